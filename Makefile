@@ -1,0 +1,58 @@
+# Every target sets up what it needs: a machine with Python 3.11 and make is enough.
+PYTHON ?= $(shell command -v python3.11 || command -v python3)
+VENV := .venv
+BIN := $(VENV)/bin
+PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Folders beside the package that hold Python files; mypy refuses an empty one.
+BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py))))
+
+.DEFAULT_GOAL := check
+.PHONY: demo test lint check bench build clean
+
+demo: $(VENV)/.demo
+	$(BIN)/holdfast demo
+
+test: $(VENV)/.dev
+	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+
+# The static part of `check`, cheapest first.
+lint: $(VENV)/.dev .link/holdfast
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	PYTHONPATH=.link $(BIN)/lint-imports
+	$(BIN)/mypy -p holdfast
+	$(BIN)/mypy $(BESIDE)
+	PYRIGHT_PYTHON_IGNORE_WARNINGS=1 $(BIN)/pyright
+
+# What CI runs. TESTS_PASSED=1 says that `make test` has just passed on the same files.
+check: lint
+	$(if $(TESTS_PASSED),@echo "tests: passed before",$(MAKE) --no-print-directory test)
+
+bench: $(VENV)/.dev
+	@failed=0; for file in benchmarks/bench_*.py; do $(BIN)/python "$$file" || failed=1; done; exit $$failed
+
+# setuptools would ship deleted modules from a build/ left behind.
+build: $(VENV)/.dev
+	rm -rf build dist *.egg-info
+	$(BIN)/python -m build --no-isolation --outdir dist .
+
+clean:
+	rm -rf $(VENV) .link build dist *.egg-info .coverage .coverage.* htmlcov
+	rm -rf .hypothesis .import_linter_cache .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The build backend comes first: without isolation the package is built by the pinned one.
+$(VENV)/.demo: pyproject.toml constraints.txt
+	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	$(PIP_INSTALL) setuptools
+	$(PIP_INSTALL) --no-build-isolation --editable '.[demo]'
+	touch $@
+
+$(VENV)/.dev: $(VENV)/.demo
+	$(PIP_INSTALL) --no-build-isolation --editable '.[dev]'
+	touch $@
+
+# Where mypy, pyright and import-linter find the package: see pyproject.toml.
+.link/holdfast:
+	mkdir -p .link
+	ln -sfn .. $@

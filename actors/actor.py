@@ -1,0 +1,185 @@
+"""The actor class: state, handlers and hooks, as a user writes them."""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar, cast, overload
+
+import msgspec
+
+from .bindings import Binding
+from .errors import type_name
+from .mail import Table
+from .message import Message
+
+if TYPE_CHECKING:
+    from .context import ActorContext, ReplyHandle
+    from .exits import ExitReason
+    from .ref import ActorRef
+
+R = TypeVar("R")
+S = TypeVar("S")
+M = TypeVar("M", bound=Message[Any])
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class _On(Protocol[R]):
+    """What `@on(M)` accepts: a method that takes the message and gives its reply, now, later, or by a handle."""
+
+    @overload
+    def __call__(self, handler: Callable[[S, M], Coroutine[Any, Any, R | ReplyHandle[R]]]) -> Callable[
+        [S, M], Coroutine[Any, Any, R | ReplyHandle[R]]
+    ]: ...
+    @overload
+    def __call__(self, handler: Callable[[S, M], R | ReplyHandle[R]]) -> Callable[[S, M], R | ReplyHandle[R]]: ...
+
+
+class Handles(typing.NamedTuple):
+    """What `@on` notes on a method."""
+
+    kind: type[Message[Any]]
+    readonly: bool
+
+
+def on(kind: type[Message[R]], *, readonly: bool = False) -> _On[R]:
+    """Make a method the handler of one message type (and of types derived from it that have none of their own).
+
+    Args:
+        kind: the message class; the method's return type must be the reply it declares.
+        readonly: the handler changes no state, so a replay may leave it out.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Message)):
+        raise TypeError(f"@on takes a Message class, not {kind!r}")
+
+    def mark(handler: Any) -> Any:
+        handler.__handles__ = (*getattr(handler, "__handles__", ()), Handles(kind, readonly))
+        return handler
+
+    return cast("_On[R]", mark)
+
+
+def subscribe(topic: str) -> Callable[[F], F]:
+    """Subscribe the actor to a topic from its start; goes above `@on` on a handler of that topic's messages."""
+    if not topic.startswith("/"):
+        raise ValueError(f"topic {topic!r} must start with '/'")
+
+    def mark(handler: F) -> F:
+        cast("Any", handler).__topics__ = (*getattr(handler, "__topics__", ()), topic)
+        return handler
+
+    return mark
+
+
+class Actor:
+    """Base of all actors: one message at a time, state in attributes.
+
+    `ctx` is there before `__init__` runs. Construct in `__init__`, act in `on_start`: an actor that is restored runs
+    `__init__` again.
+    """
+
+    ctx: ActorContext
+
+    deterministic: ClassVar[bool] = True
+    """False refuses recovery methods that replay messages."""
+    key_variables: ClassVar[tuple[str, ...] | None] = None
+    """What a snapshot saves; None saves every instance attribute without a leading underscore."""
+    schema_version: ClassVar[int] = 1
+    """Raise it when the saved state changes its shape."""
+
+    _table: ClassVar[Table] = Table()
+    _readonly: ClassVar[frozenset[type]] = frozenset()
+    _topics: ClassVar[tuple[str, ...]] = ()
+    _bindings: ClassVar[frozenset[str]] = frozenset()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        table, readonly, topics = Table(), set[type](), list[str]()
+        for name in dir(cls):
+            handler = inspect.getattr_static(cls, name)
+            for handles in getattr(handler, "__handles__", ()):
+                _check(cls, name, handler, handles.kind)
+                if handles.kind in table:
+                    raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
+                table[handles.kind] = handler
+                if handles.readonly:
+                    readonly.add(handles.kind)
+            topics.extend(getattr(handler, "__topics__", ()))
+        cls._table, cls._readonly, cls._topics = table, frozenset(readonly), tuple(topics)
+        cls._bindings = cls._bindings | _declared_bindings(cls)
+
+    def on_start(self, restored: bool) -> Any:
+        """Called first at each life, `restored` says whether state came back; may be async. Turn 0."""
+
+    def on_stop(self, reason: ExitReason) -> Any:
+        """Called last, also after a crash, but not when killed; may be async."""
+
+    def on_exit(self, source: ActorRef[Any], reason: ExitReason) -> Any:
+        """A linked actor ended, and this one traps exits (`ctx.trap_exits`)."""
+
+    def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> Any:
+        """A monitored life, or a watched address, ended."""
+
+    def on_undelivered(self, message: Message[Any]) -> Any:
+        """A queued message that will not be handled, because the actor stops; without this it is a dead letter."""
+
+    def on_safe_state(self, entered: bool) -> Any:
+        """Recovery of an actor this one is bound to begins (True) or is over (False)."""
+
+    def on_recovered(self) -> Any:
+        """State and messages are back; called before new messages are let in."""
+
+
+def _check(cls: type, name: str, handler: Any, kind: type) -> None:
+    """Refuse a handler whose message annotation contradicts `@on`, when the class is made."""
+    parameters = list(inspect.signature(handler).parameters.values())
+    if len(parameters) != 2:
+        raise TypeError(f"{type_name(cls)}.{name} must take self and the message, nothing else")
+    try:
+        declared = typing.get_type_hints(handler).get(parameters[1].name)
+    except NameError:  # A name that is only imported for checking, or defined further down.
+        return
+    if isinstance(declared, type) and not issubclass(kind, declared):
+        raise TypeError(f"{type_name(cls)}.{name} is @on({kind.__name__}) but takes a {declared.__name__}")
+
+
+def _declared_bindings(cls: type) -> frozenset[str]:
+    """Make `name: Binding[X]` in the class body a port; returns the names."""
+    names: set[str] = set()
+    for name, declared in vars(cls).get("__annotations__", {}).items():
+        text = declared if isinstance(declared, str) else getattr(declared, "__qualname__", "")
+        origin = typing.get_origin(declared) or declared
+        if origin is Binding or text.split("[")[0].rpartition(".")[2] == "Binding":
+            port: Binding[Any] = Binding()
+            port.__set_name__(cls, name)
+            setattr(cls, name, port)
+            names.add(name)
+    return frozenset(names)
+
+
+class Start(msgspec.Struct, Generic[S], frozen=True):
+    """A recipe for a new actor: class and arguments, never a live object. Made by `start`."""
+
+    kind: type[S]
+    args: tuple[Any, ...] = ()
+    kwargs: dict[str, Any] = {}
+
+    def check(self) -> None:
+        """Raise TypeError if the arguments do not fit the class."""
+        inspect.signature(self.kind).bind(*self.args, **self.kwargs)
+
+
+P = typing.ParamSpec("P")
+A = TypeVar("A", bound=Actor)
+
+
+def start(kind: Callable[P, A], *args: P.args, **kwargs: P.kwargs) -> Start[A]:
+    """A recipe for an actor: `start(Account, 100)`. Typed like the class's `__init__`; nothing runs yet.
+
+    Raises:
+        TypeError: `kind` is no Actor class. (Arguments are checked where a child spec is made of it.)
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Actor)):
+        raise TypeError(f"start takes an Actor class, not {kind!r}")
+    return Start(cast("type[A]", kind), args, kwargs)

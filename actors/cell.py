@@ -1,0 +1,270 @@
+"""The cell: one address's place in this process. Its mailbox outlives every life at the address."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from . import mailbox
+from .errors import ActorStopped, UnknownMessage, type_name
+from .exits import SHUTDOWN, ExitReason
+from .mail import AnyTable, Item, Table
+from .message import Message
+from .ref import ActorRef
+
+if TYPE_CHECKING:
+    from .actor import Actor, Start
+    from .context import ActorContext
+    from .loop import Suspended
+    from .mailbox import Bound
+    from .node import Node
+
+Admit = Callable[["Cell", Any], None]
+
+# What a cell may be in. Only a running cell is ever on the run queue for user messages.
+DOWN = "down"  # between two lives, or before the first: the queue is kept
+RUNNING = "running"
+ENDING = "ending"  # hooks and children are being wound down
+GONE = "gone"  # for good: the address is free
+
+ANY = AnyTable()
+
+
+class Host(Protocol):
+    """Where and how the lives at an address are lived: in this process, in another one, recorded or not."""
+
+    def start(self, cell: Cell) -> asyncio.Future[None] | None:
+        """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
+        ...
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        """Ask the life to end in good order."""
+        ...
+
+    def kill(self, cell: Cell) -> None:
+        """End the life at once."""
+        ...
+
+    def retired(self, cell: Cell) -> None:
+        """The address is gone for good."""
+        ...
+
+
+class More:
+    """What only some cells have; made when first needed, so that an idle actor stays small."""
+
+    __slots__ = (
+        "bindings",
+        "bound",
+        "enders",
+        "held",
+        "last",
+        "links",
+        "monitors",
+        "names",
+        "outlet",
+        "reason",
+        "start",
+        "stash",
+        "tasks",
+        "timers",
+        "topics",
+        "trap_exits",
+        "turn",
+        "urgent",
+    )
+
+    def __init__(self) -> None:
+        self.bindings: dict[str, Cell] = {}
+        self.bound: Bound | None = None
+        self.enders: list[asyncio.Future[ExitReason]] = []
+        self.held: deque[Any] | None = None  # user messages of a suspended actor
+        self.last: Actor | None = None  # the actor of the ended life, if it wants what stays undelivered
+        self.links: dict[Cell, None] = {}
+        self.monitors: list[Any] = []  # who watches us (links.Monitor)
+        self.names: list[str] = []
+        self.outlet: Any = None  # the way into another process (process.remote.Outlet)
+        self.reason: ExitReason = SHUTDOWN
+        self.start: Start[Any] | None = None
+        self.stash: deque[Any] | None = None
+        self.tasks: set[asyncio.Task[Any]] = set()
+        self.timers: set[Any] = set()
+        self.topics: set[str] = set()
+        self.trap_exits = False
+        self.turn: Suspended | None = None
+        self.urgent: deque[Item] | None = None
+
+
+class Cell:
+    """One address: its queue, the life that is lived there now, and its place in the tree."""
+
+    __slots__ = (
+        "__weakref__",
+        "actor",
+        "admit",
+        "children",
+        "context",
+        "ctx",
+        "host",
+        "life",
+        "more",
+        "name",
+        "node",
+        "parent",
+        "queue",
+        "scheduled",
+        "spec",
+        "state",
+        "table",
+    )
+
+    def __init__(self, node: Node, parent: Cell | None, name: str, host: Host) -> None:
+        self.node = node
+        self.parent = parent
+        self.name = name
+        self.host = host
+        self.admit: Admit = mailbox.admit_first
+        self.table: Table = ANY
+        self.queue: deque[Any] | None = None
+        self.scheduled = True  # Nothing runs before the first life begins: messages wait in the queue.
+        self.state = DOWN
+        self.life = 0
+        self.actor: Actor | None = None
+        self.ctx: ActorContext | None = None
+        self.context: contextvars.Context | None = None
+        self.children: dict[str, Cell] | None = None
+        self.more: More | None = None
+        self.spec: Any = None  # the supervisor's child spec; None: nobody restarts this actor
+
+    @property
+    def path(self) -> str:
+        """The address in full."""
+        parent = self.parent
+        return self.name if parent is None else f"{parent.path}/{self.name}"
+
+    @property
+    def ref(self) -> ActorRef[Any]:
+        """A handle on this address."""
+        return ActorRef(self)
+
+    @property
+    def is_dead(self) -> bool:
+        """Nobody lives here and nobody will be restarted here."""
+        return self.state is GONE or (self.state is DOWN and self.spec is None)
+
+    def extra(self) -> More:
+        """The rarely needed part, made now if it was not."""
+        if self.more is None:
+            self.more = More()
+        return self.more
+
+    # -- sending to this address ------------------------------------------------------------------------------------
+
+    def require(self, message: Message[Any]) -> None:
+        """Refuse what no handler is there for.
+
+        Raises:
+            UnknownMessage: the class is known and handles nothing of this type.
+        """
+        if not self.table.knows(type(message)):
+            raise UnknownMessage(self.path, type_name(type(message)))
+
+    def push(self, item: Item) -> None:
+        """Put an item of the runtime's own at the end of the queue: no bound, no type check."""
+        if self.state is GONE:
+            item.undelivered(self, "stopped")
+            return
+        mailbox.queue_of(self).append(item)
+        self.schedule()
+
+    def urge(self, item: Item) -> None:
+        """Put a command ahead of all messages; commands keep their order among themselves."""
+        if self.state is GONE:
+            item.undelivered(self, "stopped")
+            return
+        more = self.extra()
+        if more.urgent is None:
+            more.urgent = deque()
+        more.urgent.append(item)
+        mailbox.queue_of(self).appendleft(NEXT_URGENT)
+        self.schedule()
+
+    def schedule(self) -> None:
+        """See to it that the run loop looks at the queue."""
+        if not self.scheduled:
+            self.scheduled = True
+            self.node.make_ready(self)
+
+    def room(self) -> asyncio.Future[None] | None:
+        """None when a message would be taken now; else a future that ends when it is worth trying again.
+
+        Raises:
+            ActorStopped: the address has ended for good.
+        """
+        if self.state is GONE and self.node.successor(self) is None:
+            raise ActorStopped(self.path)
+        more = self.more
+        if more is None:
+            return None
+        if more.outlet is not None and (wait := more.outlet.room()) is not None:
+            return wait  # type: ignore[no-any-return]
+        return more.bound.room(self) if more.bound is not None else None
+
+    # -- life cycle, asked for from outside -------------------------------------------------------------------------
+
+    def request_stop(self, reason: ExitReason = SHUTDOWN) -> None:
+        """Ask for an end in good order; on a cell that is down or ending it changes nothing."""
+        self.host.stop(self, reason)
+
+    def kill(self) -> None:
+        """End the life at once, without hooks."""
+        self.host.kill(self)
+
+    def ended(self) -> asyncio.Future[ExitReason]:
+        """A future of the reason with which the present life ends; done already when there is none."""
+        future: asyncio.Future[ExitReason] = self.node.loop.create_future()
+        if self.state in (DOWN, GONE):
+            future.set_result(self.more.reason if self.more is not None else SHUTDOWN)
+        else:
+            self.extra().enders.append(future)
+        return future
+
+    # -- the fate of what is left -----------------------------------------------------------------------------------
+
+    def stopped_error(self, reason: str) -> ActorStopped:
+        """What an asker gets whose message was never run."""
+        return ActorStopped(self.path, reason)
+
+    def undelivered(self, message: Message[Any], reason: str) -> None:
+        """A message that will not be handled: offered to `on_undelivered`, else a dead letter."""
+        last = self.more.last if self.more is not None else None
+        if last is None:
+            self.node.dead_letter(self, message, reason)
+            return
+        try:
+            last.on_undelivered(message)
+        except Exception as error:
+            self.node.dead_letter(self, message, f"{reason}; on_undelivered raised {type_name(type(error))}: {error}")
+
+    def __repr__(self) -> str:
+        return f"<Cell {self.path} {self.state} life {self.life}>"
+
+
+class _NextUrgent(Item):
+    """Stands at the front of a queue for the next command in `more.urgent`."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        more: More | None = actor.ctx.cell.more
+        if more is None or not more.urgent:
+            return None
+        command = more.urgent.popleft()
+        return command.run(actor, command)
+
+
+NEXT_URGENT = _NextUrgent()

@@ -1,0 +1,332 @@
+"""`self.ctx`: what an actor may do besides handling messages. One per life."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import uuid
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+from . import links, mailbox
+from .errors import ActorStopped, AskDeadlock, HoldfastError
+from .exits import NORMAL, ExitReason
+from .links import Monitor
+from .mail import Ask, Chain, Envelope, Item, ReplyHandle
+from .message import Message
+from .timers import Timer
+
+if TYPE_CHECKING:
+    from .actor import Actor, Start
+    from .cell import Cell
+    from .ref import ActorRef
+
+A = TypeVar("A", bound="Actor")
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class StashError(HoldfastError):
+    """Only a message can be stashed, once per turn."""
+
+
+class ActorContext:
+    """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
+
+    __slots__ = ("_asking", "_random", "_turn", "cell", "closed", "item")
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+        self.item: Any = None  # what is being handled
+        self.closed = False
+        self._asking: Any = None
+        self._turn = 0
+        self._random: random.Random | None = None
+
+    # -- who, when --------------------------------------------------------------------------------------------------
+
+    @property
+    def ref(self) -> ActorRef[Any]:
+        """A ref to this actor."""
+        return self.cell.ref
+
+    @property
+    def path(self) -> str:
+        """This actor's address."""
+        return self.cell.path
+
+    @property
+    def life(self) -> int:
+        """The number of this life at the address, from 1."""
+        return self.cell.life
+
+    @property
+    def sender(self) -> ActorRef[Any] | None:
+        """Who sent the message in hand; None if it was no actor."""
+        sender = getattr(self.item, "sender", None)
+        return None if sender is None else cast("Cell", sender).ref
+
+    def now(self) -> float:
+        """Unix time in seconds; in a journaled actor, that of the input in hand."""
+        return self.cell.node.wall()
+
+    @property
+    def random(self) -> random.Random:
+        """A random generator; in a journaled actor the same numbers come again under replay."""
+        if self._random is None:
+            self._random = random.Random(self.cell.node.seed())
+        return self._random
+
+    def uuid(self) -> uuid.UUID:
+        """A new random UUID, drawn from `random`."""
+        return uuid.UUID(int=self.random.getrandbits(128), version=4)
+
+    # -- sending (called by ActorRef for sends inside a turn) -------------------------------------------------------
+
+    def tell(self, cell: Cell, message: Message[Any]) -> None:
+        """Send from this actor: the receiver sees the sender."""
+        self._alive()
+        if type(message) not in cell.table:
+            cell.require(message)
+        cell.admit(cell, Envelope(message, self.cell))
+
+    async def send(self, cell: Cell, message: Message[Any]) -> None:
+        """Send and wait for room."""
+        self._alive()
+        while (room := cell.room()) is not None:
+            await room
+        self.tell(cell, message)
+
+    def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
+        """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once."""
+        self._alive()
+        if type(message) not in cell.table:
+            cell.require(message)
+        node = self.cell.node
+        future: asyncio.Future[R] = node.loop.create_future()
+        chain = self.chain()
+        if waits_for(cell, chain):
+            future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
+            return future
+        ask = Ask(message, self.cell, chain, timeout, node.loop.time() + timeout, future)
+        node.deadlines.add(ask, cell)
+        cell.admit(cell, ask)
+        return future
+
+    def chain(self) -> Chain:
+        """This turn, and those that wait for it."""
+        if self._asking is not self.item:
+            self._asking = self.item
+            self._turn = self.cell.node.next_turn()
+        return ((self.path, self._turn), *getattr(self.item, "chain", ()))
+
+    def turn_in(self, chain: Chain) -> bool:
+        """Whether the turn in hand is one of those in the chain."""
+        return self._asking is self.item and (self.path, self._turn) in chain
+
+    def _alive(self) -> None:
+        if self.closed:
+            raise ActorStopped(self.path, "this life is over; its leftovers may not send")
+
+    def forward(self, to: ActorRef[Any]) -> None:
+        """Hand the message in hand on: the receiver sees the original sender, and its reply goes to the asker."""
+        item = self.item
+        if isinstance(item, Ask):
+            cell: Cell = to._cell
+            cell.require(item.message)
+            cell.admit(cell, Ask(item.message, item.sender, item.chain, item.timeout, item.deadline, item.future))
+            self.item = Envelope(item.message, item.sender or self.cell)
+        elif isinstance(item, Envelope):
+            to._cell.admit(to._cell, Envelope(item.message, item.sender))
+        else:
+            to._cell.admit(to._cell, item)
+
+    def reply_handle(self) -> ReplyHandle[Any]:
+        """The right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
+        item = self.item
+        return ReplyHandle(item if isinstance(item, Ask) else None)
+
+    async def publish(self, topic: str, message: Message[Any]) -> None:
+        """Publish from this actor; waits for room at bounded subscribers."""
+        for cell in self.cell.node.topics.subscribers(topic):
+            await self.send(cell, message)
+
+    async def flush(self) -> None:
+        """Release what this turn has sent so far (a journaled actor otherwise releases at the end of the turn)."""
+
+    # -- later ------------------------------------------------------------------------------------------------------
+
+    def tell_after(self, delay: float, message: Message[Any]) -> Timer:
+        """The message comes to this actor itself after `delay` seconds; the timer ends with this life."""
+        return Timer(self.cell, message, delay, None)
+
+    def every(self, interval: float, message: Message[Any]) -> Timer:
+        """The message comes every `interval` seconds; ticks that fall due while one waits are left out."""
+        return Timer(self.cell, message, interval, interval)
+
+    def pipe_to_self(
+        self,
+        work: Awaitable[T],
+        then: Callable[[T], Message[Any]],
+        failed: Callable[[BaseException], Message[Any]] | None = None,
+    ) -> None:
+        """Await `work` in the background; its result comes back as a message.
+
+        Args:
+            work: what is awaited, in a task that ends with this life.
+            then: makes the message from the result.
+            failed: makes a message from an exception; without it an exception crashes this actor.
+        """
+        self._alive()
+        tasks = self.cell.extra().tasks
+        task = self.cell.node.loop.create_task(self._pipe(work, then, failed), name=f"pipe of {self.path}")
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+    async def _pipe(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> None:
+        try:
+            result = await work
+        except asyncio.CancelledError:
+            raise
+        except BaseException as error:
+            outcome: Item = Piped(None if failed is None else failed(error), error)
+        else:
+            outcome = Piped(then(result), None)
+        if not self.closed:
+            self.cell.push(outcome)
+
+    # -- stash ------------------------------------------------------------------------------------------------------
+
+    def stash(self) -> None:
+        """Put the message in hand aside; it comes again after `unstash`. Its turn ends without a reply."""
+        item = self.item
+        if isinstance(item, Item) and item.of_life:
+            raise StashError(f"{self.path}: only a message can be stashed")
+        more = self.cell.extra()
+        if more.stash is None:
+            more.stash = deque()
+        stash = more.stash
+        if stash and stash[-1] is item:
+            raise StashError(f"{self.path}: this message is stashed already")
+        stash.append(item)
+        if isinstance(item, Ask):
+            self.item = Stashed(item)
+
+    def unstash(self) -> None:
+        """Put all stashed messages back, in order, in front of what is queued."""
+        more = self.cell.extra()
+        stash = more.stash
+        if not stash:
+            return
+        if more.bound is not None:
+            more.bound.count += len(stash)
+        mailbox.queue_of(self.cell).extendleft(reversed(stash))
+        stash.clear()
+        self.cell.schedule()
+
+    # -- others -----------------------------------------------------------------------------------------------------
+
+    def spawn(self, start: Start[A], name: str | None = None) -> ActorRef[A]:
+        """Start a child below this actor; it ends with this life and is not restarted.
+
+        Raises:
+            NameTaken: a child of that name is alive. StartFailed: its `__init__` raised.
+        """
+        self._alive()
+        return cast("ActorRef[A]", self.cell.node.spawn(start, name, parent=self.cell).ref)
+
+    def find(self, path: str, kind: type[A]) -> ActorRef[A]:
+        """A ref to the actor at `path`. Raises NoSuchActor or WrongActor."""
+        return self.cell.node.find_ref(path, kind)
+
+    @property
+    def trap_exits(self) -> bool:
+        """Whether EXIT signals come to `on_exit` instead of ending this actor."""
+        more = self.cell.more
+        return more is not None and more.trap_exits
+
+    @trap_exits.setter
+    def trap_exits(self, value: bool) -> None:
+        self.cell.extra().trap_exits = value
+
+    def link(self, other: ActorRef[Any]) -> None:
+        """Link two lives: an abnormal end of one ends the other."""
+        links.link(self.cell, other._cell)
+
+    def unlink(self, other: ActorRef[Any]) -> None:
+        """Remove a link; nothing more comes from it."""
+        links.unlink(self.cell, other._cell)
+
+    def monitor(self, other: ActorRef[Any]) -> Monitor:
+        """`on_down` hears of the end of the present life there."""
+        return links.monitor(self.cell, other._cell, for_good=False)
+
+    def watch(self, other: ActorRef[Any]) -> Monitor:
+        """`on_down` hears once, when the address is gone for good."""
+        return links.monitor(self.cell, other._cell, for_good=True)
+
+    def subscribe(self, topic: str) -> None:
+        """Get what is published there from now on."""
+        self.cell.node.topics.subscribe(topic, self.cell)
+
+    def unsubscribe(self, topic: str) -> None:
+        """No more of it."""
+        self.cell.node.topics.unsubscribe(topic, self.cell)
+
+    def bound(self, port: str) -> ActorRef[Any] | None:
+        """What a binding points to now."""
+        more = self.cell.more
+        target = more.bindings.get(port) if more is not None else None
+        return None if target is None else target.ref
+
+    def stop(self, reason: ExitReason = NORMAL) -> None:
+        """End this life after the turn in hand."""
+        self.cell.request_stop(reason)
+
+    def close(self) -> None:
+        """The life is over."""
+        self.closed = True
+
+    def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+        """A background task that ends with this life; an exception in it crashes the actor."""
+        self._alive()
+        task = self.cell.node.loop.create_task(work, name=f"task of {self.path}")
+        self.cell.extra().tasks.add(task)
+        task.add_done_callback(self._task_done)
+        return task
+
+    def _task_done(self, task: asyncio.Task[Any]) -> None:
+        self.cell.extra().tasks.discard(task)
+        if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
+            self.cell.push(Piped(None, error))
+
+
+class Stashed(Envelope):
+    """The rest of a turn whose ask was stashed: whatever the handler returns is no reply."""
+
+    __slots__ = ()
+
+    def __init__(self, ask: Ask) -> None:
+        super().__init__(ask.message, cast("Any", ask.sender))
+
+
+class Piped(Item):
+    """The result of background work."""
+
+    __slots__ = ("error", "message")
+
+    def __init__(self, message: Message[Any] | None, error: BaseException | None) -> None:
+        self.message, self.error = message, error
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        if item.message is None:
+            raise item.error
+        return actor._table[type(item.message)](actor, item.message)
+
+
+def waits_for(cell: Cell, chain: Chain) -> bool:
+    """Whether the turn that runs at `cell` is in the chain: an ask to it would wait for itself."""
+    ctx = cell.ctx
+    return ctx is not None and ctx.turn_in(chain)

@@ -1,0 +1,275 @@
+"""Every error that holdfast raises, as one tree.
+
+HoldfastError
+├── SendError            not enqueued, or surely not run: safe to send again
+│   ├── ActorStopped     the address has ended for good, or its process died with the message still queued
+│   ├── MailboxFull      the mailbox is at capacity
+│   ├── UnknownMessage   the receiver has no handler for this type
+│   ├── BadMessage       a field cannot be coded, or has the wrong type, or the frame is too large
+│   └── AskDeadlock      the receiver waits, directly or not, for this very asker
+├── AskTimeout           no reply before the deadline (`handled` says whether the turn may have run)
+├── AskFailed            the receiver ended in the middle of the turn
+├── RemoteCrash          the receiver's handler raised
+├── ReplayDiverged       a replayed turn released something else than before
+├── StartFailed          an actor could not be started
+├── NameTaken            a living actor has this name already
+├── NoSuchActor          nobody lives at this address
+├── WrongActor           another class lives at this address
+├── SpecError            a child specification is not valid
+├── ProcessUnavailable   no OS process could be had
+├── TreeFailed           the root supervisor gave up
+└── Refusal              a handler's typed "no" (`message.py`)
+
+Arguments equal parameters in each class, so the codec can rebuild an error in another process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+
+class HoldfastError(Exception):
+    """Base of every error holdfast raises."""
+
+
+class SendError(HoldfastError):
+    """The message was not enqueued, or surely not run: it is safe to send it again."""
+
+
+class ActorStopped(SendError):
+    """The address has ended for good: start the actor again, or send elsewhere."""
+
+    def __init__(self, actor: str, reason: str = "") -> None:
+        super().__init__(actor, reason)
+        self.actor, self.reason = actor, reason
+
+    def __str__(self) -> str:
+        why = f" ({self.reason})" if self.reason else ""
+        return f"{self.actor} has stopped{why}; the message was not handled"
+
+
+class MailboxFull(SendError):
+    """The mailbox is at capacity: wait, shed load, or raise the capacity."""
+
+    def __init__(self, actor: str, capacity: int) -> None:
+        super().__init__(actor, capacity)
+        self.actor, self.capacity = actor, capacity
+
+    def __str__(self) -> str:
+        return f"mailbox of {self.actor} is full (capacity {self.capacity} messages)"
+
+
+class UnknownMessage(SendError):
+    """The receiver's class has no handler for this message type."""
+
+    def __init__(self, actor: str, message: str) -> None:
+        super().__init__(actor, message)
+        self.actor, self.message = actor, message
+
+    def __str__(self) -> str:
+        return f"{self.actor} has no handler for {self.message}; add one with @on({self.message.rpartition('.')[2]})"
+
+
+class BadMessage(SendError):
+    """The message cannot be coded as its type says."""
+
+    def __init__(self, actor: str, message: str, problem: str) -> None:
+        super().__init__(actor, message, problem)
+        self.actor, self.message, self.problem = actor, message, problem
+
+    def __str__(self) -> str:
+        return f"{self.message} to {self.actor}: {self.problem}"
+
+
+class AskDeadlock(SendError):
+    """The receiver is itself waiting, directly or through others, for the asker."""
+
+    def __init__(self, actor: str, chain: tuple[str, ...]) -> None:
+        super().__init__(actor, tuple(chain))
+        self.actor, self.chain = actor, tuple(chain)
+
+    def __str__(self) -> str:
+        way = " -> ".join((*reversed(self.chain), self.actor))
+        return f"ask to {self.actor} would wait for itself ({way}); use tell, or ask from outside the turn"
+
+
+class AskTimeout(HoldfastError):
+    """No reply before the deadline.
+
+    `handled` is False when the turn never started (safe to send again), None when that is unknown.
+    """
+
+    def __init__(self, actor: str, seconds: float, handled: bool | None = None) -> None:
+        super().__init__(actor, seconds, handled)
+        self.actor, self.seconds, self.handled = actor, seconds, handled
+
+    def __str__(self) -> str:
+        known = "it was not handled" if self.handled is False else "it may have been handled"
+        return f"{self.actor} did not reply within {self.seconds:g} s; {known}"
+
+
+class AskFailed(HoldfastError):
+    """The receiver ended in the middle of the turn: whether it took effect is unknown."""
+
+    def __init__(self, actor: str, reason: str) -> None:
+        super().__init__(actor, reason)
+        self.actor, self.reason = actor, reason
+
+    def __str__(self) -> str:
+        return f"{self.actor} ended while it handled the message: {self.reason}"
+
+
+class RemoteCrash(HoldfastError):
+    """The receiver's handler raised; the actor crashed.
+
+    The same class in one process and across processes, so that isolation changes nothing.
+    """
+
+    def __init__(self, type_name: str, text: str, traceback: str = "") -> None:
+        super().__init__(type_name, text, traceback)
+        self.type_name, self.text = type_name, text
+        self._traceback = traceback
+
+    @property
+    def traceback(self) -> str:
+        """The receiver's formatted traceback (formatted on first use: most are never looked at)."""
+        cause = self.__cause__
+        if not self._traceback and cause is not None:
+            self._traceback = format_error(cause)
+        return self._traceback
+
+    def __str__(self) -> str:
+        return f"{self.type_name}: {self.text}" if self.text else self.type_name
+
+
+class ReplayDiverged(HoldfastError):
+    """A replayed turn released an output that differs from the one released before the crash."""
+
+    def __init__(self, actor: str, turn: int, output: int) -> None:
+        super().__init__(actor, turn, output)
+        self.actor, self.turn, self.output = actor, turn, output
+
+    def __str__(self) -> str:
+        return (
+            f"replay of {self.actor} diverged at turn {self.turn}, output {self.output}: the handler is not "
+            "deterministic; use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
+        )
+
+
+class StartFailed(HoldfastError):
+    """An actor could not be started; `reason` is its exit reason in words."""
+
+    def __init__(self, actor: str, reason: str) -> None:
+        super().__init__(actor, reason)
+        self.actor, self.reason = actor, reason
+
+    def __str__(self) -> str:
+        return f"{self.actor} could not be started: {self.reason}"
+
+
+class NameTaken(HoldfastError):
+    """A living actor has this name already."""
+
+    def __init__(self, actor: str) -> None:
+        super().__init__(actor)
+        self.actor = actor
+
+    def __str__(self) -> str:
+        return f"{self.actor} exists already; choose another name or stop it first"
+
+
+class NoSuchActor(HoldfastError):
+    """Nobody lives at this address."""
+
+    def __init__(self, actor: str) -> None:
+        super().__init__(actor)
+        self.actor = actor
+
+    def __str__(self) -> str:
+        return f"there is no actor at {self.actor}"
+
+
+class WrongActor(HoldfastError):
+    """An actor of another class lives at this address."""
+
+    def __init__(self, actor: str, expected: str, found: str) -> None:
+        super().__init__(actor, expected, found)
+        self.actor, self.expected, self.found = actor, expected, found
+
+    def __str__(self) -> str:
+        return f"{self.actor} is a {self.found}, not a {self.expected}"
+
+
+class SpecError(HoldfastError):
+    """A child specification or an option is not valid."""
+
+    def __init__(self, where: str, problem: str) -> None:
+        super().__init__(where, problem)
+        self.where, self.problem = where, problem
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.problem}"
+
+
+class ProcessUnavailable(HoldfastError):
+    """No OS process could be had for an actor."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(problem)
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return self.problem
+
+
+class TreeFailed(HoldfastError):
+    """The root supervisor reached its restart intensity and gave up."""
+
+    def __init__(self, system: str, reason: str) -> None:
+        super().__init__(system, reason)
+        self.system, self.reason = system, reason
+
+    def __str__(self) -> str:
+        return f"the tree of {self.system} gave up: {self.reason}"
+
+
+def format_error(error: BaseException) -> str:
+    """The traceback of `error` as text, without the frames of holdfast's own run loop at its top."""
+    import traceback
+
+    return "".join(traceback.format_exception(error))
+
+
+def remote_crash(error: BaseException) -> RemoteCrash:
+    """`error` as the asker sees it; the traceback is formatted only if somebody looks."""
+    if isinstance(error, RemoteCrash):
+        return error
+    crash = RemoteCrash(type_name(type(error)), str(error))
+    crash.__cause__ = error
+    return crash
+
+
+def type_name(kind: type) -> str:
+    """`module.Class`, without the module for builtins.
+
+    >>> type_name(ValueError)
+    'ValueError'
+    """
+    module = "" if kind.__module__ == "builtins" else kind.__module__ + "."
+    return module + kind.__qualname__
+
+
+def error_classes(base: type[HoldfastError] = HoldfastError) -> Iterator[type[HoldfastError]]:
+    """`base` and all classes derived from it that are loaded here."""
+    yield base
+    for child in base.__subclasses__():
+        yield from error_classes(child)
+
+
+def rebuild_error(name: str, args: tuple[Any, ...]) -> HoldfastError | None:
+    """The error that another process raised, or None if its class is not loaded here."""
+    for kind in error_classes():
+        if type_name(kind) == name:
+            return kind(*args)
+    return None

@@ -1,0 +1,218 @@
+"""What happens in a system, as typed values on one stream. Unformatted: text is made when somebody looks."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from typing import Any
+
+import msgspec
+
+from .exits import ExitReason
+
+
+class Event(msgspec.Struct, frozen=True, eq=False):
+    """Base of all events; `address` is the actor's."""
+
+    address: str
+
+
+class ActorStarted(Event, frozen=True, eq=False):
+    """A life began; `life` counts from 1 at each address."""
+
+    life: int
+
+
+class ActorCrashed(Event, frozen=True, eq=False):
+    """User code raised; `item` is what was being handled."""
+
+    life: int
+    reason: ExitReason
+    item: Any
+
+
+class HookFailed(Event, frozen=True, eq=False):
+    """`on_stop` or another closing hook raised; the end went on."""
+
+    hook: str
+    reason: ExitReason
+
+
+class LifeAbandoned(Event, frozen=True, eq=False):
+    """A killed turn went on in spite of its cancellation; what it sends is refused."""
+
+    life: int
+
+
+class DeadLetter(Event, frozen=True, eq=False):
+    """A message nobody handles."""
+
+    message: Any
+    why: str
+
+
+class ChildRestarted(Event, frozen=True, eq=False):
+    """A supervisor started a child again; `attempt` counts within one failure."""
+
+    reason: ExitReason
+    attempt: int
+
+
+class SupervisorGaveUp(Event, frozen=True, eq=False):
+    """A supervisor reached its restart intensity."""
+
+    child: str
+    reason: ExitReason
+
+
+class ProcessStarted(Event, frozen=True, eq=False):
+    """An actor's OS process is up."""
+
+    pid: int
+
+
+class ProcessDied(Event, frozen=True, eq=False):
+    """An actor's OS process is gone."""
+
+    pid: int
+    reason: ExitReason
+
+
+class Recovered(Event, frozen=True, eq=False):
+    """An actor came back with state and messages; seconds by phase: detect, isolate, restart, restore, replay, release."""
+
+    life: int
+    replayed: int
+    phases: dict[str, float]
+
+
+class RecoveryFailed(Event, frozen=True, eq=False):
+    """An actor could not be brought back."""
+
+    reason: str
+
+
+class Quarantined(Event, frozen=True, eq=False):
+    """A message that ended the process `deliveries` times in a row was put aside."""
+
+    message: str
+    deliveries: int
+
+
+class SnapshotTaken(Event, frozen=True, eq=False):
+    """A snapshot is safe: state after `turn`, in bytes; `pause` is how long the actor stood still, in seconds."""
+
+    turn: int
+    size_bytes: int
+    pause: float
+
+
+class SnapshotFailed(Event, frozen=True, eq=False):
+    """A snapshot could not be made or kept; journal and older snapshot stay."""
+
+    reason: str
+
+
+class JournalFull(Event, frozen=True, eq=False):
+    """The journal reached its limit; `turn` is the last one a snapshot covers."""
+
+    turn: int
+    size_bytes: int
+
+
+class LogLine(Event, frozen=True, eq=False):
+    """A line an actor's process wrote to stdout or stderr, or a log record of it."""
+
+    stream: str
+    text: str
+
+
+class EventStream:
+    """One listener's view: an async iterator over events, with a bound on how far it may fall behind."""
+
+    def __init__(self, hub: EventHub, most: int) -> None:
+        self._hub = hub
+        self._events: deque[Event] = deque(maxlen=most)
+        self._wake: asyncio.Future[None] | None = None
+        self._closed = False
+        self.missed = 0
+
+    def put(self, event: Event) -> None:
+        """Called by the hub."""
+        if len(self._events) == self._events.maxlen:
+            self.missed += 1
+        self._events.append(event)
+        self._signal()
+
+    def _signal(self) -> None:
+        if self._wake is not None and not self._wake.done():
+            self._wake.set_result(None)
+
+    def __aiter__(self) -> AsyncIterator[Event]:
+        return self
+
+    async def __anext__(self) -> Event:
+        while not self._events:
+            if self._closed:
+                raise StopAsyncIteration
+            self._wake = asyncio.get_running_loop().create_future()
+            await self._wake
+        return self._events.popleft()
+
+    def take(self) -> list[Event]:
+        """All events that wait, without waiting for more."""
+        events = list(self._events)
+        self._events.clear()
+        return events
+
+    def close(self) -> None:
+        """Stop listening; what waits can still be read."""
+        self._closed = True
+        self._hub.remove(self)
+        self._signal()
+
+    def __enter__(self) -> EventStream:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+
+class EventHub:
+    """Hands each event to the listeners there are."""
+
+    def __init__(self, watch: Callable[[bool], None]) -> None:
+        self._watch = watch  # told whether there is anybody at all
+        self._streams: list[EventStream] = []
+        self._sinks: list[Callable[[Event], None]] = []
+
+    def emit(self, event: Event) -> None:
+        """Give the event to every listener and sink."""
+        for stream in self._streams:
+            stream.put(event)
+        for sink in self._sinks:
+            sink(event)
+
+    def add_sink(self, sink: Callable[[Event], None]) -> None:
+        """Call `sink` with every event, at once."""
+        self._sinks.append(sink)
+        self._watch(True)
+
+    def listen(self, most: int = 10_000) -> EventStream:
+        """A new stream; the oldest of more than `most` unread events are dropped and counted in `missed`."""
+        stream = EventStream(self, most)
+        self._streams.append(stream)
+        self._watch(True)
+        return stream
+
+    def remove(self, stream: EventStream) -> None:
+        """Forget a stream."""
+        if stream in self._streams:
+            self._streams.remove(stream)
+        self._watch(bool(self._streams or self._sinks))
+
+    def close(self) -> None:
+        """End every stream."""
+        for stream in list(self._streams):
+            stream.close()

@@ -1,0 +1,202 @@
+"""Exit reasons: why a life at an address ended. Values, never exceptions.
+
+Clean reasons are `NORMAL`, `SHUTDOWN` and `Shutdown(detail)`; every other one is abnormal (Erlang/OTP).
+"""
+
+from __future__ import annotations
+
+import signal
+
+import msgspec
+
+from .errors import format_error, type_name
+
+
+class ExitReason(msgspec.Struct, frozen=True):
+    """Base of the exit reasons."""
+
+    @property
+    def is_clean(self) -> bool:
+        """True for NORMAL and every Shutdown: a transient child is not restarted after it."""
+        return False
+
+
+class Normal(ExitReason, frozen=True):
+    """The actor ended by itself, its work done."""
+
+    @property
+    def is_clean(self) -> bool:
+        return True
+
+    def __str__(self) -> str:
+        return "normal"
+
+
+class Shutdown(ExitReason, frozen=True):
+    """The actor was told to stop, or ended in good order; `detail` is the user's own."""
+
+    detail: str = ""
+
+    @property
+    def is_clean(self) -> bool:
+        return True
+
+    def __str__(self) -> str:
+        return f"shutdown ({self.detail})" if self.detail else "shutdown"
+
+
+class Killed(ExitReason, frozen=True):
+    """The actor was killed: no hook ran."""
+
+    def __str__(self) -> str:
+        return "killed"
+
+
+class NoProc(ExitReason, frozen=True):
+    """Nobody lives at the address."""
+
+    def __str__(self) -> str:
+        return "no such actor"
+
+
+class Crash(ExitReason, frozen=True, eq=False):
+    """A handler or hook raised.
+
+    The exception stays as it is: text and traceback are made when somebody looks, or when the reason leaves the process.
+    """
+
+    type_name: str
+    text: str
+    formatted: str = ""
+    error: BaseException | None = None
+
+    @property
+    def traceback(self) -> str:
+        """The formatted traceback."""
+        return self.formatted if self.error is None else format_error(self.error)
+
+    def __str__(self) -> str:
+        return f"{self.type_name}: {self.text}" if self.text else self.type_name
+
+    def portable(self) -> Crash:
+        """The same reason without the exception object: what crosses a process border."""
+        return self if self.error is None else Crash(self.type_name, self.text, self.traceback)
+
+
+class Signal(ExitReason, frozen=True):
+    """The OS process was ended by this signal."""
+
+    number: int
+
+    def __str__(self) -> str:
+        try:
+            return signal.Signals(self.number).name
+        except ValueError:
+            return f"signal {self.number}"
+
+
+class Exited(ExitReason, frozen=True):
+    """The OS process ended with this exit code without being asked to."""
+
+    code: int
+
+    def __str__(self) -> str:
+        return f"process exited with code {self.code}"
+
+
+class OutOfMemory(ExitReason, frozen=True):
+    """MemoryError, our watch's limit, or the kernel's out-of-memory killer."""
+
+    text: str = ""
+
+    def __str__(self) -> str:
+        return f"out of memory: {self.text}" if self.text else "out of memory"
+
+
+class Hung(ExitReason, frozen=True):
+    """The process's loop stopped beating for this many seconds."""
+
+    seconds: float
+
+    def __str__(self) -> str:
+        return f"hung for {self.seconds:g} s"
+
+
+AnyExit = Normal | Shutdown | Killed | NoProc | Crash | Signal | Exited | OutOfMemory | Hung
+
+NORMAL = Normal()
+SHUTDOWN = Shutdown()
+KILLED = Killed()
+NOPROC = NoProc()
+
+
+def crash(error: BaseException) -> ExitReason:
+    """The exit reason for an exception that left a handler or hook."""
+    if isinstance(error, MemoryError):
+        return OutOfMemory(str(error))
+    try:
+        text = str(error)
+    except Exception as broken:  # A user's __str__ may itself raise; the report must not.
+        text = f"<its text cannot be shown: {type_name(type(broken))}>"
+    return Crash(type_name(type(error)), text, "", error)
+
+
+class _Wire(msgspec.Struct, frozen=True):
+    """What crosses the border: all fields of all reasons."""
+
+    exit: str
+    detail: str = ""
+    type_name: str = ""
+    text: str = ""
+    formatted: str = ""
+    number: int = 0
+    seconds: float = 0.0
+
+
+def pack_exit(reason: ExitReason) -> dict[str, object]:
+    """`reason` as plain data for a frame."""
+    match reason:
+        case Shutdown(detail=detail):
+            return {"exit": "Shutdown", "detail": detail}
+        case Crash():
+            return {"exit": "Crash", "type_name": reason.type_name, "text": reason.text, "formatted": reason.traceback}
+        case Signal(number=number):
+            return {"exit": "Signal", "number": number}
+        case Exited(code=code):
+            return {"exit": "Exited", "number": code}
+        case OutOfMemory(text=text):
+            return {"exit": "OutOfMemory", "text": text}
+        case Hung(seconds=seconds):
+            return {"exit": "Hung", "seconds": seconds}
+        case _:
+            return {"exit": type(reason).__name__}
+
+
+def unpack_exit(data: object) -> ExitReason:
+    """The exit reason a frame carries.
+
+    Raises:
+        msgspec.ValidationError: the data is no exit reason.
+    """
+    wire = msgspec.convert(data, _Wire)
+    match wire.exit:
+        case "Normal":
+            return NORMAL
+        case "Shutdown":
+            return Shutdown(wire.detail)
+        case "Killed":
+            return KILLED
+        case "NoProc":
+            return NOPROC
+        case "Crash":
+            return Crash(wire.type_name, wire.text, wire.formatted)
+        case "Signal":
+            return Signal(wire.number)
+        case "Exited":
+            return Exited(wire.number)
+        case "OutOfMemory":
+            return OutOfMemory(wire.text)
+        case "Hung":
+            return Hung(wire.seconds)
+        case other:
+            raise msgspec.ValidationError(f"unknown exit reason {other!r}")

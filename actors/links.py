@@ -1,0 +1,126 @@
+"""Links and monitors: who hears of an end, and what it does to them. Erlang's rules.
+
+A link is two-sided: an abnormal end ends the other side with the same reason, unless that one traps exits. A monitor is
+one-sided and only informs: of one life (`monitor`), or of the address (`watch`: once, when it is gone for good).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from .exits import NOPROC, NORMAL, ExitReason
+from .mail import Item
+
+if TYPE_CHECKING:
+    from .cell import Cell
+
+
+class Monitor:
+    """One watch of `target` by `watcher`."""
+
+    __slots__ = ("active", "for_good", "target", "watcher")
+
+    def __init__(self, watcher: Cell, target: Cell, for_good: bool) -> None:
+        self.watcher, self.target, self.for_good = watcher, target, for_good
+        self.active = True
+
+    def cancel(self) -> None:
+        """No DOWN arrives after this, not even one that is queued already."""
+        self.active = False
+        more = self.target.more
+        if more is not None and self in more.monitors:
+            more.monitors.remove(self)
+
+
+def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
+    """Start a watch; if nobody lives there, DOWN with NOPROC comes at once."""
+    watch = Monitor(watcher, target, for_good)
+    if target.is_dead:
+        watcher.push(Down(watch, NOPROC, recovering=False))
+    else:
+        target.extra().monitors.append(watch)
+    return watch
+
+
+def link(one: Cell, other: Cell) -> None:
+    """Link two lives; at most one link per pair."""
+    if one is other:
+        return
+    if other.is_dead:
+        one.push(Exit(other, NOPROC))
+        return
+    one.extra().links[other] = None
+    other.extra().links[one] = None
+
+
+def unlink(one: Cell, other: Cell) -> None:
+    """Remove the link; no EXIT from it arrives afterwards."""
+    for cell, peer in ((one, other), (other, one)):
+        if cell.more is not None:
+            cell.more.links.pop(peer, None)
+
+
+def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
+    """A life has ended: EXIT over its links, DOWN to its monitors."""
+    more = cell.more
+    if more is None:
+        return
+    if more.links and not recovering:
+        peers, more.links = more.links, {}
+        for peer in peers:
+            if peer.more is not None and peer.more.links.pop(cell, 0) is None:
+                peer.push(Exit(cell, reason))
+    if more.monitors:
+        stay: list[Monitor] = []
+        for watch in more.monitors:
+            if watch.for_good:
+                stay.append(watch)
+            else:
+                watch.watcher.push(Down(watch, reason, recovering))
+                if recovering:
+                    stay.append(watch)
+        more.monitors = stay
+
+
+def gone(cell: Cell, reason: ExitReason) -> None:
+    """The address is gone for good: tell who watches it."""
+    more = cell.more
+    if more is None or not more.monitors:
+        return
+    watchers = [watch for watch in more.monitors if watch.for_good]
+    more.monitors = [watch for watch in more.monitors if not watch.for_good]
+    for watch in watchers:
+        watch.watcher.push(Down(watch, reason, recovering=False))
+
+
+class Exit(Item):
+    """An EXIT signal over a link, in its place after earlier messages."""
+
+    __slots__ = ("reason", "source")
+
+    def __init__(self, source: Cell, reason: ExitReason) -> None:
+        self.source, self.reason = source, reason
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        cell: Cell = actor.ctx.cell
+        if cell.more is not None and cell.more.trap_exits:
+            return actor.on_exit(item.source.ref, item.reason)
+        if item.reason != NORMAL:
+            cell.request_stop(item.reason)  # A command: it comes before anything else that is queued.
+        return None
+
+
+class Down(Item):
+    """A monitor's notice."""
+
+    __slots__ = ("reason", "recovering", "watch")
+
+    def __init__(self, watch: Monitor, reason: ExitReason, recovering: bool) -> None:
+        self.watch, self.reason, self.recovering = watch, reason, recovering
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        if not item.watch.active:
+            return None
+        return actor.on_down(item.watch.target.ref, item.reason, item.recovering)

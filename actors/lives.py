@@ -1,0 +1,373 @@
+"""Lives: how an actor in this process begins, crashes, is stopped or killed, and what follows from its end.
+
+The order of an end: children (newest first), `on_stop`, timers and tasks, names, links and monitors, then the
+supervisor is told, or the address is given up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from . import exits, links, mailbox
+from .actor import Actor
+from .cell import DOWN, ENDING, GONE, RUNNING, Cell
+from .context import ActorContext
+from .errors import StartFailed, remote_crash
+from .events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
+from .exits import KILLED, SHUTDOWN, ExitReason
+from .mail import LEAVE, Item
+from .ref import current
+
+if TYPE_CHECKING:
+    from .actor import Start
+
+GRACE = 1.0
+"""Seconds a killed turn may take to end after its cancellation, before its life is abandoned."""
+
+
+class LocalHost:
+    """Lives as turns in this very process."""
+
+    def start(self, cell: Cell) -> asyncio.Future[None] | None:
+        start = cell.extra().start
+        assert start is not None
+        return begin(cell, start)
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        if cell.state is not RUNNING:
+            return
+        if cell.scheduled or cell.children or type(cell.actor).on_stop is not Actor.on_stop:
+            cell.urge(Stop(reason))
+        else:
+            ended(cell, reason)  # Idle, and nothing of the user's has to run: it is over at once.
+
+    def kill(self, cell: Cell) -> None:
+        turn = cell.more.turn if cell.more is not None else None
+        if turn is not None:
+            turn.kill()
+            cell.node.loop.call_later(GRACE, abandon, cell, cell.life)
+        elif cell.state is RUNNING:
+            cell.urge(Kill())
+
+    def retired(self, cell: Cell) -> None:
+        pass
+
+
+LOCAL = LocalHost()
+
+
+def begin(
+    cell: Cell, start: Start[Any], *, restored: bool = False, context_type: type[ActorContext] = ActorContext
+) -> asyncio.Future[None] | None:
+    """Begin a life: construct the actor, then `on_start` as its first turn if the class has one.
+
+    Returns:
+        None if the life is up now; else a future that ends with `on_start` (StartFailed if that raises).
+
+    Raises:
+        StartFailed: `__init__` raised.
+    """
+    cell.life += 1
+    build(cell, start, context_type)
+    cell.state = RUNNING
+    node = cell.node
+    for topic in start.kind._topics:
+        node.topics.subscribe(topic, cell)
+    if node.watched:
+        node.emit(ActorStarted(cell.path, cell.life))
+    if start.kind.on_start is Actor.on_start:
+        up(cell)
+        return None
+    started: asyncio.Future[None] = node.loop.create_future()
+    mailbox.queue_of(cell).appendleft(FirstTurn(restored, started))
+    up(cell)
+    return started
+
+
+def build(cell: Cell, start: Start[Any], context_type: type[ActorContext]) -> None:
+    """Construct the actor with its `ctx`."""
+    kind = start.kind
+    ctx = context_type(cell)
+    actor = kind.__new__(kind)
+    actor.ctx = ctx
+    cell.actor, cell.ctx, cell.table, cell.context = actor, ctx, kind._table, None
+    try:
+        actor.__init__(*start.args, **start.kwargs)
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        ctx.close()
+        cell.actor = cell.ctx = None
+        reason = exits.crash(error)
+        if cell.more is not None:
+            cell.more.reason = reason
+        raise StartFailed(cell.path, str(reason)) from error
+
+
+def up(cell: Cell) -> None:
+    """Let the run loop at the queue."""
+    cell.scheduled = False
+    if cell.queue:
+        cell.schedule()
+
+
+def open_context(cell: Cell) -> contextvars.Context:
+    """The life's own context, in which `current` names it for good: sends find their sender there."""
+    context = cell.node.base_context.copy()
+    context.run(current.set, cell.ctx)
+    cell.context = context
+    return context
+
+
+class FirstTurn(Item):
+    """Turn 0: `on_start`."""
+
+    __slots__ = ("restored", "started")
+
+    def __init__(self, restored: bool, started: asyncio.Future[None]) -> None:
+        self.restored, self.started = restored, started
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        result = actor.on_start(item.restored)
+        if asyncio.iscoroutine(result):
+            return _first(result, item.started)
+        item.done()
+        return None
+
+    def done(self) -> None:
+        if not self.started.done():
+            self.started.set_result(None)
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        if not self.started.done():
+            self.started.set_exception(StartFailed(cell.path, reason))
+
+
+async def _first(hook: Any, started: asyncio.Future[None]) -> None:
+    await hook
+    if not started.done():
+        started.set_result(None)
+
+
+class Stop(Item):
+    """A command: end in good order."""
+
+    __slots__ = ("reason",)
+
+    def __init__(self, reason: ExitReason) -> None:
+        self.reason = reason
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        finish(actor.ctx.cell, item.reason)
+        return LEAVE
+
+
+class Kill(Item):
+    """A command: end now, without hooks."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        killed(actor.ctx.cell)
+        return LEAVE
+
+
+def crash(cell: Cell, item: Any, error: BaseException) -> None:
+    """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
+    reason = exits.crash(error)
+    fail = getattr(item, "fail", None)
+    if fail is not None:
+        fail(remote_crash(error))
+    elif isinstance(item, FirstTurn):
+        item.undelivered(cell, str(reason))
+    node = cell.node
+    if node.watched:
+        node.emit(ActorCrashed(cell.path, cell.life, reason, item))
+    finish(cell, reason)
+
+
+def killed(cell: Cell) -> None:
+    """The life ends without hooks; its children are killed with it."""
+    if cell.children:
+        _wind_down(cell, KILLED, _kill_children(cell))
+    else:
+        ended(cell, KILLED)
+
+
+def finish(cell: Cell, reason: ExitReason) -> None:
+    """End a life in good order: children, `on_stop`, then `ended`. Called in the actor's own context."""
+    actor = cell.actor
+    if cell.children or type(actor).on_stop is not Actor.on_stop:
+        _wind_down(cell, reason, _farewell(cell, reason))
+    else:
+        ended(cell, reason)
+
+
+def _wind_down(cell: Cell, reason: ExitReason, farewell: Any) -> None:
+    cell.state = ENDING
+    cell.scheduled = True
+    if cell.node.step(cell, None, farewell):
+        ended(cell, reason)
+        return
+    turn = cell.extra().turn
+    assert turn is not None
+    turn.then = lambda: ended(cell, KILLED if turn.killed else reason)
+
+
+async def _farewell(cell: Cell, reason: ExitReason) -> None:
+    """Stop the children, newest first, then say good-bye."""
+    for child in reversed(list((cell.children or {}).values())):
+        await child.node.stop_child(child)
+    actor = cell.actor
+    assert actor is not None
+    try:
+        result = actor.on_stop(reason)
+        if asyncio.iscoroutine(result):
+            await result
+    except asyncio.CancelledError:
+        raise
+    except BaseException as error:  # A failing hook must not keep the end from being told.
+        cell.node.emit(HookFailed(cell.path, "on_stop", exits.crash(error)))
+
+
+async def _kill_children(cell: Cell) -> None:
+    for child in reversed(list((cell.children or {}).values())):
+        gone = child.ended()
+        child.kill()
+        await gone
+        retire(child, "its parent was killed")
+
+
+def abandon(cell: Cell, life: int) -> None:
+    """A killed turn that swallows its cancellation: its life is over all the same, and its sends are refused."""
+    more = cell.more
+    if cell.life != life or more is None or more.turn is None:
+        return
+    turn, more.turn = more.turn, None
+    cell.node.turns_held -= 1
+    cell.node.emit(LifeAbandoned(cell.path, life))
+    assert turn.killed
+    for child in list((cell.children or {}).values()):
+        child.kill()
+        retire(child, "its parent was abandoned")
+    ended(cell, KILLED)
+
+
+def ended(cell: Cell, reason: ExitReason) -> None:
+    """The life is over: undo what it had, tell who wants to know, and pass the address on."""
+    cell.state = DOWN
+    cell.scheduled = True
+    ctx = cell.ctx
+    if ctx is not None:
+        ctx.close()
+    actor = cell.actor
+    if actor is not None and type(actor).on_undelivered is not Actor.on_undelivered:
+        cell.extra().last = actor  # It may yet be handed what was queued.
+    cell.actor = cell.ctx = cell.context = None
+    more = cell.more
+    if more is not None:
+        more.reason = reason
+        _undo(cell)
+    if cell.spec is not None and cell.parent is not None:
+        if more is not None:
+            links.announce(cell, reason, recovering=False)
+            _tell_enders(more, reason)
+        cell.parent.push(ChildExit(cell, cell.life, reason))
+    else:
+        retire(cell, reason)
+        if more is not None:
+            links.announce(cell, reason, recovering=False)
+            _tell_enders(more, reason)
+
+
+def _tell_enders(more: Any, reason: ExitReason) -> None:
+    enders, more.enders = more.enders, []
+    for future in enders:
+        if not future.done():
+            future.set_result(reason)
+
+
+def _undo(cell: Cell) -> None:
+    """Timers, tasks, subscriptions, names and the suspension end with the life; the stash goes back to the queue."""
+    more = cell.extra()
+    for timer in list(more.timers):
+        timer.cancel()
+    for task in more.tasks:
+        task.cancel()
+    more.tasks.clear()
+    for topic in list(more.topics):
+        cell.node.topics.unsubscribe(topic, cell)
+    for name in more.names:
+        cell.node.names.pop(name, None)
+    more.names.clear()
+    more.urgent = None
+    queue = cell.queue
+    if queue:
+        kept = deque.copy(queue) if type(queue) is deque else deque(queue)
+        deque.clear(queue)
+        queue.extend(item for item in kept if not isinstance(item, Item) or not item.of_life)
+    if more.held is not None:
+        mailbox.queue_of(cell).extend(more.held)
+        more.held = None
+        cell.admit = mailbox.admit_bounded if more.bound is not None else mailbox.admit_queue
+    if more.stash:
+        mailbox.queue_of(cell).extendleft(reversed(more.stash))
+        if more.bound is not None:
+            more.bound.count += len(more.stash)
+        more.stash.clear()
+
+
+def retire(cell: Cell, why: object) -> None:
+    """The address is given up: its name is free, and what is queued will not be handled."""
+    if cell.state is GONE:
+        return
+    cell.state = GONE
+    cell.admit = mailbox.admit_gone  # Closed before it is drained, so that no ask waits on the dead.
+    cell.host.retired(cell)
+    parent = cell.parent
+    if parent is not None and parent.children is not None and parent.children.get(cell.name) is cell:
+        del parent.children[cell.name]
+    queue, cell.queue = cell.queue, None
+    more = cell.more
+    if more is not None:
+        if more.bound is not None:
+            waiting, more.bound.waiting = more.bound.waiting, deque()
+            for ask in waiting:
+                ask.undelivered(cell, str(why))
+            more.bound.release()
+        links.gone(cell, more.reason)
+    while queue:
+        item = deque.popleft(queue)
+        if isinstance(item, Item):
+            item.undelivered(cell, str(why))
+        else:
+            cell.undelivered(item, str(why))
+
+
+class ChildExit(Item):
+    """A child's life has ended: its supervisor decides what follows."""
+
+    __slots__ = ("child", "life", "reason")
+
+    def __init__(self, child: Cell, life: int, reason: ExitReason) -> None:
+        self.child, self.life, self.reason = child, life, reason
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        return actor.child_exited(item.child, item.life, item.reason)
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        retire(self.child, "its supervisor has stopped")
+
+
+def stop_and_wait(cell: Cell, reason: ExitReason = SHUTDOWN) -> asyncio.Future[ExitReason]:
+    """Ask for an end in good order; the future has the reason it really ended with."""
+    gone = cell.ended()
+    cell.request_stop(reason)
+    return gone

@@ -1,0 +1,367 @@
+"""The run loop: one queue of ready actors per node, drained in slices, one turn after another.
+
+A turn of a plain `def` handler is a function call. A turn of an `async def` handler is stepped by hand (`send(None)`)
+in the name of a runner, an idle task; if it suspends, the runner stays with it to its end, so that
+`asyncio.current_task()`, `asyncio.timeout()` and anyio scopes work, and the next turn gets another runner.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+import types
+from asyncio.tasks import _enter_task, _leave_task  # the documented hooks for stepping coroutines in a task's name
+from collections import deque
+from collections.abc import Callable, Generator
+from typing import TYPE_CHECKING, Any
+
+from . import lives, mailbox
+from .mail import LEAVE, Item
+from .message import Refusal
+
+if TYPE_CHECKING:
+    from contextvars import Context
+
+    from .cell import Cell
+
+SLICE = 0.0005
+"""Seconds after which the loop lets the host program's own callbacks run."""
+MOST = 64
+"""Messages one actor may handle before the next actor's turn."""
+RUNNERS = 8
+"""Idle runner tasks kept for the next turns."""
+
+Coroutine_ = types.CoroutineType
+
+
+class RunLoop:
+    """The run queue of one node. `make_ready` is the only way in."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.loop = loop
+        self.ready: deque[Cell] = deque()
+        self.awake = False
+        self.now = loop.time()
+        self.most = MOST
+        self.turns_held = 0
+        self.entered: Runner | None = None
+        self._idle: list[Runner] = []
+        self._runners: set[Runner] = set()
+        self._idlers: list[asyncio.Future[None]] = []
+
+    def make_ready(self, cell: Cell) -> None:
+        """Put a cell on the run queue; the caller has set `scheduled`."""
+        self.ready.append(cell)
+        if not self.awake:
+            self.wake()
+
+    def wake(self) -> None:
+        """One callback drains every ready actor."""
+        self.awake = True
+        self.loop.call_soon(self._drain)
+
+    def _drain(self) -> None:
+        """Run ready actors until none is left or the slice is over."""
+        ready = self.ready
+        self.now = self.loop.time()
+        begin = clock()
+        end = begin + SLICE
+        while ready:
+            cell = ready.popleft()
+            context = cell.context
+            if context is None:
+                context = lives.open_context(cell)
+            if context.run(run_turns, cell, self.most):
+                if cell.queue:
+                    ready.append(cell)
+                else:
+                    cell.scheduled = False
+            now = clock()
+            if now > end:
+                # Slow handlers get shorter slices, so that the host's own callbacks never wait for many of them.
+                if self.most > 1 and now - begin > SLICE:
+                    self.most //= 2
+                break
+            begin = now
+        else:
+            if self.most < MOST:
+                self.most += 1
+        if self.entered is not None:
+            self._leave()
+        if ready:
+            self.loop.call_soon(self._drain)
+        else:
+            self.awake = False
+            if self._idlers and not self.turns_held:
+                self._tell_idlers()
+
+    def settled(self) -> asyncio.Future[None]:
+        """A future that ends when no actor of this node has anything to do (suspended turns included)."""
+        future: asyncio.Future[None] = self.loop.create_future()
+        self._idlers.append(future)
+        if not self.awake:
+            self.wake()
+        return future
+
+    def _tell_idlers(self) -> None:
+        waiting, self._idlers = self._idlers, []
+        for future in waiting:
+            if not future.done():
+                future.set_result(None)
+
+    # -- runners ----------------------------------------------------------------------------------------------------
+
+    def enter(self) -> None:
+        """Step coroutines in a runner's name from here to the end of the slice."""
+        runner = self._idle.pop() if self._idle else Runner(self)
+        self.entered = runner
+        _enter_task(self.loop, runner.task)
+
+    def _leave(self) -> Runner:
+        """Give the runner back to the idle ones."""
+        runner = self.entered
+        assert runner is not None
+        self.entered = None
+        _leave_task(self.loop, runner.task)
+        if runner.task.cancelling():  # Somebody kept a handle on it and cancelled it: never use it again.
+            runner.retire()
+        else:
+            self._idle.append(runner)
+        return runner
+
+    def step(self, cell: Cell, item: Any, turn: Any) -> bool:
+        """Run a coroutine's first step inside the cell's context. False: it is suspended, its runner has it now.
+
+        Raises what the coroutine raises.
+        """
+        if self.entered is None:
+            self.enter()
+        try:
+            waiting = turn.send(None)
+        except StopIteration:
+            return True
+        self.hold(cell, item, turn, waiting)
+        return False
+
+    def hold(self, cell: Cell, item: Any, turn: Any, waiting: Any) -> None:
+        """A coroutine has suspended in its first step: its runner stays with it."""
+        runner = self.entered
+        assert runner is not None
+        self.entered = None
+        _leave_task(self.loop, runner.task)
+        self.turns_held += 1
+        suspended = Suspended(cell, item, turn, waiting, runner)
+        cell.extra().turn = suspended
+        runner.take(suspended)
+
+    def turn_over(self, turn: Suspended, error: BaseException | None) -> None:
+        """A suspended turn has ended; its actor goes on."""
+        self.turns_held -= 1
+        cell = turn.cell
+        more = cell.extra()
+        if more.turn is not turn:
+            return  # The life was abandoned meanwhile.
+        more.turn = None
+        if turn.then is not None:
+            turn.then()
+        elif turn.killed or error is not None:
+            # What follows is again user code, maybe: it runs on the run queue, not in this runner's name.
+            mailbox.queue_of(cell).appendleft(TurnEnded(turn, error))
+            self.make_ready(cell)
+        elif cell.queue:
+            self.make_ready(cell)
+        else:
+            cell.scheduled = False
+        if self._idlers and not self.awake:
+            self.wake()
+
+    def idle_again(self, runner: Runner) -> bool:
+        """Whether the runner shall wait for another turn."""
+        if len(self._idle) >= RUNNERS or runner.task.cancelling():
+            return False
+        self._idle.append(runner)
+        return True
+
+    async def close(self) -> None:
+        """End every runner; turns that still hang are cancelled."""
+        self._idle.clear()
+        tasks = [runner.task for runner in self._runners]
+        for task in tasks:
+            task.cancel()
+        if tasks:
+            await asyncio.wait(tasks, timeout=1.0)
+
+    def joined(self, runner: Runner) -> None:
+        """Keep a reference to a runner's task."""
+        self._runners.add(runner)
+
+    def left(self, runner: Runner) -> None:
+        """A runner's task has ended."""
+        self._runners.discard(runner)
+        if runner in self._idle:
+            self._idle.remove(runner)
+
+
+clock: Callable[[], float] = time.monotonic
+
+
+def run_turns(cell: Cell, most: int) -> bool:
+    """Run up to `most` turns of one actor, in its own context. False: it left the run queue."""
+    queue, actor, table, ctx = cell.queue, cell.actor, cell.table, cell.ctx
+    if queue is None or ctx is None:
+        return True
+    count = len(queue)
+    item: Any = None
+    try:
+        for _ in range(count if count < most else most):
+            ctx.item = item = queue.popleft()
+            result = table[type(item)](actor, item)
+            if result is None:
+                continue
+            if type(result) is Coroutine_:
+                node = cell.node
+                if node.entered is None:
+                    node.enter()
+                try:
+                    waiting = result.send(None)
+                except StopIteration:
+                    continue
+                node.hold(cell, item, result, waiting)
+                return False
+            if result is LEAVE:
+                return False
+    except Refusal as no:  # Refused a tell: nobody waits for the answer.
+        cell.node.refused(cell, item, no)
+        return True
+    except BaseException as error:  # Whatever user code raises ends this life, and only this life.
+        if isinstance(error, KeyboardInterrupt):
+            raise
+        lives.crash(cell, item, error)
+        return False
+    return True
+
+
+class TurnEnded(Item):
+    """What is left to do after a suspended turn that did not simply succeed."""
+
+    __slots__ = ("error", "turn")
+
+    def __init__(self, turn: Suspended, error: BaseException | None) -> None:
+        self.turn, self.error = turn, error
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        turn: Suspended = item.turn
+        cell = turn.cell
+        if turn.killed:
+            lives.killed(cell)
+        elif isinstance(item.error, Refusal):
+            cell.node.refused(cell, turn.item, item.error)
+            return None
+        else:
+            lives.crash(cell, turn.item, item.error)
+        return LEAVE
+
+
+class Suspended:
+    """A turn that waits for something, and the runner that waits with it."""
+
+    __slots__ = ("cell", "coroutine", "item", "killed", "runner", "then", "waiting")
+
+    def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
+        self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
+        self.killed = False
+        self.then: Callable[[], None] | None = None  # set when the coroutine is no turn but a winding down
+
+    def kill(self) -> None:
+        """Cancel the turn; `after_turn` then ends the life as killed."""
+        self.killed = True
+        self.runner.task.cancel()
+
+
+class Runner:
+    """A task in whose name turns are stepped; when a turn suspends, it becomes that turn's task."""
+
+    __slots__ = ("_call", "_cancelled", "_loop", "_turn", "task")
+
+    def __init__(self, loop: RunLoop) -> None:
+        self._loop = loop
+        self._turn: Suspended | None = None
+        self._cancelled: asyncio.CancelledError | None = None
+        self._call: asyncio.Future[None] = loop.loop.create_future()
+        self.task = loop.loop.create_task(self._run(), name="holdfast runner")
+        loop.joined(self)
+        self.task.add_done_callback(self._done)
+
+    def take(self, turn: Suspended) -> None:
+        """Wait with this turn from the next tick on."""
+        self._turn = turn
+        if not self._call.done():
+            self._call.set_result(None)
+
+    def retire(self) -> None:
+        """End the task."""
+        self.task.cancel()
+
+    def _done(self, _: object) -> None:
+        self._loop.left(self)
+        if self._turn is not None:
+            # A task that is cancelled before its first step never runs: another one delivers the cancel to the turn.
+            successor = Runner(self._loop)
+            self._turn.runner = successor
+            successor._cancelled = asyncio.CancelledError()
+            successor.take(self._turn)
+
+    async def _run(self) -> None:
+        while True:
+            cancelled, self._cancelled = self._cancelled, None
+            if not self._call.done():
+                try:
+                    await self._call
+                except asyncio.CancelledError as error:
+                    # A cancel can come between the turn's first wait and our taking it over: it belongs to the turn.
+                    if self._turn is None:
+                        raise
+                    cancelled = error
+            turn, self._turn = self._turn, None
+            if turn is None:
+                return
+            self._call = self._loop.loop.create_future()
+            error_left: BaseException | None = None
+            try:
+                context = turn.cell.context
+                assert context is not None
+                await _drive(context, turn.coroutine, turn.waiting, cancelled)
+            except BaseException as error:  # The turn's own outcome, whatever it is: its actor gets it.
+                error_left = error
+            self._loop.turn_over(turn, error_left)
+            if not self._loop.idle_again(self):
+                return
+
+
+@types.coroutine
+def _drive(
+    context: Context, turn: Any, waiting: Any, cancelled: asyncio.CancelledError | None
+) -> Generator[Any, Any, None]:
+    """Step a started coroutine to its end inside `context`, handing what it waits for up to the running task."""
+    while True:
+        try:
+            if cancelled is not None:
+                error, cancelled = cancelled, None
+                if waiting is not None:
+                    waiting._asyncio_future_blocking = False  # We do not wait for it after all.
+                raise error
+            value = yield waiting
+        except GeneratorExit:
+            turn.close()
+            raise
+        except BaseException as error:
+            try:
+                waiting = context.run(turn.throw, error)
+            except StopIteration:
+                return
+        else:
+            try:
+                waiting = context.run(turn.send, value)
+            except StopIteration:
+                return

@@ -1,0 +1,196 @@
+"""What stands in a mailbox: bare messages, envelopes, asks, and the runtime's own items.
+
+The run loop knows nothing of these kinds. It looks up `table[type(item)]` and calls what it finds: a user's handler
+for a message, `run` for everything else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import types
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+from .errors import AskTimeout, HoldfastError, UnknownMessage, type_name
+from .message import Message, Refusal
+
+if TYPE_CHECKING:
+    from .cell import Cell
+    from .context import ActorContext
+
+R = TypeVar("R")
+
+Chain = tuple[tuple[str, int], ...]
+"""Who waits for this ask, nearest first: (address, turn)."""
+
+LEAVE = object()
+"""Returned by an item that took its actor off the run queue: the loop goes on with the next actor."""
+
+
+class Item:
+    """Anything in a mailbox that is no message: it runs itself, in its turn."""
+
+    __slots__ = ()
+    of_life: ClassVar[bool] = True
+    """Whether it concerns one life only, and is dropped when that ends; messages stay with the address."""
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        """Do the item's work; a coroutine is stepped by the loop, LEAVE takes the actor off the run queue."""
+        raise TypeError(f"{type(item).__name__} cannot be run")
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        """The address is gone before the item's turn came."""
+
+
+Handler = Callable[[Any, Any], object]
+
+
+class Table(dict[type, Handler]):
+    """Handlers by the type of what stands in the mailbox.
+
+    Items run themselves, and a derived message goes to the handler of its base; both are found once and remembered.
+    """
+
+    def __init__(self) -> None:
+        super().__init__({Envelope: Envelope.run, Ask: Ask.run})
+
+    def __missing__(self, kind: type) -> Handler:
+        if issubclass(kind, Item):
+            self[kind] = kind.run
+        else:
+            self[kind] = next((self[base] for base in kind.__mro__[1:] if base in self), unhandled)
+        return self[kind]
+
+    def knows(self, kind: type) -> bool:
+        """Whether messages of this type have a handler."""
+        return self[kind] is not unhandled
+
+
+class AnyTable(Table):
+    """The table of an actor whose class is not known here: its home decides what is unknown."""
+
+    def __contains__(self, kind: object) -> bool:
+        return True
+
+    def knows(self, kind: type) -> bool:
+        return True
+
+
+def unhandled(actor: Any, message: Any) -> object:
+    """Stands in the table for types without a handler."""
+    ctx: ActorContext = actor.ctx
+    ctx.cell.node.dead_letter(ctx.cell, message, f"{type(actor).__name__} has no handler for it")
+    return None
+
+
+class Envelope(Item):
+    """A message whose sender is known."""
+
+    __slots__ = ("message", "sender")
+    of_life = False
+
+    def __init__(self, message: Message[Any], sender: Cell) -> None:
+        self.message, self.sender = message, sender
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        message = item.message
+        return actor._table[type(message)](actor, message)
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        cell.undelivered(self.message, reason)
+
+
+Coroutine_ = types.CoroutineType
+
+
+class Ask(Item):
+    """A message that somebody waits for: exactly one outcome reaches `future`."""
+
+    __slots__ = ("chain", "deadline", "future", "message", "sender", "started", "timeout")
+    of_life = False
+
+    def __init__(
+        self,
+        message: Message[Any],
+        sender: Cell | None,
+        chain: Chain,
+        timeout: float,
+        deadline: float,
+        future: asyncio.Future[Any],
+    ) -> None:
+        self.message, self.sender, self.chain = message, sender, chain
+        self.timeout, self.deadline, self.future = timeout, deadline, future
+        self.started = False  # whether a turn may have begun; whoever hands it to another process sets it
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        cell: Cell = actor.ctx.cell
+        if item.deadline <= cell.node.now:  # Nobody waits any more: not run (unless the wait was only cancelled).
+            item.expire(cell)
+            return None
+        item.started = True
+        message = item.message
+        handler = actor._table[type(message)]
+        if handler is unhandled:
+            item.fail(UnknownMessage(cell.path, type_name(type(message))))
+            return None
+        try:
+            result = handler(actor, message)
+        except Refusal as no:
+            item.fail(no)
+            return None
+        if type(result) is Coroutine_:
+            return _finish(item, result)
+        item.answer(result)
+        return None
+
+    def answer(self, reply: object) -> None:
+        """Hand the reply to the asker; a late one is dropped and counted."""
+        if type(reply) is ReplyHandle:
+            return  # The handler keeps the handle and answers later.
+        if not self.future.done():
+            self.future.set_result(reply)
+
+    def fail(self, error: BaseException) -> None:
+        """End the wait with a typed failure."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
+    def expire(self, cell: Cell) -> None:
+        """The deadline has passed; a turn that has not begun will not begin."""
+        self.deadline = 0.0
+        self.fail(AskTimeout(cell.path, self.timeout, None if self.started else False))
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        self.fail(cell.stopped_error(reason))
+
+
+async def _finish(ask: Ask, handler: Coroutine[Any, Any, object]) -> None:
+    """The turn of an async handler that was asked."""
+    try:
+        reply = await handler
+    except Refusal as no:
+        ask.fail(no)
+    else:
+        ask.answer(reply)
+
+
+class ReplyHandle(Generic[R]):
+    """The right to answer one ask later. `return self.ctx.reply_handle()` ends the turn without a reply."""
+
+    __slots__ = ("_ask",)
+
+    def __init__(self, ask: Ask | None) -> None:
+        self._ask = ask
+
+    def reply(self, value: R) -> None:
+        """Answer; a second answer and one after the deadline are dropped."""
+        if self._ask is not None:
+            self._ask.answer(value)
+
+    def fail(self, error: HoldfastError) -> None:
+        """Answer with a Refusal or another typed error."""
+        if self._ask is not None:
+            self._ask.fail(error)

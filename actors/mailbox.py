@@ -1,0 +1,222 @@
+"""How a message gets into a mailbox: one `admit` function per situation, swapped when the situation changes.
+
+`cell.admit(cell, item)` is called for every message; which function stands there says what happens to it. No flag is
+tested per message.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from .errors import MailboxFull, SpecError
+from .mail import Ask, Item
+
+if TYPE_CHECKING:
+    from .cell import Cell
+
+Overflow = Literal["block", "fail", "drop_newest", "drop_oldest", "latest"]
+
+
+def admit_first(cell: Cell, item: Any) -> None:
+    """The first message: make the queue (an empty deque is 760 bytes), then go on as `admit_queue`."""
+    if type(item) not in cell.table:
+        cell.require(item)
+    queue_of(cell).append(item)
+    cell.schedule()
+
+
+def admit_queue(cell: Cell, item: Any) -> None:
+    """The unbounded mailbox: the hot path."""
+    if type(item) not in cell.table:
+        cell.require(item)
+    cell.queue.append(item)  # type: ignore[union-attr] - this function stands there only when the queue is made
+    if not cell.scheduled:
+        cell.scheduled = True
+        node = cell.node
+        node.ready.append(cell)
+        if not node.awake:
+            node.wake()
+
+
+def admit_held(cell: Cell, item: Any) -> None:
+    """The actor is suspended: messages wait apart, so that commands still run."""
+    if type(item) not in cell.table:
+        cell.require(item)
+    more = cell.extra()
+    assert more.held is not None
+    more.held.append(item)
+
+
+def admit_bounded(cell: Cell, item: Any) -> None:
+    """A mailbox with a capacity: what does not fit goes by the overflow policy."""
+    if type(item) not in cell.table:
+        cell.require(item)
+    bound = cell.extra().bound
+    assert bound is not None
+    bound.admit(cell, item)
+
+
+def admit_gone(cell: Cell, item: Any) -> None:
+    """The address has ended: another life may have been started there since, else it is a dead letter."""
+    successor = cell.node.successor(cell)
+    if successor is not None:
+        successor.admit(successor, item)
+    elif isinstance(item, Item):
+        item.undelivered(cell, "it has stopped")
+    else:
+        cell.node.dead_letter(cell, item, "the actor has stopped")
+
+
+def queue_of(cell: Cell) -> deque[Any]:
+    """The cell's queue, made now if there was none."""
+    if cell.queue is None:
+        bound = cell.more.bound if cell.more is not None else None
+        cell.queue = deque() if bound is None else BoundedQueue(cell)
+        if cell.admit is admit_first:
+            cell.admit = admit_queue
+    return cell.queue
+
+
+class Bound:
+    """A mailbox's capacity, its overflow policy, and who waits for room.
+
+    Only messages count, and only while they are queued: commands and signals always fit.
+    """
+
+    __slots__ = ("capacity", "count", "overflow", "senders", "waiting")
+
+    def __init__(self, capacity: int, overflow: Overflow) -> None:
+        self.capacity, self.overflow = capacity, overflow
+        self.count = 0
+        self.waiting: deque[Ask] = deque()  # asks that wait for room, first in, first served
+        self.senders: deque[asyncio.Future[None]] = deque()  # `send`s that wait for room
+
+    def admit(self, cell: Cell, item: Any) -> None:
+        """Take the item, or let the policy decide."""
+        if self.count < self.capacity and not self.waiting:
+            self.put(cell, item)
+            return
+        match self.overflow:
+            case "block" if isinstance(item, Ask):
+                self.waiting.append(item)
+            case "block" | "fail":
+                self._refuse(cell, item)
+            case "drop_newest":
+                self._lose(cell, item)
+            case "drop_oldest":
+                self._lose_queued(cell, keep=self.capacity - 1)
+                self.put(cell, item)
+            case "latest":
+                self._lose_queued(cell, keep=0)
+                self.put(cell, item)
+
+    def put(self, cell: Cell, item: Any) -> None:
+        """Append, counted."""
+        self.count += 1
+        (cell.extra().held if cell.admit is admit_held else queue_of(cell)).append(item)  # type: ignore[union-attr]
+        cell.schedule()
+
+    def taken(self, cell: Cell) -> None:
+        """One message has left the queue: let the next one in."""
+        self.count -= 1
+        while self.waiting and self.count < self.capacity:
+            ask = self.waiting.popleft()
+            if not ask.future.done():  # Expired or given up while it waited: never admitted.
+                self.put(cell, ask)
+        # One wakes for each free place; it tries again and may find the place taken, then it waits once more.
+        while self.senders and self.count < self.capacity:
+            sender = self.senders.popleft()
+            if not sender.done():
+                sender.set_result(None)
+                break
+
+    def room(self, cell: Cell) -> asyncio.Future[None] | None:
+        """For `send`: None if there is room (or the policy never waits)."""
+        if self.overflow != "block" or (self.count < self.capacity and not self.waiting):
+            return None
+        future: asyncio.Future[None] = cell.node.loop.create_future()
+        self.senders.append(future)
+        return future
+
+    def release(self) -> None:
+        """The address is gone: whoever waits shall see it."""
+        for sender in self.senders:
+            if not sender.done():
+                sender.set_result(None)
+        self.senders.clear()
+
+    def _refuse(self, cell: Cell, item: Any) -> None:
+        error = MailboxFull(cell.path, self.capacity)
+        if isinstance(item, Ask):
+            item.fail(error)
+            return
+        raise error
+
+    def _lose(self, cell: Cell, item: Any) -> None:
+        message = item.message if isinstance(item, Item) else item
+        if isinstance(item, Ask):
+            item.fail(MailboxFull(cell.path, self.capacity))
+        cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})")
+
+    def _lose_queued(self, cell: Cell, keep: int) -> None:
+        """Drop queued messages, oldest first, until `keep` are left."""
+        queue = queue_of(cell)
+        kept: list[Any] = []
+        while self.count > keep and queue:
+            item = deque.popleft(queue)
+            if counts(item):
+                self.count -= 1
+                self._lose(cell, item)
+            else:
+                kept.append(item)
+        queue.extendleft(reversed(kept))
+
+
+def counts(item: Any) -> bool:
+    """Whether an item takes one of a bounded mailbox's places: messages do, the runtime's own do not."""
+    return not isinstance(item, Item) or hasattr(item, "message")
+
+
+class BoundedQueue(deque[Any]):
+    """The queue of a bounded mailbox: taking a message makes room. Only these actors pay for it."""
+
+    def __init__(self, cell: Cell) -> None:
+        super().__init__()
+        self._cell = cell
+
+    def popleft(self) -> Any:
+        item = super().popleft()
+        if counts(item):
+            bound = self._cell.extra().bound
+            assert bound is not None
+            bound.taken(self._cell)
+        return item
+
+
+class Bounded:
+    """The choice of a bounded mailbox, for a child spec; made by `bounded`."""
+
+    __slots__ = ("capacity", "overflow")
+
+    def __init__(self, capacity: int, overflow: Overflow) -> None:
+        self.capacity, self.overflow = capacity, overflow
+
+    def __repr__(self) -> str:
+        return f"bounded({self.capacity}, overflow={self.overflow!r})"
+
+
+def bounded(capacity: int, *, overflow: Overflow = "block") -> Bounded:
+    """A mailbox for at most `capacity` messages.
+
+    Args:
+        capacity: messages, >= 1.
+        overflow: "block" (tell raises MailboxFull, send waits, ask waits to its deadline), "fail" (all raise),
+            "drop_newest", "drop_oldest", or "latest" (only the newest is kept); the loser goes to dead letters.
+    """
+    if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
+        raise SpecError("bounded", f"capacity must be a whole number of messages >= 1, not {capacity!r}")
+    if overflow not in get_args(Overflow):
+        raise SpecError("bounded", f"overflow must be one of {', '.join(get_args(Overflow))}, not {overflow!r}")
+    return Bounded(capacity, overflow)

@@ -1,0 +1,220 @@
+"""The node: an OS process that hosts actors. It owns the run loop, the tree of cells, and what they share."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import itertools
+import random
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from . import lives
+from .cell import DOWN, GONE, RUNNING, Cell, Host
+from .deadlines import Deadlines
+from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
+from .events import DeadLetter, Event, EventHub
+from .exits import ExitReason
+from .lives import LOCAL
+from .loop import RunLoop
+from .mailbox import Bounded
+from .message import Message, Refusal
+from .topics import Topics
+
+if TYPE_CHECKING:
+    from .actor import Actor, Start
+    from .ref import ActorRef
+
+A = TypeVar("A", bound="Actor")
+
+
+class Node(RunLoop):
+    """One process's actors. All of a node runs on one event loop, in one thread."""
+
+    def __init__(self, name: str, loop: asyncio.AbstractEventLoop, *, seed: int | None = None) -> None:
+        super().__init__(loop)
+        if not name or "/" in name:
+            raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
+        self.name = name
+        self.base_context = contextvars.copy_context()
+        self.deadlines = Deadlines(loop)
+        self.watched = False  # whether anybody looks at events: else they are not even made
+        self.events = EventHub(self._watch)
+        self.topics = Topics()
+        self.names: dict[str, Cell] = {}
+        self.dead_letters = 0
+        self.wall: Callable[[], float] = time.time
+        self.outside: Callable[[str], Cell | None] | None = None  # finds cells of other processes
+        self.root: Cell | None = None
+        self.host_for: Callable[[Any], Host] = lambda spec: LOCAL  # chooses where a child spec's lives are lived
+        self._seeds = random.Random(seed)
+        self._numbers = itertools.count(1)
+        self._turns = itertools.count(1)
+
+    # -- events -----------------------------------------------------------------------------------------------------
+
+    def _watch(self, watched: bool) -> None:
+        self.watched = watched
+
+    def emit(self, event: Event) -> None:
+        """Put an event on the stream."""
+        self.events.emit(event)
+
+    def dead_letter(self, cell: Cell, message: object, why: str) -> None:
+        """A message that nobody handles: counted, and told to who looks."""
+        self.dead_letters += 1
+        if self.watched:
+            self.events.emit(DeadLetter(cell.path, message, why))
+
+    def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
+        """A tell was answered with a Refusal: there is nobody to hand it to."""
+        if self.watched:
+            self.events.emit(DeadLetter(cell.path, item, f"refused: {no}"))
+
+    # -- numbers ----------------------------------------------------------------------------------------------------
+
+    def seed(self) -> int:
+        """A seed for an actor's random generator."""
+        return self._seeds.getrandbits(64)
+
+    def next_turn(self) -> int:
+        """A number for a turn that asks."""
+        return next(self._turns)
+
+    # -- the tree ---------------------------------------------------------------------------------------------------
+
+    def cell_below(self, parent: Cell | None, name: str | None, host: Host = LOCAL) -> Cell:
+        """A new cell in the tree.
+
+        Raises:
+            NameTaken: there is one of that name.
+        """
+        if name is None:
+            name = f"${next(self._numbers)}"
+        elif parent is not None and (not name or "/" in name):
+            raise SpecError("name", f"an actor's name must be text without '/', not {name!r}")
+        cell = Cell(self, parent, name, host)
+        if parent is not None:
+            if parent.children is None:
+                parent.children = {}
+            elif name in parent.children:
+                raise NameTaken(f"{parent.path}/{name}")
+            parent.children[name] = cell
+        return cell
+
+    def spawn(
+        self, start: Start[Any], name: str | None = None, *, parent: Cell | None = None, mailbox: Bounded | None = None
+    ) -> Cell:
+        """Start an actor in this process that nobody restarts. It is up when this returns, but for its `on_start`."""
+        cell = self.cell_below(parent if parent is not None else self.root, name)
+        if mailbox is not None:
+            self.bound(cell, mailbox)
+        try:
+            lives.begin(cell, start)
+        except BaseException:
+            lives.retire(cell, "it could not be started")
+            raise
+        return cell
+
+    def bound(self, cell: Cell, choice: Bounded) -> None:
+        """Give a cell without messages a bounded mailbox."""
+        from .mailbox import Bound, admit_bounded
+
+        cell.extra().bound = Bound(choice.capacity, choice.overflow)
+        cell.admit = admit_bounded
+
+    async def stop_child(self, cell: Cell) -> ExitReason:
+        """Stop a child in good order, as its parent ends: by its spec, if it has one."""
+        if cell.state is DOWN or cell.state is GONE:
+            lives.retire(cell, "its parent has stopped")
+            return cell.extra().reason
+        stop = getattr(cell.spec, "stop", None)
+        reason: ExitReason = await (stop(cell) if stop is not None else lives.stop_and_wait(cell))
+        lives.retire(cell, "its parent has stopped")
+        return reason
+
+    def find(self, path: str) -> Cell | None:
+        """The cell at an address, here or (through `outside`) in another process."""
+        root = self.root
+        if root is not None and (path == root.path or path.startswith(root.path + "/")):
+            cell: Cell | None = root
+            for name in path[len(root.path) :].split("/")[1:]:
+                cell = cell.children.get(name) if cell is not None and cell.children else None
+                if cell is None:
+                    break
+            if cell is not None:
+                return cell
+        return self.outside(path) if self.outside is not None else None
+
+    def successor(self, cell: Cell) -> Cell | None:
+        """The living cell at the address of a dead one."""
+        found = self.find(cell.path)
+        return None if found is None or found.state is GONE else found
+
+    def find_ref(self, path: str, kind: type[A]) -> ActorRef[A]:
+        """A ref to the actor at `path`.
+
+        Raises:
+            NoSuchActor: nobody lives there. WrongActor: another class does.
+        """
+        from .ref import ActorRef
+
+        cell = self.find(path)
+        if cell is None or cell.is_dead:
+            raise NoSuchActor(path)
+        found = cell_kind(cell)
+        if found is not None and not issubclass(found, kind):
+            raise WrongActor(path, type_name(kind), type_name(found))
+        return ActorRef(cell)
+
+    def register(self, name: str, cell: Cell) -> None:
+        """Give an actor a name beside its path; it is free again before anybody hears of the actor's end.
+
+        Raises:
+            NameTaken: another living actor has it.
+        """
+        holder = self.names.get(name)
+        if holder is not None and holder is not cell:
+            raise NameTaken(name)
+        if cell.state is not RUNNING:
+            raise ActorStopped(cell.path)
+        self.names[name] = cell
+        cell.extra().names.append(name)
+
+    def unregister(self, name: str) -> None:
+        """Free a name; unknown ones are fine."""
+        cell = self.names.pop(name, None)
+        if cell is not None and cell.more is not None and name in cell.more.names:
+            cell.more.names.remove(name)
+
+    def bind(self, cell: Cell, port: str, target: Cell) -> None:
+        """Point a binding elsewhere; the owner sees it from its next turn on.
+
+        Raises:
+            SpecError: the class has no such binding.
+        """
+        kind = cell_kind(cell)
+        if kind is not None and port not in kind._bindings:
+            known = ", ".join(sorted(kind._bindings)) or "none"
+            raise SpecError(cell.path, f"{type_name(kind)} has no binding {port!r} (it has: {known})")
+        cell.extra().bindings[port] = target
+
+
+def cell_kind(cell: Cell) -> type[Actor] | None:
+    """The actor class that lives at a cell, as far as it is known here."""
+    if cell.actor is not None:
+        return type(cell.actor)
+    start = cell.more.start if cell.more is not None else None
+    return None if start is None else start.kind
+
+
+def public(error: BaseException) -> bool:
+    """Whether an error is holdfast's own."""
+    return isinstance(error, HoldfastError)
+
+
+def message_of(item: object) -> Message[Any] | None:
+    """The user's message inside a mailbox item, if there is one."""
+    found = item if isinstance(item, Message) else getattr(item, "message", None)
+    return found if isinstance(found, Message) else None

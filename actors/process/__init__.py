@@ -1,0 +1,1 @@
+"""Actors in an OS process of their own."""

@@ -1,0 +1,524 @@
+"""The parent's side of the fork server: OS processes for actors, a few milliseconds each.
+
+`ForkServer` starts the server by exec (`zygote.py` says what it does there), sends it requests over a Unix socket and
+sees its death through a pidfd. It touches no signal handler of the program it runs in, SIGCHLD's neither.
+
+Source: the fork server of `multiprocessing`; the zygote of Android.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import builtins
+import contextlib
+import importlib
+import json
+import mmap
+import os
+import signal
+import socket
+import subprocess
+import sys
+import sysconfig
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from ..errors import ProcessUnavailable
+from . import zygote
+from .zygote import HEADER, PAGE_BYTES, SERVER_VARIABLE, Config, Kind, receive
+
+FORK_SECONDS = 10.0  # a server that does not answer by then is stopped or stuck
+IMPORT_SECONDS = 120.0  # time for user modules to be imported
+SOCKET_BYTES = 2 * 1024 * 1024
+FORKS_IN_FLIGHT = 32  # each holds eight descriptors here, and four more on their way
+PACKETS_PER_TICK = 64
+
+# Without these, messages of a megabyte cost a page fault per page each time: 4 to 5 times slower.
+_MALLOC = {
+    "MALLOC_MMAP_THRESHOLD_": "67108864",
+    "MALLOC_TRIM_THRESHOLD_": "134217728",
+    "MALLOC_TOP_PAD_": "16777216",
+}
+# Native thread pools: their threads would not survive the fork, and bit-identical replay needs one thread.
+_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+@dataclass(slots=True)
+class Forked:
+    """One actor process, seen from the root.
+
+    Who hands a descriptor on (to a transport that will close it) sets the field to -1; `close` closes what is left.
+
+    Attributes:
+        sock: our end of the socket pair, non-blocking.
+        page: 4096 bytes shared with the child; readable after its death, however it died.
+    """
+
+    pid: int
+    pidfd: int
+    sock: socket.socket
+    stdout_fd: int
+    stderr_fd: int
+    page: mmap.mmap
+
+    def kill(self, signum: int = signal.SIGKILL) -> None:
+        """Send a signal to this very process; nothing happens if it is dead already."""
+        if self.pidfd >= 0:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self.pidfd, signum)
+
+    def close(self) -> None:
+        """Give everything back; may be called twice. The process sees the end of its socket."""
+        self.sock.close()
+        for fd in (self.pidfd, self.stdout_fd, self.stderr_fd):
+            if fd >= 0:
+                os.close(fd)
+        self.pidfd = self.stdout_fd = self.stderr_fd = -1
+        self.page.close()
+
+
+class _Request:
+    """A fork that was asked for: our ends of everything, the child's ends until they are sent, and the outcome."""
+
+    def __init__(self, number: int, outcome: asyncio.Future[int]) -> None:
+        self.number = number
+        self.outcome = outcome  # the child's pid
+        self.pidfd = -1
+        self.status: int | None = None  # wait status, if it died before anybody had it
+        self.handed_over = False
+        self._child_fds: list[int] = []
+        with contextlib.ExitStack() as undo:
+            self.sock, theirs = socket.socketpair()
+            undo.callback(self.sock.close)
+            undo.callback(theirs.close)
+            self._set_up(self.sock, theirs)
+            self.stdout_fd, stdout = self._pipe(undo)
+            self.stderr_fd, stderr = self._pipe(undo)
+            page_fd = os.memfd_create("holdfast-page", os.MFD_CLOEXEC)
+            undo.callback(os.close, page_fd)
+            os.ftruncate(page_fd, PAGE_BYTES)
+            self.page = mmap.mmap(page_fd, PAGE_BYTES)
+            undo.pop_all()
+        self._child_fds = [theirs.detach(), stdout, stderr, page_fd]
+
+    @staticmethod
+    def _set_up(ours: socket.socket, theirs: socket.socket) -> None:
+        ours.setblocking(False)
+        for sock in (ours, theirs):
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BYTES)
+
+    @staticmethod
+    def _pipe(undo: contextlib.ExitStack) -> tuple[int, int]:
+        out, into = os.pipe2(os.O_CLOEXEC)
+        undo.callback(os.close, out)
+        undo.callback(os.close, into)
+        os.set_blocking(out, False)  # our end only: a child's print() must not fail with EAGAIN
+        return out, into
+
+    def send(self, control: socket.socket) -> None:
+        """Ask the server; raises BlockingIOError if it must be tried again."""
+        if self._child_fds:  # otherwise nobody waits any more
+            socket.send_fds(control, [HEADER.pack(Kind.FORK, self.number, 0)], self._child_fds)
+            self._close_child_fds()
+
+    def _close_child_fds(self) -> None:
+        for fd in self._child_fds:
+            os.close(fd)
+        self._child_fds = []
+
+    def hand_over(self) -> Forked:
+        """The process, now the caller's."""
+        self.handed_over = True
+        return Forked(self.outcome.result(), self.pidfd, self.sock, self.stdout_fd, self.stderr_fd, self.page)
+
+    def abandon(self) -> None:
+        """Nobody wants it: kill what there may be, close everything."""
+        self._close_child_fds()
+        done = Forked(-1, self.pidfd, self.sock, self.stdout_fd, self.stderr_fd, self.page)
+        done.kill()
+        done.close()
+        self.pidfd = -1
+
+
+class ForkServer:
+    """Forks actor processes from one that has everything imported.
+
+    Belongs to the event loop it is started in, stock or uvloop. When it is lost it stays lost: start another one.
+
+    Args:
+        entry: "module:function", called in each child with (socket, descriptor of the page); it returns the exit code.
+        preload: names or paths of modules to import before the first fork.
+        on_exit: called with (pid, wait status as from `waitpid`) when a child that `fork` has returned is dead and
+            reaped, and its descendants are killed. Not called for children that end with the server.
+        on_lost: called when the server has died without `stop`; its children are being killed by the kernel.
+        fork_seconds: time limit of `fork`.
+    """
+
+    def __init__(
+        self,
+        entry: str,
+        preload: Sequence[str],
+        *,
+        on_exit: Callable[[int, int], None],
+        on_lost: Callable[[], None],
+        fork_seconds: float = FORK_SECONDS,
+    ) -> None:
+        self.preload_errors: dict[str, str] = {}
+        """What could not be imported, and why; "__main__" is the program itself."""
+        self.threads = 0
+        """Threads in the server when it was ready. All but one were started by modules; a fork does not copy them."""
+        self._entry, self._preload = entry, list(preload)
+        self._on_exit, self._on_lost = on_exit, on_lost
+        self._fork_seconds = fork_seconds
+        self._process: subprocess.Popen[bytes] | None = None
+        self._pidfd = -1
+        self._control: socket.socket | None = None
+        self._stopping = False
+        self._ended = asyncio.Event()
+        self._slots = asyncio.Semaphore(FORKS_IN_FLIGHT)
+        self._outbox: deque[_Request | bytes] = deque()
+        self._loading = 0  # PRELOADs without an answer
+        self._last_number = 0
+        self._requests: dict[int, _Request] = {}  # by number, unanswered
+        self._unclaimed: dict[int, _Request] = {}  # by pid, answered, `fork` has not resumed yet
+        self._children: set[int] = set()  # pids that `fork` has returned
+
+    @property
+    def pid(self) -> int:
+        """The server's pid, also after its end."""
+        if self._process is None:
+            raise ProcessUnavailable("the fork server has not been started")
+        return self._process.pid
+
+    # --- starting and stopping
+
+    async def start(self) -> None:
+        """Exec the server and wait until it has imported everything.
+
+        Raises:
+            ProcessUnavailable: not on Linux, no process to be had, or the entry point cannot be imported.
+        """
+        _check_can_start()
+        if self._process is not None:
+            raise ProcessUnavailable("a fork server is started once; make another one")
+        self._loop = asyncio.get_running_loop()
+        self._ready: asyncio.Future[None] = self._loop.create_future()
+        try:
+            self._exec()
+            async with asyncio.timeout(IMPORT_SECONDS):
+                await self._ready
+        except BaseException as error:
+            await self.stop(0.0)
+            if isinstance(error, TimeoutError):
+                raise ProcessUnavailable(f"the fork server still imports after {IMPORT_SECONDS:g} s") from None
+            if isinstance(error, OSError):
+                raise ProcessUnavailable(f"the fork server cannot be started: {error}") from error
+            raise
+
+    def _exec(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control = ours
+        ours.setblocking(False)
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
+        with theirs:
+            config = json.dumps(_config(self._entry, self._preload)._asdict())
+            ours.send(HEADER.pack(Kind.CONFIG, 0, 0) + config.encode())
+            self._process = subprocess.Popen(
+                _command(theirs.fileno()),
+                stdin=subprocess.DEVNULL,
+                stdout=_inherited(1),
+                stderr=_inherited(2),
+                pass_fds=(theirs.fileno(),),
+                env={**_MALLOC, **_THREADS, **os.environ},
+                start_new_session=True,  # a Ctrl-C in the terminal is the program's business
+            )
+        try:
+            self._pidfd = os.pidfd_open(self._process.pid)
+        except OSError:
+            self._process.kill()  # not reaped yet, so the pid is still its own
+            self._process.wait()
+            raise
+        self._loop.add_reader(self._pidfd, self._on_death)
+        self._loop.add_reader(ours.fileno(), self._on_readable)
+
+    async def stop(self, timeout: float = 2.0) -> None:
+        """End the server, which kills all its children and their descendants first; may be called twice.
+
+        Args:
+            timeout: seconds until the server itself is killed; its children then die too, their descendants may not.
+        """
+        self._stopping = True
+        self._close_control()
+        self._fail_all("the fork server was stopped")
+        if self._pidfd < 0:
+            return
+        try:
+            async with asyncio.timeout(timeout):
+                await self._ended.wait()
+        except TimeoutError:
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+            await self._ended.wait()
+
+    def _on_death(self) -> None:
+        """The server's pidfd is readable: it has ended."""
+        assert self._process is not None
+        self._read_packets(limit=None)  # deaths it had still reported
+        self._loop.remove_reader(self._pidfd)
+        os.close(self._pidfd)
+        self._pidfd = -1
+        self._process.poll()  # reaps exactly this process; somebody else's waitpid(-1) may have been first
+        self._close_control()
+        self._ended.set()
+        was_ready = self._ready.done() and not self._ready.cancelled() and self._ready.exception() is None
+        self._fail_all(f"the fork server (pid {self._process.pid}) has died ({_cause(self._process.returncode)})")
+        if was_ready and not self._stopping:
+            self._on_lost()
+
+    def _close_control(self) -> None:
+        if self._control is not None:
+            if self._process is not None:
+                self._loop.remove_reader(self._control.fileno())
+                self._loop.remove_writer(self._control.fileno())
+            self._control.close()
+            self._control = None
+
+    def _fail_all(self, problem: str) -> None:
+        """Nothing will be answered any more. Requests close their descriptors when `fork` resumes."""
+        self._outbox.clear()
+        self._loading = 0
+        self._children.clear()
+        waiting = [request.outcome for request in self._requests.values()]
+        if self._process is not None:
+            waiting.append(self._ready)  # type: ignore[arg-type]
+        for future in waiting:
+            if not future.done():
+                future.set_exception(ProcessUnavailable(problem))
+                future.exception()  # whoever waited may have been cancelled: then nobody else asks for it
+
+    # --- forking
+
+    async def fork(self) -> Forked:
+        """Start one process; calls may overlap.
+
+        Raises:
+            ProcessUnavailable: the server is gone or does not answer, or no process, memory or descriptor is left.
+        """
+        seconds = self._fork_seconds + (IMPORT_SECONDS if self._loading else 0.0)
+        try:
+            async with asyncio.timeout(seconds), self._slots:
+                return await self._fork()
+        except TimeoutError:
+            raise ProcessUnavailable(f"the fork server (pid {self.pid}) did not answer within {seconds:g} s") from None
+        except OSError as error:
+            raise ProcessUnavailable(f"no process can be started: {error}") from error
+
+    async def _fork(self) -> Forked:
+        if self._control is None or not self._ready.done():
+            raise ProcessUnavailable("the fork server does not run")
+        self._last_number += 1
+        request = _Request(self._last_number, self._loop.create_future())
+        self._requests[request.number] = request
+        try:
+            self._post(request)
+            pid = await request.outcome
+            self._children.add(pid)
+            return request.hand_over()
+        finally:
+            self._requests.pop(request.number, None)
+            self._claim(request)
+
+    def _claim(self, request: _Request) -> None:
+        """`fork` resumes: its caller has the process now, or nobody has."""
+        outcome = request.outcome
+        pid = outcome.result() if outcome.done() and not outcome.cancelled() and outcome.exception() is None else -1
+        self._unclaimed.pop(pid, None)
+        if not request.handed_over:
+            request.abandon()
+        elif request.status is not None:
+            # Soon, not now: the caller must first learn of the process before it learns of its death.
+            self._loop.call_soon(self._report, pid, request.status)
+
+    def preload(self, module_or_path: str) -> None:
+        """Import one more module in the server; processes forked from now on have it. Problems go to `preload_errors`.
+
+        Raises:
+            ProcessUnavailable: the server does not run.
+        """
+        if self._control is None:
+            raise ProcessUnavailable("the fork server does not run")
+        self._loading += 1
+        self._post(HEADER.pack(Kind.PRELOAD, 0, 0) + module_or_path.encode())
+
+    # --- the control socket
+
+    def _post(self, packet: _Request | bytes) -> None:
+        self._outbox.append(packet)
+        if len(self._outbox) == 1:
+            self._flush()
+
+    def _flush(self) -> None:
+        """Send what there is, in order; come back when the socket takes more."""
+        control = self._control
+        if control is None:
+            return
+        try:
+            while self._outbox:
+                self._send(control, self._outbox[0])
+                self._outbox.popleft()
+        except BlockingIOError:
+            self._loop.add_writer(control.fileno(), self._flush)
+            return
+        self._loop.remove_writer(control.fileno())
+
+    def _send(self, control: socket.socket, packet: _Request | bytes) -> None:
+        """One packet; a failure other than "not now" is the packet's own, and its sender is told."""
+        try:
+            if isinstance(packet, _Request):
+                packet.send(control)
+            else:
+                control.send(packet)
+        except BlockingIOError:
+            raise
+        except OSError as error:  # a dead server is told by its pidfd
+            if isinstance(packet, _Request) and not packet.outcome.done():
+                packet.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be reached: {error}"))
+
+    def _on_readable(self) -> None:
+        self._read_packets(PACKETS_PER_TICK)
+
+    def _read_packets(self, limit: int | None) -> None:
+        """Handle what has arrived, at most `limit` packets: the program's own callbacks want their turn."""
+        while self._control is not None and limit != 0:
+            limit = None if limit is None else limit - 1
+            try:
+                data, fds = receive(self._control, 1)
+            except BlockingIOError:
+                return
+            except ConnectionError:
+                data, fds = b"", []
+            if not data:  # its end; what that means is told by the pidfd
+                self._loop.remove_reader(self._control.fileno())
+                return
+            kind, number, value = HEADER.unpack_from(data)
+            self._on_packet(Kind(kind), number, value, data[HEADER.size :].decode(), fds)
+
+    def _on_packet(self, kind: Kind, number: int, value: int, text: str, fds: list[int]) -> None:
+        match kind:
+            case Kind.FORKED:
+                self._on_forked(number, value, fds)
+            case Kind.EXITED:
+                self._on_exited(number, value)
+            case Kind.REFUSED:
+                self._refuse(number, text)
+            case Kind.READY if not self._ready.done():
+                self.threads = value
+                self._ready.set_result(None)
+            case Kind.BROKEN if not self._ready.done():
+                self._ready.set_exception(ProcessUnavailable(f"the fork server cannot import {self._entry}: {text}"))
+            case Kind.PROBLEM:
+                name, why = json.loads(text)
+                self.preload_errors[name] = why
+            case Kind.LOADED:
+                self._loading -= 1
+            case _:
+                pass
+
+    def _on_forked(self, number: int, pid: int, fds: list[int]) -> None:
+        request = self._requests.pop(number, None)
+        if request is None or request.outcome.done():  # given up meanwhile
+            for fd in fds:
+                with contextlib.suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(fd, signal.SIGKILL)
+                os.close(fd)
+        elif not fds:  # no descriptor was free here; the child ends with its socket
+            request.outcome.set_exception(ProcessUnavailable("no process can be started: out of file descriptors"))
+        else:
+            request.pidfd = fds[0]
+            self._unclaimed[pid] = request
+            request.outcome.set_result(pid)
+
+    def _refuse(self, number: int, why: str) -> None:
+        request = self._requests.pop(number, None)
+        if request is not None and not request.outcome.done():
+            request.outcome.set_exception(ProcessUnavailable(f"no process can be started: {why}"))
+
+    def _on_exited(self, pid: int, status: int) -> None:
+        if pid in self._unclaimed:
+            self._unclaimed.pop(pid).status = status
+        else:
+            self._report(pid, status)
+
+    def _report(self, pid: int, status: int) -> None:
+        if pid in self._children:
+            self._children.remove(pid)
+            self._on_exit(pid, status)
+
+
+# --- what the server is told about this process
+
+
+def _check_can_start() -> None:
+    if not sys.platform.startswith("linux"):
+        raise ProcessUnavailable(f"actors in processes of their own need Linux (pidfd, memfd); this is {sys.platform}")
+    if os.environ.get(SERVER_VARIABLE) == str(os.getpid()):
+        raise ProcessUnavailable(
+            "this program is being imported by the fork server and must not start a system then; "
+            'put what it does under `if __name__ == "__main__":`'
+        )
+
+
+def _command(control_fd: int) -> list[str]:
+    # Our own flags (-O changes what `assert` means), and -P: the file's directory is no place to import from.
+    flags: list[str] = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
+    return [sys.executable, *flags, "-P", os.path.abspath(zygote.__file__), str(control_fd)]
+
+
+def _inherited(fd: int) -> int | None:
+    """Share a standard stream with the server, or give it /dev/null if a daemon has closed it."""
+    try:
+        os.fstat(fd)
+    except OSError:
+        return subprocess.DEVNULL
+    return None
+
+
+def _config(entry: str, preload: list[str]) -> Config:
+    package = __name__.partition(".")[0]
+    main, is_path = _program()
+    return Config(
+        parent=os.getpid(),
+        entry=entry,
+        preload=preload,
+        path=[directory or os.getcwd() for directory in sys.path],
+        argv=sys.argv,
+        package=package,
+        package_path=[os.path.abspath(path) for path in importlib.import_module(package).__path__],
+        main=main,
+        main_is_path=is_path,
+    )
+
+
+def _program() -> tuple[str, bool]:
+    """What `__main__` is: a module's name, or a path (then True), or "" if it cannot be imported a second time."""
+    module = sys.modules["__main__"]
+    if hasattr(sys, "ps1") or hasattr(builtins, "__IPYTHON__"):
+        return "", False
+    if module.__spec__ is not None:  # python -m name; a package's __main__.py seldom has a guard
+        name = module.__spec__.name
+        return ("", False) if name.rpartition(".")[2] == "__main__" else (name, False)
+    file = getattr(module, "__file__", None)
+    if file is None:  # python -c
+        return "", False
+    path = os.path.abspath(file)
+    if os.path.dirname(path) in {os.path.dirname(sys.executable), sysconfig.get_path("scripts")}:
+        return "", False  # a console script, such as pytest, defines no actors
+    return path, True
+
+
+def _cause(returncode: int | None) -> str:
+    if returncode is None:
+        return "cause unknown"
+    return f"signal {-returncode}" if returncode < 0 else f"exit code {returncode}"

@@ -1,0 +1,1 @@
+"""Crash recovery: snapshots, journals, stores and replay."""

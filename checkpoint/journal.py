@@ -1,0 +1,210 @@
+"""The journal protocol: what a store promises the switch, its errors, and the engine that stores nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol, TypeAlias
+
+from ..actors.errors import HoldfastError
+
+__all__ = [
+    "DamagedStore",
+    "Entry",
+    "Journal",
+    "MemoryJournal",
+    "Primitive",
+    "Saved",
+    "StaleEpoch",
+    "StoreFailed",
+    "StoreInUse",
+]
+
+Primitive: TypeAlias = "int | float | str | bytes | bool | tuple[Primitive, ...] | None"
+Entry: TypeAlias = "tuple[Primitive, ...]"
+"""What the switch writes: a short `str` kind ("in", "out", "got", "end", "note"), then what that kind needs."""
+
+
+class StoreInUse(HoldfastError):
+    """A live process has the store open: stop it, or open with `takeover=True`."""
+
+    def __init__(self, path: str, pid: int) -> None:
+        super().__init__(path, pid)
+        self.path, self.pid = path, pid
+
+    def __str__(self) -> str:
+        return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
+
+
+class StaleEpoch(HoldfastError):
+    """The store was opened by somebody else since: nothing was written; stop, for you are no longer its owner."""
+
+    def __init__(self, path: str, epoch: int, current: int) -> None:
+        super().__init__(path, epoch, current)
+        self.path, self.epoch, self.current = path, epoch, current
+
+    def __str__(self) -> str:
+        return (
+            f"store {self.path} was opened with epoch {self.epoch} and now has epoch {self.current}: "
+            "another opening owns it, nothing was written; stop this one"
+        )
+
+
+class DamagedStore(HoldfastError):
+    """What was stored cannot be trusted: `address` and `position` say where, when that is known."""
+
+    def __init__(self, path: str, address: str | None, position: int | None, reason: str) -> None:
+        super().__init__(path, address, position, reason)
+        self.path, self.address, self.position, self.reason = path, address, position, reason
+
+    def __str__(self) -> str:
+        where = f"store {self.path}"
+        if self.address is not None:
+            where += f", address {self.address}"
+        if self.position is not None:
+            where += f", position {self.position}"
+        remedy = "restore the store from a backup"
+        if self.address is not None:
+            remedy += ", or erase the address to start it afresh"
+        return f"{where} is damaged: {self.reason}; {remedy}"
+
+
+class StoreFailed(HoldfastError):
+    """The operating system or a lock refused the store: `reason` says whether trying again makes sense."""
+
+    def __init__(self, path: str, reason: str) -> None:
+        super().__init__(path, reason)
+        self.path, self.reason = path, reason
+
+    def __str__(self) -> str:
+        return f"store {self.path} failed: {self.reason}"
+
+
+class Saved(NamedTuple):
+    """What a store has of one address.
+
+    Attributes:
+        snapshot: the newest trustworthy snapshot, `None` if none was ever made.
+        turn: the turn the snapshot was made after; 0 without one.
+        entries: (position, entry) of everything the snapshot does not contain, oldest first.
+        passed_over: why a newer snapshot was not used; empty when the newest was. Worth an event.
+    """
+
+    snapshot: bytes | None
+    turn: int
+    entries: list[tuple[int, Entry]]
+    passed_over: str = ""
+
+
+class Journal(Protocol):
+    """Where a home writes what it must not forget.
+
+    Entries come back exactly as given, in order, or not at all and loudly. Calls that write either happen completely
+    or raise and leave the store as it was. `append` may be called on the event loop; `cut`, `load` and `erase` may run
+    in worker threads meanwhile, but only one of them per address at a time.
+    """
+
+    durable: bool
+    """Whether anything survives this process."""
+    epoch: int
+    """Rises at each opening of the store."""
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
+        """Append (address, entry) pairs as one: all or none. Returns their positions, rising ints."""
+        ...
+
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int) -> None:
+        """Keep the snapshot, made after `turn`, then forget the positions it contains (T10: in this order).
+
+        The two newest snapshots are kept. `drop` is only marked now and physically removed by the next cut of the
+        address, so that the older snapshot stays usable for as long as it is kept. Positions in `drop` that the
+        address does not have are ignored.
+        """
+        ...
+
+    def load(self, address: str, *, older: bool = False) -> Saved:
+        """The newest snapshot whose checksum is right, with the entries it does not contain.
+
+        Args:
+            address: unknown ones have an empty `Saved`.
+            older: start from the older of the two kept snapshots, if there are two, and all entries since.
+
+        Raises:
+            DamagedStore: an entry is damaged or missing, or no snapshot is left whose later entries all exist. A
+                damaged first snapshot is not replaced by "no snapshot": it may hold state from before the journal.
+        """
+        ...
+
+    def erase(self, address: str) -> None:
+        """Forget everything about the address; unknown ones are ignored."""
+        ...
+
+    def addresses(self) -> list[str]:
+        """Every address that has something stored, sorted."""
+        ...
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep a small named fact, such as a dynamic child; `None` forgets it."""
+        ...
+
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or `None`."""
+        ...
+
+    def close(self) -> None:
+        """Release the store; a second call does nothing."""
+        ...
+
+
+class MemoryJournal:
+    """The engine behind `durability="memory"`: it hands out positions and writes nothing.
+
+    Within the life of the process the switch holds every unfinished entry and the newest snapshot in structures of its
+    own, and nothing is to survive the process: a copy kept here would be read by nobody. So `load` is always empty,
+    and an `append` costs an addition. Only notes are kept, since their writers look them up again.
+    """
+
+    __slots__ = ("_last", "_notes", "durable", "epoch")
+
+    def __init__(self) -> None:
+        self.durable = False
+        self.epoch = 1  # There is only one opening: what was in memory cannot be opened again.
+        self._last = 0
+        self._notes: dict[str, bytes] = {}
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
+        """Hand out one position for each entry."""
+        count = len(entries)
+        if count == 1:  # the common case, at half the price of the general one
+            self._last = last = self._last + 1
+            return [last]
+        first = self._last + 1
+        self._last += count
+        return list(range(first, first + count))
+
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int) -> None:
+        """Do nothing: the switch keeps the snapshot."""
+
+    def load(self, address: str, *, older: bool = False) -> Saved:
+        """Return an empty `Saved`."""
+        return Saved(None, 0, [])
+
+    def erase(self, address: str) -> None:
+        """Do nothing."""
+
+    def addresses(self) -> list[str]:
+        """Return nothing: no address has anything stored."""
+        return []
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep the fact until the process ends."""
+        if value is None:
+            self._notes.pop(key, None)
+        else:
+            self._notes[key] = value
+
+    def noted(self, key: str) -> bytes | None:
+        """Return the fact of that name, or `None`."""
+        return self._notes.get(key)
+
+    def close(self) -> None:
+        """Do nothing."""

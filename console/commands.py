@@ -1,0 +1,97 @@
+"""The commands, as Typer sees them. Imported by `cli` only, which says what to install if a package is missing."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from .. import HoldfastError
+from .cli import missing_extra
+
+commands = typer.Typer(
+    name="holdfast",
+    help="Actors in supervision trees, with crash recovery that loses nothing.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+DIFFERS = 1
+UNUSABLE = 2
+
+
+class Method(StrEnum):
+    """How a killed mapper comes back."""
+
+    HYBRID = "hybrid"
+    REPLAY = "replay"
+    CHECKPOINT = "checkpoint"
+    FRESH = "fresh"
+
+
+def _print_version(wanted: bool) -> None:
+    if not wanted:
+        return
+    try:
+        typer.echo(f"holdfast {version('holdfast')}")
+    except PackageNotFoundError:  # Run from a checkout that is not installed.
+        typer.echo("holdfast, not installed")
+    raise typer.Exit
+
+
+@commands.callback()
+def holdfast(
+    show_version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Actors in supervision trees, with crash recovery that loses nothing."""
+
+
+@commands.command()
+def demo(
+    log: Annotated[
+        Path | None,
+        typer.Option("--log", help="A laser log: g2o text, or .zip or .gz of it. [default: MIT Killian Court]"),
+    ] = None,
+    kills: Annotated[int, typer.Option(min=0, max=1000, help="How often the mapper's process is killed.")] = 5,
+    seed: Annotated[int, typer.Option(help="Draws the moments of the kills, and the questions.")] = 7,
+    method: Annotated[Method, typer.Option(help="How the mapper comes back.")] = Method.HYBRID,
+    interval: Annotated[float, typer.Option(min=0.05, help="Seconds between two snapshots.")] = 2.0,
+    speed: Annotated[
+        float, typer.Option(min=0.0, help="Times the pace of the recording; 0: as fast as it goes.")
+    ] = 600.0,
+    picture: Annotated[Path, typer.Option(help="Where both maps are drawn.")] = Path("holdfast-demo.png"),
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+) -> None:
+    """Map a real building while the mapper's process is killed again and again; compare with an undisturbed run.
+
+    Exit status 0: nothing lost, nothing doubled, the maps are equal bit by bit. 1: something differs. 2: there is
+    nothing to run on.
+    """
+    try:
+        from .demo.log import LogError, killian_court
+        from .demo.main import run_demo
+        from .demo.run import Plan
+    except ModuleNotFoundError as missing:
+        sys.exit(missing_extra(missing))
+    try:
+        plan = Plan(log or killian_court(), kills, seed, method.value, interval, speed)
+        report = run_demo(plan, Console(), picture=picture, as_json=as_json)
+    except (LogError, OSError) as error:
+        raise _failed(error, UNUSABLE) from error
+    except HoldfastError as error:
+        raise _failed(error, DIFFERS) from error
+    if not report.is_good:
+        raise typer.Exit(DIFFERS)
+
+
+def _failed(error: Exception, status: int) -> typer.Exit:
+    typer.echo(f"holdfast demo: {error}", err=True)
+    return typer.Exit(status)

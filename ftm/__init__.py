@@ -1,0 +1,1 @@
+"""Fault-tolerance mechanisms that are attached, exchanged and composed while requests flow will live here."""

@@ -1,0 +1,1 @@
+"""Supervisors: who restarts whom, when and how often."""

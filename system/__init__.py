@@ -1,0 +1,1 @@
+"""The composition root: `ActorSystem` and `run` hand the parts to each other."""

@@ -1,0 +1,110 @@
+"""Events as structlog records, with a limit on floods."""
+
+from __future__ import annotations
+
+import time
+
+import structlog
+
+from ..actors.errors import type_name
+from ..actors.events import (
+    ActorCrashed,
+    ChildRestarted,
+    DeadLetter,
+    Event,
+    HookFailed,
+    JournalFull,
+    LifeAbandoned,
+    LogLine,
+    ProcessDied,
+    Quarantined,
+    Recovered,
+    RecoveryFailed,
+    SnapshotFailed,
+    SupervisorGaveUp,
+)
+from ..actors.exits import Crash
+from ..actors.node import message_of
+
+BURST = 10
+"""Records of one kind within a second; what is more is counted and told with the next one."""
+
+
+class LogSink:
+    """Writes what an operator wants to see; formats only what is written."""
+
+    def __init__(self, system: str) -> None:
+        self._log = structlog.get_logger("holdfast", system=system)
+        self._second: dict[type, tuple[int, int]] = {}
+
+    def __call__(self, event: Event) -> None:
+        level = LEVELS.get(type(event))
+        if level is None:
+            return
+        left_out = self._admit(type(event))
+        if left_out is None:
+            return
+        fields = describe(event)
+        if left_out:
+            fields["left_out"] = left_out
+        getattr(self._log, level)(NAMES[type(event)], **fields)
+
+    def _admit(self, kind: type) -> int | None:
+        """None: this second has had its records. Else how many were left out before."""
+        second = int(time.monotonic())
+        then, count = self._second.get(kind, (second, 0))
+        if then != second:
+            self._second[kind] = (second, 1)
+            return max(0, count - BURST)
+        self._second[kind] = (second, count + 1)
+        return 0 if count < BURST else None
+
+
+LEVELS: dict[type, str] = {
+    ActorCrashed: "error",
+    HookFailed: "error",
+    LifeAbandoned: "error",
+    DeadLetter: "warning",
+    ChildRestarted: "warning",
+    SupervisorGaveUp: "error",
+    ProcessDied: "warning",
+    Recovered: "info",
+    RecoveryFailed: "error",
+    Quarantined: "error",
+    SnapshotFailed: "error",
+    JournalFull: "warning",
+    LogLine: "info",
+}
+NAMES: dict[type, str] = {
+    ActorCrashed: "actor crashed",
+    HookFailed: "hook failed",
+    LifeAbandoned: "life abandoned",
+    DeadLetter: "dead letter",
+    ChildRestarted: "child restarted",
+    SupervisorGaveUp: "supervisor gave up",
+    ProcessDied: "process died",
+    Recovered: "actor recovered",
+    RecoveryFailed: "recovery failed",
+    Quarantined: "message quarantined",
+    SnapshotFailed: "snapshot failed",
+    JournalFull: "journal full",
+    LogLine: "output",
+}
+
+
+def describe(event: Event) -> dict[str, object]:
+    """An event's fields as text and numbers."""
+    fields: dict[str, object] = {}
+    for name in event.__struct_fields__:
+        value = getattr(event, name)
+        if name in ("item", "message") and not isinstance(value, str):
+            message = message_of(value)
+            fields["message"] = type_name(type(value if message is None else message))
+        elif isinstance(value, Crash):
+            fields[name] = str(value)
+            fields["traceback"] = value.traceback
+        elif isinstance(value, (int, float, dict)):
+            fields[name] = value
+        else:
+            fields[name] = str(value)
+    return fields

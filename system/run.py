@@ -1,0 +1,49 @@
+"""`run`: start a program of actors, and end it in good order on SIGTERM and SIGINT."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+import sys
+from collections.abc import Coroutine
+from typing import Any, TypeVar
+
+import uvloop
+
+T = TypeVar("T")
+
+
+def run(main: Coroutine[Any, Any, T], *, debug: bool | None = None) -> T:
+    """Run a coroutine on uvloop, like `asyncio.run`; SIGTERM and SIGINT cancel it, so that systems stop in order.
+
+    Raises:
+        KeyboardInterrupt: it was ended by SIGINT.
+        SystemExit: it was ended by SIGTERM (with code 143, as a shell reports it).
+    """
+    stopped_by: list[int] = []
+
+    async def guarded() -> T:
+        loop, task = asyncio.get_running_loop(), asyncio.current_task()
+        assert task is not None
+
+        def stop(number: int) -> None:
+            stopped_by.append(number)
+            task.cancel()
+
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, stop, number)
+        try:
+            return await main
+        finally:
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.remove_signal_handler(number)
+
+    with asyncio.Runner(debug=debug, loop_factory=uvloop.new_event_loop) as runner:
+        try:
+            return runner.run(guarded())
+        except asyncio.CancelledError:
+            if not stopped_by:
+                raise
+    if stopped_by[0] == signal.SIGINT:
+        raise KeyboardInterrupt
+    sys.exit(128 + stopped_by[0])

@@ -1,0 +1,224 @@
+"""`ActorSystem`: a tree of actors inside a running asyncio program."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Sequence
+from types import TracebackType
+from typing import Any, TypeVar, cast
+
+from ..actors import lives
+from ..actors.actor import Actor, Start
+from ..actors.cell import Cell
+from ..actors.errors import HoldfastError, NoSuchActor, SpecError, TreeFailed
+from ..actors.events import EventStream, SupervisorGaveUp
+from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.mailbox import Bounded
+from ..actors.message import Message
+from ..actors.node import Node
+from ..actors.ref import ActorRef
+from ..supervision.spec import ChildSpec, Flags
+from ..supervision.supervisor import DeleteChild, StartChild, Supervisor, TerminateChild
+from .logs import LogSink
+
+A = TypeVar("A", bound=Actor)
+
+ADMIN_TIMEOUT = 60.0
+"""Seconds an admin call of the system may take: starting a child can mean restoring a large state."""
+
+
+class ActorSystem:
+    """A tree of actors: an async context manager that lives in whatever loop it is entered in.
+
+    Args:
+        name: the first part of all addresses.
+        store: where journals and snapshots go: None (memory: survives any process but this one), or
+            "sqlite:PATH".
+        intensity, period: how many restarts of its direct children the root allows before the tree fails.
+        preload: modules the fork server imports beforehand, besides those of the actors it starts.
+        log: write events to structlog (crashes, restarts, dead letters, output of processes).
+        seed: for `ctx.random` of actors without a journal; random if left out.
+
+    Leaving the context stops all actors, newest first. If the root supervisor gives up, the body is cancelled and
+    TreeFailed is raised.
+    """
+
+    def __init__(
+        self,
+        name: str = "app",
+        *,
+        store: str | None = None,
+        intensity: int = 3,
+        period: float = 5.0,
+        preload: Sequence[str] = (),
+        log: bool = True,
+        seed: int | None = None,
+        takeover: bool = False,
+    ) -> None:
+        if not name or "/" in name:
+            raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
+        self.name = name
+        self._flags = Flags("one_for_one", intensity, period)
+        self._store = store
+        self._takeover = takeover
+        self._preload = tuple(preload)
+        self._log = log
+        self._seed = seed
+        self._node: Node | None = None
+        self._root: Cell | None = None
+        self._body: asyncio.Task[Any] | None = None
+        self._failure: TreeFailed | None = None
+
+    # -- life -------------------------------------------------------------------------------------------------------
+
+    async def __aenter__(self) -> ActorSystem:
+        if self._node is not None:
+            raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
+        node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
+        if self._log:
+            node.events.add_sink(LogSink(self.name))
+        self._body = asyncio.current_task()
+        root = self._root = node.root = node.cell_below(None, f"/{self.name}")
+        up = lives.begin(root, Start(Supervisor, (self._flags, ())))
+        if up is not None:
+            await up
+        root.ended().add_done_callback(self._root_ended)
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.shutdown()
+        if self._failure is not None:
+            failure, self._failure = self._failure, None
+            if self._body is not None and isinstance(error, asyncio.CancelledError):
+                self._body.uncancel()
+            raise failure from (None if isinstance(error, asyncio.CancelledError) else error)
+
+    async def shutdown(self) -> None:
+        """Stop every actor, newest first, and what belongs to the system. A second call changes nothing."""
+        root, node = self._root, self._node
+        if root is None or node is None:
+            return
+        self._body = None
+        await asyncio.shield(self._close(root, node))
+
+    async def _close(self, root: Cell, node: Node) -> None:
+        await lives.stop_and_wait(root)
+        await node.close()
+        node.deadlines.close()
+        node.events.close()
+
+    def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
+        """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
+        if self._body is None or done.cancelled():
+            return
+        self._failure = TreeFailed(self.name, self._why())
+        self._body.cancel()
+
+    def _why(self) -> str:
+        return "restart intensity reached by the children of the root"
+
+    # -- starting and finding actors --------------------------------------------------------------------------------
+
+    @property
+    def node(self) -> Node:
+        """The node that hosts this process's actors."""
+        if self._node is None:
+            raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
+        return self._node
+
+    async def start(self, spec: ChildSpec) -> ActorRef[Any]:
+        """Start a child of the root, and wait until it is up.
+
+        Raises:
+            StartFailed: naming the actor and why. AlreadyStarted, AlreadyPresent: the id is in use.
+        """
+        if not isinstance(spec, ChildSpec):
+            raise SpecError("start", f"takes child(...) or supervisor(...), not {spec!r}")
+        root = self._root_ref()
+        return cast("ActorRef[Any]", await root.ask(StartChild(spec), ADMIN_TIMEOUT))
+
+    def spawn(self, start: Start[A], name: str | None = None, *, mailbox: Bounded | None = None) -> ActorRef[A]:
+        """Start an actor that nobody restarts, in this process, at once (its `on_start` is its first turn).
+
+        Raises:
+            NameTaken: the name is in use. StartFailed: `__init__` raised.
+        """
+        return cast("ActorRef[A]", self.node.spawn(start, name, mailbox=mailbox).ref)
+
+    async def stop(self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN) -> None:
+        """Stop an actor for good and wait until its hook has run; one that has stopped already is no error."""
+        cell = ref._cell
+        parent = cell.parent
+        if cell.spec is not None and parent is not None and isinstance(parent.actor, Supervisor):
+            supervisor = ActorRef[Supervisor](parent)
+            await supervisor.ask(TerminateChild(cell.name), ADMIN_TIMEOUT)
+            if cell.spec.restart != "temporary":
+                await supervisor.ask(DeleteChild(cell.name), ADMIN_TIMEOUT)
+        elif not cell.is_dead:
+            await lives.stop_and_wait(cell, reason)
+
+    def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
+        """A ref to the actor at an address.
+
+        Raises:
+            NoSuchActor: nobody lives there. WrongActor: another class does.
+        """
+        return self.node.find_ref(path, kind)
+
+    def _root_ref(self) -> ActorRef[Supervisor]:
+        root = self._root
+        if root is None:
+            raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
+        return ActorRef(root)
+
+    # -- names, topics, bindings ------------------------------------------------------------------------------------
+
+    def register(self, name: str, ref: ActorRef[Any]) -> None:
+        """Give an actor a name beside its address. Raises NameTaken."""
+        self.node.register(name, ref._cell)
+
+    def unregister(self, name: str) -> None:
+        """Free a name; unknown ones are fine."""
+        self.node.unregister(name)
+
+    def whereis(self, name: str) -> ActorRef[Any]:
+        """The actor with this name. Raises NoSuchActor."""
+        cell = self.node.names.get(name)
+        if cell is None:
+            raise NoSuchActor(name)
+        return cell.ref
+
+    async def publish(self, topic: str, message: Message[Any]) -> None:
+        """Send to every subscriber of a topic; waits for room at bounded ones."""
+        for cell in self.node.topics.subscribers(topic):
+            await cell.ref.send(message)
+
+    def bind(self, ref: ActorRef[Any], port: str, target: ActorRef[Any]) -> None:
+        """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError."""
+        self.node.bind(ref._cell, port, target._cell)
+
+    # -- looking at it ----------------------------------------------------------------------------------------------
+
+    def events(self) -> EventStream:
+        """A new stream of events from here on: `async for event in stream`; close it when done."""
+        return self.node.events.listen()
+
+    @property
+    def dead_letters(self) -> int:
+        """Messages that nobody handled, so far."""
+        return self.node.dead_letters
+
+    def tree(self) -> list[str]:
+        """The addresses that live now, parents before children."""
+        found: list[str] = []
+        waiting = [self._root] if self._root is not None else []
+        while waiting:
+            cell = waiting.pop()
+            found.append(cell.path)
+            waiting.extend(reversed(list((cell.children or {}).values())))
+        return found
+
+
+__all__ = ["ActorSystem", "SupervisorGaveUp"]

@@ -1,0 +1,129 @@
+"""What the documents show is true: every docstring example and every Python block in a Markdown file.
+
+A block of a Markdown file is a part of a program that is made of all blocks of that file, in order. A block that opens
+with a comment holding a path is a quotation instead: it must stand word for word in that file.
+"""
+
+import doctest
+import importlib
+import os
+import pkgutil
+import re
+import signal
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+import holdfast
+
+ROOT = Path(__file__).resolve().parents[1]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
+TIME_LIMIT = 60.0  # seconds for all blocks of one document
+FENCE = re.compile(
+    r"^(?P<indent> *)(?P<fence>`{3,}|~{3,})(?P<info>[^`\n]*)\n(?P<body>.*?)^(?P=indent)(?P=fence)`* *$", re.M | re.S
+)
+QUOTATION = re.compile(r"# (?P<path>[\w./-]+\.\w+)\n")
+
+
+class Block(NamedTuple):
+    line: int  # of the document, counted from 1, where the body begins
+    body: str
+
+
+def module_names(paths: list[str], prefix: str) -> Iterator[str]:
+    """Name every module below `paths` without importing any, as `pkgutil.walk_packages` would."""
+    for found in pkgutil.iter_modules(paths, prefix):
+        if found.name.endswith(".__main__"):
+            continue  # a command, not a module: importing it runs it
+        yield found.name
+        if found.ispkg:
+            yield from module_names([f"{path}/{found.name.removeprefix(prefix)}" for path in paths], f"{found.name}.")
+
+
+def python_blocks(text: str) -> Iterator[Block]:
+    for found in FENCE.finditer(text):
+        language = found["info"].strip()
+        assert not re.match(r"py(thon3|con)?\b(?!thon)|python\s+\S", language), f"write ```python, not ```{language}"
+        if language == "python":
+            yield Block(text.count("\n", 0, found.start("body")) + 1, textwrap.dedent(found["body"]))
+
+
+def quoted_path(block: Block) -> str | None:
+    found = QUOTATION.match(block.body)
+    return found["path"] if found else None
+
+
+def program(blocks: list[Block]) -> str:
+    """Join the blocks that are to be run, each at its line of the document, so that a traceback names that line."""
+    lines: list[str] = []
+    for block in blocks:
+        if quoted_path(block) is None:
+            lines += [""] * (block.line - 1 - len(lines))
+            lines += block.body.splitlines()
+    return "\n".join(lines) + "\n" if lines else ""
+
+
+def run(path: Path) -> tuple[int, str]:
+    """Run a script in a session of its own, killed at the time limit, and return its exit code and output."""
+    with subprocess.Popen(
+        [sys.executable, "-W", "error", str(path)],
+        cwd=path.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,
+    ) as process:
+        try:
+            output, _ = process.communicate(timeout=TIME_LIMIT)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            output, _ = process.communicate()
+            output += f"\nstopped after {TIME_LIMIT:g} s"
+    return process.returncode, output
+
+
+@pytest.mark.parametrize("name", ["holdfast", *module_names(list(holdfast.__path__), "holdfast.")])
+def test_docstring_examples(name: str) -> None:
+    module = importlib.import_module(name)
+    failures, _ = doctest.testmod(module, optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    assert failures == 0, "see the captured output"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_quotations(document: Path) -> None:
+    for block in python_blocks(document.read_text("utf-8")):
+        path = quoted_path(block)
+        if path is None:
+            continue
+        quoted = block.body.split("\n", 1)[1].strip("\n")
+        assert quoted in (ROOT / path).read_text("utf-8"), f"line {block.line}: this does not stand in {path}"
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_blocks_run(document: Path, tmp_path: Path) -> None:
+    text = program(list(python_blocks(document.read_text("utf-8"))))
+    if not text:
+        return
+    script = tmp_path / f"{document.stem.lower()}.py"
+    script.write_text(text, "utf-8")
+    code, output = run(script)
+    assert code == 0, output
+
+
+def test_blocks_keep_their_lines() -> None:
+    quotation = "- b\n\n  ```python\n  # actors/ref.py\n  y = x\n  ```\n"
+    text = f"# A\n\n```python\nx = 1\n```\n\n{quotation}\n```python\nprint(x)\n```\n"
+    blocks = list(python_blocks(text))
+    assert [(block.line, quoted_path(block)) for block in blocks] == [(4, None), (10, "actors/ref.py"), (15, None)]
+    assert program(blocks).splitlines() == ["", "", "", "x = 1", *[""] * 10, "print(x)"]
+
+
+@pytest.mark.parametrize("language", ["py", "python3", "pycon", "python no-run"])
+def test_a_block_cannot_escape_by_its_language(language: str) -> None:
+    with pytest.raises(AssertionError, match="write"):
+        list(python_blocks(f"```{language}\n1 / 0\n```\n"))

@@ -1,0 +1,89 @@
+"""The shape of the package: one copy of it, what it exports, what importing it costs, and what it must never import."""
+
+import ast
+import json
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import holdfast
+
+ROOT = Path(__file__).resolve().parents[1]
+BESIDE = {"tests", "benchmarks", "examples", "docs", "build", "dist"}
+SOURCES = sorted(
+    path.relative_to(ROOT)
+    for path in [*ROOT.glob("*.py"), *ROOT.glob("[a-z]*/**/*.py")]
+    if path.relative_to(ROOT).parts[0] not in BESIDE
+)
+
+
+def modules_after_import() -> list[str]:
+    program = "import json, sys, holdfast; print(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, timeout=60)
+    names: list[str] = json.loads(done.stdout)
+    return names
+
+
+def imports(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield the level and the name of each import of a source file; level 0 is an absolute import."""
+    for node in ast.walk(ast.parse((ROOT / path).read_text("utf-8"))):
+        match node:
+            case ast.Import(names=names):
+                yield from ((0, alias.name) for alias in names)
+            case ast.ImportFrom(module=module, level=level):
+                yield level, module or ""
+            case _:
+                pass
+
+
+def test_a_fresh_process_holds_one_copy_of_the_package() -> None:
+    assert [name for name in modules_after_import() if name.endswith("actors.ref")] == ["holdfast.actors.ref"]
+
+
+def test_pytest_holds_one_copy_of_the_package() -> None:
+    assert [name for name in sys.modules if name.endswith("actors.ref")] == ["holdfast.actors.ref"]
+
+
+@pytest.mark.parametrize("name", ["numpy", "holdfast.console", "holdfast.diagnosis", "holdfast.testing"])
+def test_importing_holdfast_leaves_alone(name: str) -> None:
+    assert name not in modules_after_import()
+
+
+def test_all_is_sorted_and_complete() -> None:
+    public = [
+        name for name, value in vars(holdfast).items() if not name.startswith("_") and not isinstance(value, ModuleType)
+    ]
+    # `__version__` is public by convention although it begins with an underscore.
+    assert [name for name in holdfast.__all__ if name != "__version__"] == sorted(public)
+    assert list(holdfast.__all__) == sorted(holdfast.__all__)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=str)
+def test_module_imports_no_pickle(path: Path) -> None:
+    assert not {name.split(".")[0] for _, name in imports(path)} & {"pickle", "_pickle", "cloudpickle", "dill"}
+
+
+@pytest.mark.parametrize("path", [path for path in SOURCES if path != Path("__init__.py")], ids=str)
+def test_module_imports_its_own_package_relatively(path: Path) -> None:
+    folders = {other.parts[0] for other in SOURCES if len(other.parts) > 1}
+    # `import actors` would find the folder while the checkout is on sys.path, and load a second copy.
+    assert not {name.split(".")[0] for level, name in imports(path) if level == 0} & {"holdfast", *folders}
+
+
+def test_root_imports_absolutely() -> None:
+    assert not [name for level, name in imports(Path("__init__.py")) if level]
+
+
+def test_every_folder_of_the_package_is_shipped() -> None:
+    listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]["packages"]
+    assert sorted(listed) == sorted({".".join(("holdfast", *path.parts[:-1])) for path in SOURCES})
+    assert all((ROOT / path.parent / "__init__.py").exists() for path in SOURCES)
+
+
+def test_types_are_announced() -> None:
+    assert (ROOT / "py.typed").read_text() == ""
