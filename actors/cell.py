@@ -36,6 +36,11 @@ ANY = AnyTable()
 class Host(Protocol):
     """Where and how the lives at an address are lived: in this process, in another one, recorded or not."""
 
+    @property
+    def takes_parcels(self) -> bool:
+        """Whether messages that came encoded are passed on as they are."""
+        ...
+
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
         ...
@@ -49,7 +54,11 @@ class Host(Protocol):
         ...
 
     def retired(self, cell: Cell) -> None:
-        """The address is gone for good."""
+        """The address is gone for good; called before its queue is drained."""
+        ...
+
+    def push(self, cell: Cell, item: Item) -> None:
+        """Put an item of the runtime's own in its place behind the messages."""
         ...
 
 
@@ -176,9 +185,8 @@ class Cell:
         """Put an item of the runtime's own at the end of the queue: no bound, no type check."""
         if self.state is GONE:
             item.undelivered(self, "stopped")
-            return
-        mailbox.queue_of(self).append(item)
-        self.schedule()
+        else:
+            self.host.push(self, item)
 
     def urge(self, item: Item) -> None:
         """Put a command ahead of all messages; commands keep their order among themselves."""

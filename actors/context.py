@@ -111,7 +111,11 @@ class ActorContext:
             return future
         ask = Ask(message, self.cell, chain, timeout, node.loop.time() + timeout, future)
         node.deadlines.add(ask, cell)
-        cell.admit(cell, ask)
+        try:
+            cell.admit(cell, ask)
+        except BaseException:
+            future.cancel()
+            raise
         return future
 
     def chain(self) -> Chain:
@@ -135,8 +139,8 @@ class ActorContext:
         if isinstance(item, Ask):
             cell: Cell = to._cell
             cell.require(item.message)
-            cell.admit(cell, Ask(item.message, item.sender, item.chain, item.timeout, item.deadline, item.future))
-            self.item = Envelope(item.message, item.sender or self.cell)
+            self.item = Stashed(item)
+            cell.admit(cell, item)
         elif isinstance(item, Envelope):
             to._cell.admit(to._cell, Envelope(item.message, item.sender))
         else:

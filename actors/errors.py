@@ -256,8 +256,10 @@ def type_name(kind: type) -> str:
     >>> type_name(ValueError)
     'ValueError'
     """
-    module = "" if kind.__module__ == "builtins" else kind.__module__ + "."
-    return module + kind.__qualname__
+    if kind.__module__ == "builtins":
+        return kind.__qualname__
+    module = "__main__" if kind.__module__ == "__mp_main__" else kind.__module__  # as in `message_name`
+    return f"{module}.{kind.__qualname__}"
 
 
 def error_classes(base: type[HoldfastError] = HoldfastError) -> Iterator[type[HoldfastError]]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import msgspec
 
-from .exits import ExitReason
+from .exits import ExitReason, pack_exit, unpack_exit
 
 
 class Event(msgspec.Struct, frozen=True, eq=False):
@@ -216,3 +216,32 @@ class EventHub:
         """End every stream."""
         for stream in list(self._streams):
             stream.close()
+
+
+def event_from(kind: str, data: dict[str, Any]) -> Event | None:
+    """The event another process told of; None if it is of no kind known here or its data does not fit."""
+    for event in Event.__subclasses__():
+        if event.__name__ == kind:
+            try:
+                fields = {name: _field_in(data[name]) for name in event.__struct_fields__}
+            except (KeyError, msgspec.ValidationError):
+                return None
+            return event(**fields)
+    return None
+
+
+def event_data(event: Event) -> dict[str, Any]:
+    """An event's fields as plain data for a frame; what has no plain form is sent as text."""
+    return {name: _field_out(getattr(event, name)) for name in event.__struct_fields__}
+
+
+def _field_out(value: Any) -> Any:
+    if isinstance(value, ExitReason):
+        return {"exit reason": pack_exit(value)}
+    if isinstance(value, (str, int, float, dict)) or value is None:
+        return value
+    return str(value)
+
+
+def _field_in(value: Any) -> Any:
+    return unpack_exit(value["exit reason"]) if isinstance(value, dict) and "exit reason" in value else value

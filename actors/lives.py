@@ -31,6 +31,8 @@ GRACE = 1.0
 class LocalHost:
     """Lives as turns in this very process."""
 
+    takes_parcels = False
+
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
         assert start is not None
@@ -54,6 +56,10 @@ class LocalHost:
 
     def retired(self, cell: Cell) -> None:
         pass
+
+    def push(self, cell: Cell, item: Item) -> None:
+        mailbox.queue_of(cell).append(item)
+        cell.schedule()
 
 
 LOCAL = LocalHost()

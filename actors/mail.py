@@ -126,7 +126,8 @@ class Ask(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        cell: Cell = actor.ctx.cell
+        ctx: ActorContext = actor.ctx
+        cell = ctx.cell
         if item.deadline <= cell.node.now:  # Nobody waits any more: not run (unless the wait was only cancelled).
             item.expire(cell)
             return None
@@ -142,9 +143,15 @@ class Ask(Item):
             item.fail(no)
             return None
         if type(result) is Coroutine_:
-            return _finish(item, result)
-        item.answer(result)
+            return _finish(ctx, item, result)
+        if ctx.item is item:  # Else the ask was forwarded or stashed: it is not ours to answer any more.
+            item.answer(result)
         return None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the outcome is known, or nobody waits for it."""
+        return self.future.done()
 
     def answer(self, reply: object) -> None:
         """Hand the reply to the asker; a late one is dropped and counted."""
@@ -167,14 +174,15 @@ class Ask(Item):
         self.fail(cell.stopped_error(reason))
 
 
-async def _finish(ask: Ask, handler: Coroutine[Any, Any, object]) -> None:
+async def _finish(ctx: ActorContext, ask: Ask, handler: Coroutine[Any, Any, object]) -> None:
     """The turn of an async handler that was asked."""
     try:
         reply = await handler
     except Refusal as no:
         ask.fail(no)
     else:
-        ask.answer(reply)
+        if ctx.item is ask:
+            ask.answer(reply)
 
 
 class ReplyHandle(Generic[R]):

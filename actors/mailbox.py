@@ -123,7 +123,7 @@ class Bound:
         self.count -= 1
         while self.waiting and self.count < self.capacity:
             ask = self.waiting.popleft()
-            if not ask.future.done():  # Expired or given up while it waited: never admitted.
+            if not ask.is_done:  # Expired or given up while it waited: never admitted.
                 self.put(cell, ask)
         # One wakes for each free place; it tries again and may find the place taken, then it waits once more.
         while self.senders and self.count < self.capacity:

@@ -35,7 +35,9 @@ class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
 
 def message_name(kind: type) -> str:
     """The name a message type has on the wire and in journals: `module:Class`."""
-    return f"{kind.__module__}:{kind.__qualname__}"
+    module = kind.__module__
+    # A process that was forked for an actor knows the classes of the user's script by another module name.
+    return f"{'__main__' if module == '__mp_main__' else module}:{kind.__qualname__}"
 
 
 @functools.cache

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from . import lives
 from .cell import DOWN, GONE, RUNNING, Cell, Host
+from .codec import Codec
 from .deadlines import Deadlines
 from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
 from .events import DeadLetter, Event, EventHub
 from .exits import ExitReason
 from .lives import LOCAL
 from .loop import RunLoop
-from .mailbox import Bounded
+from .mailbox import Bound, Bounded, admit_bounded, admit_gone
 from .message import Message, Refusal
 from .topics import Topics
 
@@ -39,6 +40,7 @@ class Node(RunLoop):
         self.name = name
         self.base_context = contextvars.copy_context()
         self.deadlines = Deadlines(loop)
+        self.codec = Codec(self.cell_at)
         self.watched = False  # whether anybody looks at events: else they are not even made
         self.events = EventHub(self._watch)
         self.topics = Topics()
@@ -47,6 +49,7 @@ class Node(RunLoop):
         self.wall: Callable[[], float] = time.time
         self.outside: Callable[[str], Cell | None] | None = None  # finds cells of other processes
         self.root: Cell | None = None
+        self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
         self.host_for: Callable[[Any], Host] = lambda spec: LOCAL  # chooses where a child spec's lives are lived
         self._seeds = random.Random(seed)
         self._numbers = itertools.count(1)
@@ -119,8 +122,6 @@ class Node(RunLoop):
 
     def bound(self, cell: Cell, choice: Bounded) -> None:
         """Give a cell without messages a bounded mailbox."""
-        from .mailbox import Bound, admit_bounded
-
         cell.extra().bound = Bound(choice.capacity, choice.overflow)
         cell.admit = admit_bounded
 
@@ -146,6 +147,16 @@ class Node(RunLoop):
             if cell is not None:
                 return cell
         return self.outside(path) if self.outside is not None else None
+
+    def cell_at(self, path: str) -> Cell:
+        """The cell at an address; if there is none, a stand-in whose messages are dead letters."""
+        return self.find(path) or self.nowhere(path)
+
+    def nowhere(self, path: str) -> Cell:
+        """A stand-in for an address where nobody lives; somebody may come to live there."""
+        cell = Cell(self, None, path, LOCAL)
+        cell.state, cell.admit = GONE, admit_gone
+        return cell
 
     def successor(self, cell: Cell) -> Cell | None:
         """The living cell at the address of a dead one."""

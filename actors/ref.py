@@ -95,7 +95,11 @@ class ActorRef(Generic[A_co]):
         future: asyncio.Future[R] = node.loop.create_future()
         ask = Ask(message, None, (), timeout, node.loop.time() + timeout, future)
         node.deadlines.add(ask, cell)
-        cell.admit(cell, ask)
+        try:
+            cell.admit(cell, ask)
+        except BaseException:
+            future.cancel()  # Refused at the call: nobody holds the future.
+            raise
         return future
 
     def stop(self) -> None:

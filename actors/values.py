@@ -15,8 +15,6 @@ import dataclasses
 import enum
 import gc
 import hashlib
-import importlib
-import random
 import reprlib
 import struct
 import sys
@@ -26,9 +24,12 @@ from collections.abc import Callable, Iterable
 from datetime import date, datetime, time, timedelta, timezone
 from decimal import Decimal
 from fractions import Fraction
+from functools import partial
+from importlib import import_module
 from itertools import chain
 from pathlib import PosixPath, PurePosixPath, PureWindowsPath
-from typing import Any, Final, NamedTuple
+from random import Random
+from typing import Any, Final
 from uuid import UUID, SafeUUID
 from zoneinfo import ZoneInfo
 
@@ -40,7 +41,7 @@ from .errors import HoldfastError
 __all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest"]
 
 FORMAT: Final = 1
-_HEAD: Final = struct.Struct(">BBQ")
+_HEAD: Final = struct.Struct(">BBQ")  # format, flag, length of the tree
 
 
 class UnsavableValue(HoldfastError):
@@ -90,10 +91,7 @@ def encode_value(value: object, *, where: str = "value") -> bytes:
     Traceback (most recent call last):
     holdfast.actors.values.UnsavableValue: balance['x'][1]: a value of type object cannot be saved; make it ...
     """
-    try:
-        return b"".join(_Encoder(canonical=False).pieces(value))
-    except _Refusal as refusal:
-        raise refusal.at(where) from None
+    return b"".join(_pieces(value, where, canonical=False))
 
 
 def state_digest(value: object) -> bytes:
@@ -108,11 +106,8 @@ def state_digest(value: object) -> bytes:
     (True, False)
     """
     digest = hashlib.blake2b(digest_size=16)
-    try:
-        for piece in _Encoder(canonical=True).pieces(value):
-            digest.update(piece)
-    except _Refusal as refusal:
-        raise refusal.at("value") from None
+    for piece in _pieces(value, "value", canonical=True):
+        digest.update(piece)
     return digest.digest()
 
 
@@ -137,23 +132,14 @@ def decode_value(data: bytes | memoryview) -> object:
     if view[0] != FORMAT:
         raise DamagedValue(f"it has format {view[0]}, and only format {FORMAT} is known")
     try:
-        return _Decoder(view).value()
+        if view[1] == 0:
+            return _unpack(view[2:], ext_hook=_make_int)
+        length = _HEAD.unpack_from(view)[2]
+        return _Decoder(view[_HEAD.size + length :]).value(view[_HEAD.size : _HEAD.size + length])
     except (DamagedValue, MemoryError):  # Out of memory is no damage: the bytes may be good.
         raise
     except Exception as error:
         raise DamagedValue(f"{type(error).__name__}: {error}") from error
-
-
-class _Refusal(Exception):
-    """Something cannot be saved. On its way out each level of the value adds its step to the path."""
-
-    def __init__(self, problem: str, *steps: str) -> None:
-        super().__init__(problem)
-        self.problem, self.steps = problem, [*steps]
-
-    def at(self, where: str) -> UnsavableValue:
-        steps = self.steps if len(self.steps) < 20 else [*self.steps[:8], " ... ", *self.steps[-8:]]
-        return UnsavableValue(where + "".join(reversed(steps)), self.problem)
 
 
 class _Blob:
@@ -167,13 +153,6 @@ class _Mark(int):
     """The code at the head of a list while that list is being read."""
 
 
-def _type_name(kind: type) -> str:
-    return kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
-
-
-# The types that are known beforehand -----------------------------------------------------------------------------
-
-
 def _flat(mapping: dict[Any, Any]) -> Iterable[Any]:
     return chain.from_iterable(mapping.items())
 
@@ -182,7 +161,7 @@ def _pairs(parts: tuple[Any, ...]) -> dict[Any, Any]:
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
-def _counter(*parts: Any) -> Counter[Any]:
+def _make_counter(*parts: Any) -> Counter[Any]:
     counter = Counter[Any]()
     dict.update(counter, _pairs(parts))  # Counter's own update would add.
     return counter
@@ -192,80 +171,256 @@ def _moment_parts(moment: Any) -> tuple[Any, ...]:
     return moment.replace(tzinfo=None).isoformat(), moment.fold, moment.tzinfo
 
 
+def _make_moment(kind: Any, text: str, fold: int, zone: Any) -> object:
+    return kind.fromisoformat(text).replace(fold=fold, tzinfo=zone)
+
+
 def _zone_parts(zone: ZoneInfo) -> tuple[str]:
     if zone.key is None:
-        raise _Refusal("a ZoneInfo without a key")
+        raise UnsavableValue("", "a ZoneInfo without a key")
     return (zone.key,)
 
 
-def _random(version: int, internal: tuple[int, ...], gauss: float | None) -> random.Random:
+def _make_random(version: int, internal: tuple[int, ...], gauss: float | None) -> Random:
     if version != 3 or not isinstance(gauss, float | None):
         raise DamagedValue("it has a random.Random of another version")
-    made = random.Random(0)
+    made = Random(0)
     made.setstate((version, internal, gauss))
     return made
 
 
-class _Kind(NamedTuple):
-    code: int
-    type: type
-    parts: Callable[[Any], Iterable[Any]]  # any values that can be saved
-    make: Callable[..., object]
-
-
-_KINDS: Final = (
-    _Kind(1, tuple, iter, lambda *parts: parts),
-    _Kind(2, set, iter, lambda *parts: {*parts}),
-    _Kind(3, frozenset, iter, lambda *parts: frozenset(parts)),
-    _Kind(4, dict, _flat, lambda *parts: _pairs(parts)),  # only from `_Walk`, if a key is no scalar
-    _Kind(5, OrderedDict, _flat, lambda *parts: OrderedDict(_pairs(parts))),
-    _Kind(6, Counter, _flat, _counter),
-    _Kind(7, deque, lambda x: (x.maxlen, *x), lambda limit, *parts: deque(parts, limit)),
-    _Kind(8, bytearray, lambda x: (_Blob(x),), lambda view: bytearray(memoryview(view))),  # an int would be a length
-    _Kind(9, complex, lambda x: (x.real, x.imag), complex),
-    _Kind(10, range, lambda x: (x.start, x.stop, x.step), range),
-    _Kind(11, Decimal, lambda x: (str(x),), Decimal),
-    _Kind(12, Fraction, lambda x: (x.numerator, x.denominator), Fraction),
-    _Kind(13, UUID, lambda x: (x.bytes, x.is_safe.value), lambda raw, safe: UUID(bytes=raw, is_safe=SafeUUID(safe))),
-    _Kind(14, date, lambda x: (x.isoformat(),), date.fromisoformat),
-    _Kind(15, time, _moment_parts, lambda text, fold, zone: time.fromisoformat(text).replace(fold=fold, tzinfo=zone)),
-    _Kind(16, datetime, _moment_parts, lambda text, fold, zone: datetime.fromisoformat(text).replace(fold=fold, tzinfo=zone)),
-    _Kind(17, timedelta, lambda x: (x.days, x.seconds, x.microseconds), timedelta),
-    _Kind(18, timezone, lambda x: x.__getinitargs__(), timezone),
-    _Kind(19, ZoneInfo, _zone_parts, ZoneInfo),
-    _Kind(20, PosixPath, lambda x: (str(x),), PosixPath),
-    _Kind(21, PurePosixPath, lambda x: (str(x),), PurePosixPath),
-    _Kind(22, PureWindowsPath, lambda x: (str(x),), PureWindowsPath),
-    _Kind(23, random.Random, lambda x: x.getstate(), _random),
-)  # fmt: skip
-_KNOWN: Final = {kind.type: (ExtType(kind.code, b""), kind.parts) for kind in _KINDS}
+# Code in the data; type; its parts, which may be anything that can be saved; how the parts make it again.
+_TYPES: Final[tuple[tuple[int, type, Callable[[Any], Iterable[Any]], Callable[..., Any]], ...]] = (
+    (1, tuple, iter, lambda *parts: parts),
+    (2, set, iter, lambda *parts: {*parts}),
+    (3, frozenset, iter, lambda *parts: frozenset(parts)),
+    (4, dict, _flat, lambda *parts: _pairs(parts)),  # marked only where `walked` meets a key that is no scalar
+    (5, OrderedDict, _flat, lambda *parts: OrderedDict(_pairs(parts))),
+    (6, Counter, _flat, _make_counter),
+    (7, deque, lambda x: (x.maxlen, *x), lambda limit, *parts: deque(parts, limit)),
+    (8, bytearray, lambda x: (_Blob(x),), lambda view: bytearray(memoryview(view))),  # of an int it would be zeros
+    (9, complex, lambda x: (x.real, x.imag), complex),
+    (10, range, lambda x: (x.start, x.stop, x.step), range),
+    (11, Decimal, lambda x: (str(x),), Decimal),
+    (12, Fraction, lambda x: (x.numerator, x.denominator), Fraction),
+    (13, UUID, lambda x: (x.bytes, x.is_safe.value), lambda raw, safe: UUID(bytes=raw, is_safe=SafeUUID(safe))),
+    (14, date, lambda x: (x.isoformat(),), date.fromisoformat),
+    (15, time, _moment_parts, partial(_make_moment, time)),
+    (16, datetime, _moment_parts, partial(_make_moment, datetime)),
+    (17, timedelta, lambda x: (x.days, x.seconds, x.microseconds), timedelta),
+    (18, timezone, lambda x: x.__getinitargs__(), timezone),
+    (19, ZoneInfo, _zone_parts, ZoneInfo),
+    (20, PosixPath, lambda x: (str(x),), PosixPath),
+    (21, PurePosixPath, lambda x: (str(x),), PurePosixPath),
+    (22, PureWindowsPath, lambda x: (str(x),), PureWindowsPath),
+    (23, Random, Random.getstate, _make_random),
+)
+_KNOWN: Final = {kind: (ExtType(code, b""), parts) for code, kind, parts, _ in _TYPES}
 _SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes, _Blob})
-_NATIVE: Final = frozenset({list, dict, tuple, set, frozenset})  # what the garbage collector sees into
-_FIXED: Final = frozenset(_KNOWN) - {set, dict, OrderedDict, Counter, deque, bytearray, random.Random}
-_FACTORIES: Final = {kind.__name__: kind for kind in (bool, int, float, str, bytes, list, *(kind.type for kind in _KINDS))}
-_SHARED, _AGAIN, _BUFFER, _DEFAULTDICT, _ENUM, _DATACLASS, _STRUCT, _NAMEDTUPLE = (ExtType(n, b"") for n in range(32, 40))
-_ARRAY, _SCALAR, _TEXT, _BYTES, _BITS, _SEED, _GENERATOR, _RANDOM_STATE = (ExtType(n, b"") for n in range(48, 56))
+_NATIVE: Final = frozenset({list, dict, tuple, set, frozenset})  # the garbage collector knows what they refer to
+_CHANGING: Final = frozenset({list, dict, set, OrderedDict, Counter, deque, bytearray, Random})
+# The marks of what has readers of its own, below.
+_SHARED, _AGAIN, _BUFFER, _DEFAULTDICT, _ENUM, _DATACLASS, _STRUCT, _NAMEDTUPLE = (
+    ExtType(n, b"") for n in range(32, 40)
+)
+_ARRAY, _TEXT, _BITS, _SEED, _GENERATOR, _RANDOM_STATE = (ExtType(n, b"") for n in range(48, 54))
 
 
-# --- Classes of users and of numpy ---
+def _pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
+    encoder = _Encoder(canonical=canonical)
+    try:
+        if not encoder.is_tree(value):
+            walk = _Walk(encoder, shared=set())
+            tree = walk.lowered(value)
+            value = tree if canonical or not walk.again else _Walk(encoder, shared=walk.again).lowered(value)
+        packed = encoder.packed(value, None)
+    except UnsavableValue as refusal:
+        path = refusal.where if len(refusal.where) < 200 else f"{refusal.where[:90]} ... {refusal.where[-90:]}"
+        raise UnsavableValue(where + path, refusal.problem) from None
+    except (RecursionError, ValueError) as error:
+        raise UnsavableValue(where, f"a value that is nested too deep or too large ({error})") from None
+    if not encoder.is_marked:
+        return [bytes((FORMAT, 0)), packed]
+    return [_HEAD.pack(FORMAT, 1, len(packed)), packed, *encoder.blobs]
+
+
+class _Encoder:
+    """One value on its way to bytes. `canonical`: the order of sets, and what is shared, leave no trace."""
+
+    def __init__(self, *, canonical: bool) -> None:
+        self.canonical = canonical
+        self.is_marked = False
+        self.forms: dict[int, list[Any]] = {}  # made by `is_tree` for the packer, by id
+        self.classes: dict[type, tuple[ExtType, str, dict[str, Any]]] = {}
+        self.blobs: list[memoryview] = []
+        self.blob_bytes = 0
+
+    def is_tree(self, value: object) -> bool:
+        """Whether all of it can be saved, and nothing that can change is reached twice."""
+        level, ids, n_ids = [value], set[int](), 0
+        while kinds := set(map(type, level)) - _SCALARS:
+            changing = {kind for kind in kinds if _can_change(kind)}
+            found = [id(x) for x in level if type(x) in changing]
+            ids.update(found)
+            n_ids += len(found)
+            if len(ids) != n_ids:
+                return False
+            # Twice as fast as iterating: CPython does not report the keys of a dict if they all are of type str.
+            below = gc.get_referents(*[x for x in level if type(x) in _NATIVE])
+            if not kinds <= _NATIVE:
+                try:
+                    for x in level:
+                        if type(x) in kinds and type(x) not in _NATIVE:
+                            form = self.forms[id(x)] = self.form(x)
+                            below += form[1:]
+                except UnsavableValue:  # `walked` meets it again, and knows where
+                    return False
+            level = below
+        return True
+
+    def packed(self, tree: object, unicode_errors: str | None) -> Any:
+        packer = Packer(
+            default=self.default, strict_types=True, autoreset=False, buf_size=1024, unicode_errors=unicode_errors
+        )
+        try:
+            packer.pack(tree)
+        except UnicodeEncodeError:  # A lone surrogate, as in file names that are not UTF-8: rare, so tried second.
+            self.blobs, self.blob_bytes = [], 0
+            return self.packed(tree, "surrogatepass")
+        return packer.getbuffer()
+
+    def default(self, x: Any) -> Any:
+        """What the packer packs in place of `x`, which it does not know."""
+        if type(x) is int:
+            return ExtType(0, x.to_bytes(x.bit_length() // 8 + 1, "big", signed=True))
+        if type(x) is _Blob:
+            self.blobs.append(x.view)
+            self.blob_bytes += x.view.nbytes
+            return [_BUFFER, self.blob_bytes - x.view.nbytes, x.view.nbytes]
+        return self.forms.get(id(x)) or self.form(x)
+
+    def form(self, x: Any) -> list[Any]:
+        """A mark and the parts of `x`."""
+        self.is_marked = True
+        kind = type(x)
+        if kind in _KNOWN:
+            mark, parts = _KNOWN[kind]
+            if self.canonical and (kind is set or kind is frozenset):
+                is_ordered = set(map(type, x)) in ({int}, {str})
+                return [mark, *sorted(x, key=None if is_ordered else _canonical_bytes)]
+            return [mark, *parts(x)]
+        if kind is defaultdict:
+            return [_DEFAULTDICT, _factory_name(x.default_factory), *_flat(x)]
+        if kind.__module__.startswith("numpy") and (np := sys.modules.get("numpy")) and (form := _numpy_form(np, x)):
+            return form
+        if kind not in self.classes:
+            mark = _class_mark(kind)
+            if mark is None:
+                raise UnsavableValue("", f"a value of type {_type_name(kind)}")
+            self.classes[kind] = mark, _class_name(kind), _slots(kind)
+        mark, name, slots = self.classes[kind]
+        return [mark, name, *_class_parts(x, slots)]
+
+
+class _Walk:
+    """The slow way, object by object: for a value with shared objects, or with something that cannot be saved."""
+
+    def __init__(self, encoder: _Encoder, shared: set[int]) -> None:
+        self.encoder, self.shared = encoder, shared
+        self.numbers: dict[int, int] = {}  # of the shared ones that are in the tree already, by id
+        self.seen: dict[int, object] = {}  # by id: None while inside it, then itself, so that the id is not used again
+        self.again: set[int] = set()
+
+    def lowered(self, x: Any) -> Any:
+        if type(x) in _SCALARS:
+            return x
+        if not _can_change(type(x)):
+            return self.inside(x)
+        key = id(x)
+        if key in self.seen:
+            if self.seen[key] is None:
+                raise UnsavableValue("", f"a {_type_name(type(x))} that contains itself")
+            if key in self.numbers:
+                return [_AGAIN, self.numbers[key]]
+            self.again.add(key)
+            if not self.encoder.canonical:
+                return None  # This tree is thrown away: the next walk knows what is shared.
+        self.seen[key] = None
+        lowered = self.inside(x)
+        self.seen[key] = x
+        if key in self.shared:
+            self.encoder.is_marked = True
+            self.numbers[key] = len(self.numbers)
+            return [_SHARED, self.numbers[key], lowered]
+        return lowered
+
+    def inside(self, x: Any) -> Any:
+        if type(x) is list:
+            return self.each(x, x)
+        if type(x) is dict and _SCALARS.issuperset(map(type, x)):
+            return _pairs((*self.each(x, [*_flat(x)]),))
+        mark, *parts = self.encoder.form(x)
+        return [mark, *self.each(x, parts)]
+
+    def each(self, x: Any, parts: list[Any]) -> list[Any]:
+        lowered: list[Any] = []
+        try:
+            for part in parts:
+                lowered.append(self.lowered(part))  # noqa: PERF401 - the error needs the index
+        except UnsavableValue as refusal:  # on its way out each level adds its step to the path
+            refusal.where = _step(x, parts, len(lowered)) + refusal.where
+            raise
+        return lowered
+
+
+def _canonical_bytes(x: object) -> bytes:
+    return b"".join(_pieces(x, "{...}", canonical=True))
+
+
+def _can_change(kind: type) -> bool:
+    """Whether it makes a difference that two places hold the same object of this type."""
+    if kind in _CHANGING or kind in _KNOWN or issubclass(kind, (tuple, enum.Enum)):
+        return kind in _CHANGING
+    return kind.__module__ != "numpy" or kind.__name__ in ("ndarray", "void")  # the others are numpy's scalars
+
+
+def _step(x: Any, parts: list[Any], index: int) -> str:
+    """The way from `x` to one of its parts, as a reader would write it."""
+    if isinstance(x, dict):
+        index -= isinstance(x, defaultdict)  # which has its factory in front
+        return f"[{reprlib.repr(parts[index - 1])}]" if index % 2 else f".keys()[{index // 2}]"
+    if isinstance(x, (set, frozenset)):
+        return "{...}"
+    if isinstance(x, (date, time)):
+        return ".tzinfo"
+    if type(x) in (list, tuple, deque):
+        return f"[{index - (type(x) is deque)}]"
+    return f".{parts[index - 1]}" if index and isinstance(parts[index - 1], str) else ""
+
+
+# Classes: Enum, dataclass, Struct, NamedTuple.
+
+
+def _type_name(kind: type) -> str:
+    return kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _find(name: str) -> type:
-    """Find the class "module:qualname"; nothing is called for it, except what importing the module does."""
+    """Find the class "module:qualname". Nothing is called for it, except what importing the module does."""
     module, _, qualname = name.partition(":")
     try:
-        found: Any = sys.modules.get(module) or importlib.import_module(module)
+        found: Any = sys.modules.get(module) or import_module(module)
         for part in qualname.split("."):
             found = vars(found)[part]
     except (Exception, SystemExit) as error:
-        raise DamagedValue(f"{name} is not there ({type(error).__name__}: {error})") from error
+        raise DamagedValue(f"class {name} is not there ({type(error).__name__}: {error})") from error
     if not isinstance(found, type):
         raise DamagedValue(f"{name} is no class")
     return found
 
 
-def _name_of(kind: type) -> str:
-    # The user's program may be `__mp_main__` here and `__main__` in the process that reads, and the other way round.
+def _class_name(kind: type) -> str:
+    # The program is `__main__` in its own process, and `__mp_main__` too in those that are started for it.
     is_main = sys.modules.get(kind.__module__) is sys.modules.get("__main__")
     name = f"{'__main__' if is_main else kind.__module__}:{kind.__qualname__}"
     try:
@@ -273,18 +428,18 @@ def _name_of(kind: type) -> str:
             return name
     except DamagedValue:
         pass
-    raise _Refusal(f"a value of type {_type_name(kind)}, whose class is not found under that name,")
+    raise UnsavableValue("", f"a value of type {_type_name(kind)}, whose class is not found by that name,")
 
 
-def _mark_of(kind: Any) -> ExtType | None:
-    """How an instance is made again from its attributes, if that is possible without a call to code of the class."""
+def _class_mark(kind: type) -> ExtType | None:
+    """What instances can be made from again: their attributes, unless they are, say, a dict besides."""
     if issubclass(kind, enum.Enum):
         return _ENUM
     if issubclass(kind, msgspec.Struct):
         return _STRUCT
-    if dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__:  # else a dict, say, with contents of its own
+    if dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__:
         return _DATACLASS
-    if issubclass(kind, tuple) and isinstance(getattr(kind, "_fields", None), tuple):
+    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
         return _NAMEDTUPLE
     return None
 
@@ -294,72 +449,233 @@ def _slots(kind: type) -> dict[str, Any]:
     return {name: slot for name, slot in found if type(slot) is types.MemberDescriptorType}
 
 
-def _user_parts(x: Any, mark: ExtType, slots: dict[str, Any]) -> Iterable[Any]:
-    if mark is _ENUM:
-        if type(x).__members__.get(x.name) is not x and not isinstance(x, enum.Flag):
-            raise _Refusal(f"the unnamed member {x!r}")
-        yield x.name if x.name in type(x).__members__ else x.value
-        return
-    if mark is _NAMEDTUPLE:
-        yield from chain.from_iterable(zip(x._fields, x, strict=True))
+def _class_parts(x: Any, slots: dict[str, Any]) -> list[Any]:
+    if isinstance(x, enum.Enum):
+        return [x.name if x.name in type(x).__members__ else x.value]  # a value: flags together, without a name
+    parts = [*_flat(getattr(x, "__dict__", {}))]
+    if isinstance(x, tuple):
+        parts += chain.from_iterable(zip(x._fields, x, strict=True))
     for name, slot in slots.items():
         try:
-            value = slot.__get__(x)
+            parts += name, slot.__get__(x)
         except AttributeError:  # never set, or deleted
-            continue
-        yield name
-        yield value
-    yield from _flat(getattr(x, "__dict__", {}))
+            if isinstance(x, msgspec.Struct):
+                raise UnsavableValue("", f"a {_type_name(type(x))} without its field {name}") from None
+    return parts
 
 
-def _numpy_form(x: Any) -> list[Any] | None:
-    np, kind = sys.modules["numpy"], type(x)
-    if kind is np.ndarray:
+def _is_factory(kind: Any) -> bool:
+    return isinstance(kind, type) and (
+        kind in _SCALARS or kind in _KNOWN or kind is list or _class_mark(kind) is not None
+    )
+
+
+def _factory_name(factory: Any) -> str | None:
+    if factory is None:
+        return None
+    if not _is_factory(factory):
+        raise UnsavableValue(".default_factory", f"a value of type {_type_name(type(factory))}")
+    return _class_name(factory)
+
+
+# What numpy has, if the program has imported it.
+
+_LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0, "SFC64": 0}
+_LARGEST_POOL: Final = 64  # A SeedSequence takes time with the square of its pool.
+
+
+def _numpy_form(np: Any, x: Any) -> list[Any] | None:
+    kind = type(x)
+    if kind is np.str_ or kind is np.bytes_:  # as an array it would lose the NULs at its end
+        return [_TEXT, str.__str__(x) if kind is np.str_ else bytes(x)]
+    if kind is np.ndarray or (issubclass(kind, np.generic) and kind is x.dtype.type):
         order = "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"
         flat = np.ascontiguousarray(x.T if order == "F" else x).reshape(-1)
-        return [_ARRAY, _dtype_parts(x.dtype), [*x.shape], order, _Blob(flat.view(np.uint8) if flat.nbytes else b"")]
-    if kind is np.str_:
-        return [_TEXT, str.__str__(x)]  # as an array it would lose NULs at its end
-    if kind is np.bytes_:
-        return [_BYTES, bytes(x)]
-    if issubclass(kind, np.generic) and kind is x.dtype.type:
-        return [_SCALAR, _dtype_parts(x.dtype), x.tobytes()]
+        dtype, blob = _dtype_parts(x.dtype), _Blob(flat.view(np.uint8) if flat.nbytes else b"")
+        return [_ARRAY, dtype, x.shape, order if kind is np.ndarray else "", blob]
     if kind is np.random.Generator:
         return [_GENERATOR, x.bit_generator]
     if kind is np.random.RandomState and (state := x.get_state(legacy=False))["bit_generator"] == "MT19937":
         return [_RANDOM_STATE, state]
-    if kind.__name__ in _BIT_GENERATORS and kind is getattr(np.random, kind.__name__):
-        return [_BITS, x.state, getattr(x, "seed_seq", None)]
-    if kind is np.random.SeedSequence and x.pool_size <= _MAX_POOL:
-        return [_SEED, x.entropy, [*x.spawn_key], x.pool_size, x.n_children_spawned]
+    if kind.__name__ in _LAST_POSITION and kind is getattr(np.random, kind.__name__):
+        return [_BITS, x.state, x.seed_seq]
+    if kind is np.random.SeedSequence and x.pool_size <= _LARGEST_POOL:
+        return [_SEED, x.entropy, x.spawn_key, x.pool_size, x.n_children_spawned]
     return None
 
 
 def _dtype_parts(dtype: Any) -> Any:
-    """A dtype as text, [base, shape], or [fields, size, is aligned]."""
+    """A dtype as its name, [base, shape], or [fields, size, is aligned]."""
+    parts: Any = dtype.byteorder + dtype.char if dtype.char in "qQ" else dtype.str  # longlong is not int64
     if dtype.names is not None:
         fields = [[name, _dtype_parts(dtype[name]), *dtype.fields[name][1:]] for name in dtype.names]
-        parts: Any = [fields, dtype.itemsize, dtype.isalignedstruct]
+        parts = [fields, dtype.itemsize, dtype.isalignedstruct]
     elif dtype.subdtype is not None:
         parts = [_dtype_parts(dtype.base), [*dtype.shape]]
-    else:
-        parts = dtype.byteorder + dtype.char if dtype.char in "lLqQ" else dtype.str
     try:
-        made = _dtype(parts)
+        made = _make_dtype(parts)
         if (made, made.type, made.metadata) == (dtype, dtype.type, dtype.metadata):
             return parts
-    except (DamagedValue, TypeError, ValueError):
+    except (DamagedValue, TypeError, ValueError):  # of objects, or from another library
         pass
-    raise _Refusal(f"a numpy value of dtype {dtype}")
+    raise UnsavableValue("", f"a numpy value of dtype {dtype}")
 
 
-def _dtype(parts: Any) -> Any:
-    import numpy as np
-
+def _make_dtype(parts: Any) -> Any:
+    np = import_module("numpy")
     if isinstance(parts, str):
         dtype = np.dtype(parts)
     elif len(parts) == 2:
-        dtype = np.dtype((_dtype(parts[0]), tuple(parts[1])))
+        dtype = np.dtype((_make_dtype(parts[0]), tuple(parts[1])))
     else:
         fields, size, is_aligned = parts
-        names, formats, offsets, *titles = zip(*fields)
+        columns = {
+            "names": [name for name, *_ in fields],
+            "formats": [_make_dtype(form) for _, form, *_ in fields],
+            "offsets": [offset for _, _, offset, *_ in fields],
+            "titles": [title[0] if title else None for _, _, _, *title in fields],
+        }
+        dtype = np.dtype({**columns, "itemsize": size}, align=is_aligned)
+    if dtype.hasobject:  # Numpy would take its bytes for addresses.
+        raise DamagedValue(f"it has an array of dtype {dtype}")
+    return dtype
+
+
+def _make_array(dtype: Any, shape: tuple[int, ...], order: Any, data: memoryview) -> Any:
+    np = import_module("numpy")
+    array = np.ndarray(shape, _make_dtype(dtype), data, order=order or "C")
+    if array.shape != shape or array.nbytes != len(data):
+        raise DamagedValue(f"it has {len(data)} bytes for an array of shape {shape} and dtype {array.dtype}")
+    array = array.copy(order or "C")
+    return array if order else array[()]
+
+
+def _make_text(text: str | bytes) -> Any:
+    np = import_module("numpy")
+    return np.str_(text) if isinstance(text, str) else np.bytes_(text)
+
+
+def _make_bits(state: dict[str, Any], seed: Any) -> Any:
+    kind, position = state["bit_generator"], state.get("buffer_pos", state["state"].get("pos", 0))
+    if not 0 <= position <= _LAST_POSITION[kind]:  # Numpy does not check, and would read what is there.
+        raise DamagedValue(f"it has a {kind} at position {position}")
+    bits = getattr(import_module("numpy.random"), kind)(0 if seed is None else seed)
+    bits.state = state
+    return bits
+
+
+def _make_seed(entropy: Any, spawn_key: tuple[int, ...], pool_size: int, n_children: int) -> Any:
+    if pool_size > _LARGEST_POOL:
+        raise DamagedValue(f"it has a SeedSequence with a pool of {pool_size}")
+    return import_module("numpy.random").SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children)
+
+
+def _make_generator(bits: Any) -> Any:
+    return import_module("numpy.random").Generator(bits)
+
+
+def _make_random_state(state: dict[str, Any]) -> Any:
+    made = import_module("numpy.random").RandomState(_make_bits(state, None))
+    made.set_state(state)
+    return made
+
+
+# Reading.
+
+
+def _make_int(code: int, data: bytes) -> int:
+    if code != 0:
+        raise DamagedValue(f"it has an extension value with code {code}")
+    return int.from_bytes(data, "big", signed=True)
+
+
+_unpack: Final = partial(unpackb, strict_map_key=False, unicode_errors="surrogatepass")
+_MAKE: Final[dict[int, Callable[..., Any]]] = {
+    **{code: make for code, _, _, make in _TYPES},
+    _ARRAY.code: _make_array,
+    _TEXT.code: _make_text,
+    _BITS.code: _make_bits,
+    _SEED.code: _make_seed,
+    _GENERATOR.code: _make_generator,
+    _RANDOM_STATE.code: _make_random_state,
+}
+
+
+class _Decoder:
+    """What msgpack calls for each extension value and each list, inner ones first."""
+
+    def __init__(self, buffers: memoryview) -> None:
+        self.open_marks = 0
+        self.shared: dict[int, object] = {}
+        self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any]]] = {}
+        self.make = _MAKE | {
+            _BUFFER.code: lambda start, n_bytes: buffers[start : start + n_bytes],
+            _SHARED.code: self.make_shared,
+            _AGAIN.code: self.shared.__getitem__,
+            _DEFAULTDICT.code: self.make_defaultdict,
+            _ENUM.code: self.make_enum,
+            _DATACLASS.code: partial(self.make_record, _DATACLASS),
+            _STRUCT.code: partial(self.make_record, _STRUCT),
+            _NAMEDTUPLE.code: partial(self.make_record, _NAMEDTUPLE),
+        }
+
+    def value(self, tree: memoryview) -> object:
+        value = _unpack(tree, ext_hook=self.on_extension, list_hook=self.on_list)
+        if self.open_marks:
+            raise DamagedValue("it has a mark that opens no list")
+        return value
+
+    def on_extension(self, code: int, data: bytes) -> int:
+        if code == 0:
+            return _make_int(code, data)
+        self.open_marks += 1
+        return _Mark(code)
+
+    def on_list(self, parts: list[Any]) -> Any:
+        if not parts or type(parts[0]) is not _Mark:
+            return parts
+        self.open_marks -= 1
+        return self.make[parts[0]](*parts[1:])
+
+    def make_shared(self, number: int, x: object) -> object:
+        self.shared[number] = x
+        return x
+
+    def make_defaultdict(self, factory: str | None, *parts: Any) -> object:
+        kind: Any = None if factory is None else _find(factory)
+        if kind is not None and not _is_factory(kind):
+            raise DamagedValue(f"it has a defaultdict of {factory}")
+        return defaultdict(kind, _pairs(parts))
+
+    def find(self, mark: ExtType, name: str) -> tuple[Any, dict[str, Any]]:
+        if name not in self.classes:
+            kind = _find(name)
+            self.classes[name] = kind, _class_mark(kind), _slots(kind)
+        kind, found, slots = self.classes[name]
+        if found is not mark:
+            raise DamagedValue(f"class {name} is of another kind now")
+        return kind, slots
+
+    def make_enum(self, name: str, member: str | int) -> object:
+        kind, _ = self.find(_ENUM, name)
+        if isinstance(member, str):
+            return kind.__members__[member]
+        if issubclass(kind, enum.Flag):
+            return kind(member)
+        raise DamagedValue(f"{name} has no member {member!r}")
+
+    def make_record(self, mark: ExtType, name: str, *parts: Any) -> object:
+        kind, slots = self.find(mark, name)
+        attributes = _pairs(parts)
+        if mark is _DATACLASS:
+            made: Any = object.__new__(kind)
+        elif mark is _STRUCT:
+            made = kind(**{field: attributes[field] for field in kind.__struct_fields__ if field in attributes})
+        else:
+            made = tuple.__new__(kind, [attributes.pop(field) for field in kind._fields])
+        for attribute, value in attributes.items():
+            if attribute in slots:
+                slots[attribute].__set__(made, value)  # also where it is frozen
+            else:
+                made.__dict__[attribute] = value
+        return made

@@ -28,12 +28,12 @@ import time
 import zlib
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, field
 from hashlib import blake2b
 from itertools import count
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 import msgpack
 
@@ -101,8 +101,11 @@ def _from_ext(code: int, data: bytes) -> int:
 
 
 def _decode(data: bytes) -> Entry:
-    entry: Entry = msgpack.unpackb(data, use_list=False, ext_hook=_from_ext, unicode_errors="surrogatepass")
-    return entry
+    return cast("Entry", msgpack.unpackb(data, use_list=False, ext_hook=_from_ext, unicode_errors="surrogatepass"))
+
+
+def _text(data: bytes) -> str:
+    return data.decode(errors="surrogateescape")
 
 
 def _row_crc(position: int, address: int, chain: int, data: bytes) -> int:
@@ -149,7 +152,7 @@ def _start_of(pid: int) -> str | None:
 
 
 @contextlib.contextmanager
-def _living(pid: int, start: str | None) -> Iterator[int | None]:
+def _living(pid: int, start: str | None) -> Generator[int | None, None, None]:
     """Hold a pidfd of that very process, or `None` if it is dead. One that may not be looked at counts as alive."""
     try:
         pidfd = os.pidfd_open(pid) if pid > 0 else None
@@ -203,7 +206,7 @@ def _lock_holder(path: str) -> int | None:
     Asking the kernel through `fcntl` would need a descriptor of our own, and closing it would drop the locks of any
     connection this process has.
     """
-    files = set()
+    files: set[str] = set()
     for name in (path, f"{path}-shm"):
         with contextlib.suppress(OSError):
             info = os.stat(name)
@@ -232,7 +235,7 @@ class _Chain:
     removed: int = 0  # rows removed by cuts, and the sum of their chain numbers
     removed_sum: int = 0
     floor: int = 0  # the chain is at least this long
-    kept: list[int] = field(default_factory=list)  # ids of its snapshots, oldest first
+    kept: list[int] = field(default_factory=list[int])  # ids of its snapshots, oldest first
     last: int = 0  # newest chain number
     total: int = 0  # sum of the chain numbers of `positions`
     positions: array[int] = field(default_factory=lambda: array("q"))
@@ -275,7 +278,9 @@ class SqliteJournal:
         self._fsync = synchronous == "fsync"
         self._folder = f"{self.path}-snapshots"
         self._file_numbers = count(1)
-        self._pack = msgpack.Packer(default=_big_int, unicode_errors="surrogatepass").pack
+        self._pack = cast(
+            "Callable[[Entry], bytes]", msgpack.Packer(default=_big_int, unicode_errors="surrogatepass").pack
+        )
         self._lock = threading.RLock()  # guards the writing connection and all that follows
         self._read_lock = threading.Lock()
         self._chains: dict[str, _Chain] = {}
@@ -292,6 +297,8 @@ class SqliteJournal:
             self._open(takeover)
         except (sqlite3.Error, OSError) as error:
             raise self._translate(error) from error
+        except UnicodeDecodeError as error:  # SQLite quotes a damaged schema, and Python cannot read the quotation.
+            raise DamagedStore(self.path, None, None, "its tables are not as they were created") from error
 
     # ---- opening and closing
 
@@ -347,6 +354,8 @@ class SqliteJournal:
             isolation_level=None,
             check_same_thread=False,
         )
+        # A flipped bit may make a blob a text that is not UTF-8: leave it to the checksums.
+        db.text_factory = _text
         db.execute("PRAGMA wal_autocheckpoint = 0")  # It would sync the disk within an append: see `_checkpoint`.
         return db
 
@@ -605,16 +614,16 @@ class SqliteJournal:
     # ---- transactions
 
     @contextlib.contextmanager
-    def _transaction(self, size: int = 0, *, note: bool = False) -> Iterator[sqlite3.Connection]:
+    def _transaction(self, size: int = 0, *, note: bool = False) -> Generator[sqlite3.Connection, None, None]:
         """Run a write of about `size` bytes as the owner, or not at all.
 
         With `note` the transaction takes a position of its own, so that the mark shows if it is lost, and the store
         row is brought up to date.
         """
         with self._lock:
+            self._refresh()
             db = self._db
             try:
-                self._refresh()
                 db.execute("BEGIN IMMEDIATE")
                 (current,) = db.execute("SELECT epoch FROM store").fetchone()
                 if current != self.epoch:
@@ -646,17 +655,20 @@ class SqliteJournal:
         """Make sure that memory and file agree, after a transaction that was broken off."""
         self._refuse_failed()
         if self._in_doubt:
-            self._scan()
+            try:
+                self._scan()
+            except sqlite3.Error as error:
+                raise self._translate(error) from error
 
     def _translate(self, error: sqlite3.Error | OSError) -> HoldfastError:
         """Our error for theirs; after damage or an I/O error the journal stops for good."""
         code = _code(error)
-        # Our statements are fixed: what is wrong with them is the file they are for. Code 0 is text that is not UTF-8.
-        damaged = (0, sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+        # Our statements are fixed: if SQLite finds one in error, the file is no longer what they are for.
+        damaged = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
         translated: HoldfastError
         if isinstance(error, OSError) or code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
             translated = StoreFailed(self.path, f"{error}; open it again, which verifies it")
-        elif isinstance(error, sqlite3.DatabaseError) and code in damaged:
+        elif code in damaged:
             translated = DamagedStore(self.path, None, None, str(error))
         else:
             hint = {sqlite3.SQLITE_BUSY: "try again", sqlite3.SQLITE_FULL: "make room and try again"}
@@ -677,8 +689,8 @@ class SqliteJournal:
         """
         try:
             with contextlib.closing(self._connect()) as db:
-                _, frames, done = db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
-                if frames > _WAL_FRAMES and done < frames:
+                _, frames, _ = db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+                if frames > _WAL_FRAMES:
                     with self._lock:
                         db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
         except sqlite3.Error as error:
@@ -696,7 +708,8 @@ class SqliteJournal:
         if not entries:
             return []
         with self._lock:
-            packed, size = [], 0
+            packed: list[tuple[str, Primitive, bytes]] = []
+            size = 0
             for address, entry in entries:
                 _check(entry)
                 data = self._pack(entry)
@@ -709,7 +722,7 @@ class SqliteJournal:
 
     def _rows(self, packed: list[tuple[str, Primitive, bytes]]) -> list[tuple[int, int, int, Primitive, bytes, int]]:
         """Give each entry its position and its place in its chain."""
-        rows = []
+        rows: list[tuple[int, int, int, Primitive, bytes, int]] = []
         position = self._last
         for address, kind, data in packed:
             chain = self._chain(address)
@@ -808,7 +821,7 @@ class SqliteJournal:
 
     def _delete_snapshots(self, db: sqlite3.Connection, numbers: Sequence[int]) -> list[str]:
         """Delete the rows; return the files to be removed once that is committed."""
-        files = []
+        files: list[str] = []
         for number in numbers:
             row = db.execute("SELECT file FROM snapshots WHERE id = ?", (number,)).fetchone()
             files += [row[0]] if row and row[0] else []
@@ -840,7 +853,7 @@ class SqliteJournal:
                 raise translated from error
 
     @contextlib.contextmanager
-    def _view(self, address: str) -> Iterator[tuple[_Chain, array[int], list[int]] | None]:
+    def _view(self, address: str) -> Generator[tuple[_Chain, array[int], list[int]] | None, None, None]:
         """Freeze the file, for the reading connection, at the very state that the memory describes now."""
         db = self._reader
         with self._lock:
@@ -860,8 +873,8 @@ class SqliteJournal:
 
     def _load(self, chain: _Chain, positions: array[int], kept: list[int], older: bool) -> Saved:
         reason = ""
-        dropped: set[int]
-        snapshot, turn, dropped = None, 0, set()
+        snapshot, turn = None, 0
+        dropped: set[int] = set()
         candidates = kept[:-1] if older and len(kept) > 1 else kept
         # During a clean-up there are more than two, but the entries of the oldest may already be gone.
         for number in reversed(candidates[-1:] if older else kept[-2:]):

@@ -41,7 +41,7 @@ class LogSink:
         level = LEVELS.get(type(event))
         if level is None:
             return
-        left_out = self._admit(type(event))
+        left_out = 0 if type(event) is LogLine else self._admit(type(event))
         if left_out is None:
             return
         fields = describe(event)

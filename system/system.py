@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import asyncio
+import os
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, TypeVar, cast
 
 from ..actors import lives
 from ..actors.actor import Actor, Start
-from ..actors.cell import Cell
+from ..actors.cell import Cell, Host
 from ..actors.errors import HoldfastError, NoSuchActor, SpecError, TreeFailed
-from ..actors.events import EventStream, SupervisorGaveUp
+from ..actors.events import EventStream
 from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.lives import LOCAL
 from ..actors.mailbox import Bounded
 from ..actors.message import Message
 from ..actors.node import Node
+from ..actors.process.remote import ProcessHost, on_frame
+from ..actors.process.workers import Workers
 from ..actors.ref import ActorRef
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import DeleteChild, StartChild, Supervisor, TerminateChild
 from .logs import LogSink
 
 A = TypeVar("A", bound=Actor)
+
+ENTRY = f"{__package__}.guest_main:main"
+BASE = (f"{__package__}.guest_main",)
 
 ADMIN_TIMEOUT = 60.0
 """Seconds an admin call of the system may take: starting a child can mean restoring a large state."""
@@ -75,6 +82,8 @@ class ActorSystem:
         if self._node is not None:
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
+        self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
+        node.host_for = self._host_for
         if self._log:
             node.events.add_sink(LogSink(self.name))
         self._body = asyncio.current_task()
@@ -105,9 +114,17 @@ class ActorSystem:
 
     async def _close(self, root: Cell, node: Node) -> None:
         await lives.stop_and_wait(root)
+        await self._workers.close()
         await node.close()
         node.deadlines.close()
         node.events.close()
+
+    def _host_for(self, spec: ChildSpec) -> Host:
+        """Where a child's lives are lived."""
+        if spec.isolation == "process":
+            self._workers.want(spec.start.kind.__module__)
+            return ProcessHost(self._workers, spec.limits)
+        return LOCAL
 
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
@@ -210,6 +227,22 @@ class ActorSystem:
         """Messages that nobody handled, so far."""
         return self.node.dead_letters
 
+    def pid_of(self, ref: ActorRef[Any]) -> int:
+        """The OS process an actor lives in now: its own, or this one.
+
+        Raises:
+            NoSuchActor: it lives nowhere at the moment.
+        """
+        cell: Cell | None = ref._cell
+        while cell is not None:
+            worker = self._workers.of(cell)
+            if worker is not None:
+                return worker.pid
+            if isinstance(cell.host, ProcessHost):
+                raise NoSuchActor(ref.path)
+            cell = cell.parent
+        return os.getpid()
+
     def tree(self) -> list[str]:
         """The addresses that live now, parents before children."""
         found: list[str] = []
@@ -220,5 +253,3 @@ class ActorSystem:
             waiting.extend(reversed(list((cell.children or {}).values())))
         return found
 
-
-__all__ = ["ActorSystem", "SupervisorGaveUp"]

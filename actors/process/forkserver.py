@@ -258,8 +258,9 @@ class ForkServer:
             async with asyncio.timeout(timeout):
                 await self._ended.wait()
         except TimeoutError:
-            with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+            if self._pidfd >= 0:  # it may have ended in the very tick the time was up
+                with contextlib.suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
             await self._ended.wait()
 
     def _on_death(self) -> None:

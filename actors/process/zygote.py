@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import gc
 import importlib
+import importlib.abc
 import importlib.util
 import json
 import os
@@ -162,10 +163,13 @@ def load_main(main: str, is_path: bool) -> None:
             code = compile(file.read(), main, "exec", dont_inherit=True)
     else:
         spec = importlib.util.find_spec(main)
-        if spec is None or spec.loader is None:
+        if spec is None or not isinstance(spec.loader, importlib.abc.InspectLoader):
             raise ImportError(f"no module named {main}")
         module.__file__, module.__package__ = spec.origin, spec.parent
-        code = spec.loader.get_code(main)  # type: ignore[attr-defined]
+        found = spec.loader.get_code(main)
+        if found is None:
+            raise ImportError(f"{main} has no Python code")
+        code = found
     replaced = sys.modules["__main__"]
     sys.modules["__main__"] = sys.modules[MAIN_NAME] = module
     try:
@@ -445,7 +449,7 @@ class Zygote:
 
     def _reap(self) -> list[tuple[int, int]]:
         """Take the wait status of all that have died."""
-        gone = []
+        gone: list[tuple[int, int]] = []
         with contextlib.suppress(ChildProcessError):
             while (found := os.waitpid(-1, os.WNOHANG))[0]:
                 gone.append(found)

@@ -20,6 +20,7 @@ Position = tuple[float, float]
 
 TOPIC = "/scan"
 BURST = 0.02  # seconds: scans due within this are published together, one timer for all
+LONGEST_PAUSE = 1.0  # seconds: a gap in the recording is not sat out
 ROBOT_WIDTH = 1.0  # metres around a way that are fetched to judge it
 
 
@@ -238,10 +239,11 @@ def _message(number: int, scan: LaserScan) -> Scan:
 async def _paced(file: Path, speed: float) -> AsyncIterator[LaserScan]:
     """The scans of a log, each not before its time."""
     clock = asyncio.get_running_loop().time
-    began, first = clock(), None
+    due, before = clock(), None
     for scan in read_scans(file):
-        first = scan.time if first is None else first
-        early = (scan.time - first) / speed - (clock() - began) if speed else 0.0
-        if early > BURST:
-            await asyncio.sleep(early)
+        if speed and before is not None:
+            due += min(max(scan.time - before, 0.0) / speed, LONGEST_PAUSE)
+        before = scan.time
+        if due - clock() > BURST:
+            await asyncio.sleep(due - clock())
         yield scan

@@ -125,8 +125,8 @@ def _samples(lengths: NDArray[np.float64], resolution: float) -> tuple[NDArray[n
     """Points along beams, closer than a cell, to half a cell before the end: (beam of each point, its distance)."""
     pitch = 0.7 * resolution
     counts = np.ceil(np.maximum(lengths - 0.5 * resolution, 0.0) / pitch).astype(np.int64)
-    beams = np.repeat(np.arange(len(lengths)), counts)
-    ordinals = np.arange(len(beams)) - np.repeat(np.cumsum(counts) - counts, counts)
+    beams = np.repeat(np.arange(len(lengths), dtype=np.int64), counts)
+    ordinals = np.arange(len(beams), dtype=np.float64) - np.repeat(np.cumsum(counts) - counts, counts)
     return beams, ordinals * pitch
 
 

@@ -69,7 +69,8 @@ class Killer:
 
     def _strike(self, moment: Moment) -> None:
         pid = self._find_pid()
-        if pid is None or any(kill.pid == pid for kill in self.kills) or not _kill(pid):
+        killed_before = bool(self.kills) and self.kills[-1].pid == pid
+        if pid is None or killed_before or not _kill(pid):
             asyncio.get_running_loop().call_later(RETRY, self._strike, moment)
             return
         kill = Kill(pid, moment.scan)

@@ -9,7 +9,7 @@ import math
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -179,7 +179,7 @@ def _summary(poses: NDArray[np.float64], problem: LogError | None) -> Survey:
 
 
 @contextmanager
-def _open_text(path: Path) -> Iterator[Iterable[str]]:
+def _open_text(path: Path) -> Generator[Iterable[str], None, None]:
     """Open a log as lines that keep their line ends: the last one shows by it whether it is whole."""
     if path.suffix == ".gz":
         with gzip.open(path, "rt", encoding="utf-8", newline="\n") as lines:

@@ -60,7 +60,8 @@ def _radius(grid: OccupancyGrid) -> int:
 
 
 def _holds(free: Mask, cell: Cell) -> bool:
-    return 0 <= cell[0] < free.shape[0] and 0 <= cell[1] < free.shape[1]
+    rows, columns = free.shape
+    return bool(0 <= cell[0] < rows and 0 <= cell[1] < columns)
 
 
 def _sees(free: Mask, here: Cell, there: Cell) -> bool:
@@ -69,7 +70,8 @@ def _sees(free: Mask, here: Cell, there: Cell) -> bool:
     steps = 2 * max(abs(there[0] - here[0]), abs(there[1] - here[1])) + 1
     rows = np.rint(np.linspace(here[0], there[0], steps)).astype(np.int64)
     columns = np.rint(np.linspace(here[1], there[1], steps)).astype(np.int64)
-    return bool(free[rows, columns].all())
+    along: Mask = free[rows, columns]
+    return bool(along.all())
 
 
 def _shortest(free: Mask, start: Cell, goal: Cell) -> list[Cell] | None:

@@ -46,10 +46,12 @@ class Questions:
         """Send the next question; the task ends with its answer, or with its failure."""
         serial = self.next_serial()
         if serial % PLANNER_SHARE:
-            return self._await(serial, self._mapper.ask(LookAt(serial, self._place()), timeout=PATIENCE))
+            seen = self._mapper.ask(LookAt(serial, self._place()), timeout=PATIENCE)
+            return self._await(serial, seen)
         start = self._place()
         goal = start[0] + self._random.uniform(-WAY, WAY), start[1] + self._random.uniform(-WAY, WAY)
-        return self._await(serial, self._planner.ask(IsWayFree(serial, start, goal), timeout=PATIENCE))
+        judged = self._planner.ask(IsWayFree(serial, start, goal), timeout=PATIENCE)
+        return self._await(serial, judged)
 
     def next_serial(self) -> int:
         """The serial number of a question that is about to be sent; it counts as sent."""

@@ -12,8 +12,8 @@ from typing import Literal
 from ... import (
     ActorRef,
     ActorSystem,
+    ChildSpec,
     Recovered,
-    RecoveryMethod,
     bounded,
     checkpoint_only,
     child,
@@ -52,17 +52,17 @@ class Plan:
     speed: float
 
 
-def tree(geometry: Geometry, recovery: RecoveryMethod, kills: int) -> object:
+def tree(geometry: Geometry, recovery: object, kills: int) -> ChildSpec:
     """The supervision tree. Only the mapper's child spec knows that it has a process, and how it comes back."""
     mapper = child("mapper", start(Mapper, geometry), isolation="process", recovery=recovery, mailbox=bounded(MAILBOX))
-    planner = child("planner", start(Planner), bind={"mapper": MAPPER})
+    planner = child("planner", start(Planner), bindings={"mapper": MAPPER})
     reader = child("reader", start(Reader))
     return supervisor(
         "robot", strategy="one_for_one", intensity=2 * kills + 3, period=10.0, children=[mapper, planner, reader]
     )
 
 
-def recovery_of(plan: Plan) -> RecoveryMethod:
+def recovery_of(plan: Plan) -> object:
     """The recovery method that the plan names."""
     match plan.method:
         case "hybrid":
@@ -104,7 +104,8 @@ class Run:
         self._watcher.begin(self._name, self._found.scans)
         found = self._found
         geometry = Geometry.covering(found.x_min, found.y_min, found.x_max, found.y_max)
-        async with ActorSystem("demo") as system:
+        # Its log would run through the display, which shows the same events.
+        async with ActorSystem("demo", log=False) as system:
             events = asyncio.create_task(self._listen(system))
             try:
                 await system.start(tree(geometry, recovery_of(self._plan), len(self._moments)))
@@ -173,12 +174,13 @@ class Run:
         )
 
     async def _listen(self, system: ActorSystem) -> None:
-        async for event in system.events():
-            if isinstance(event, Recovered) and event.address == MAPPER:
-                recovery = Recovery(event.phases, event.replayed)
-                self._recoveries.append(recovery)
-                self._heard.set()
-                self._watcher.recovered(recovery)
+        with system.events() as events:
+            async for event in events:
+                if isinstance(event, Recovered) and event.address == MAPPER:
+                    recovery = Recovery(event.phases, event.replayed)
+                    self._recoveries.append(recovery)
+                    self._heard.set()
+                    self._watcher.recovered(recovery)
 
     async def _hear_the_last(self, killer: Killer) -> None:
         """Events come a little after the fact."""

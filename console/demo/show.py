@@ -209,7 +209,7 @@ def _table(kills: Sequence[Kill], recoveries: Sequence[Recovery]) -> Table:
     for heading in ("SIGKILL", "after scan", *PHASES):
         table.add_column(heading, justify="right")
     for row, kill in enumerate(kills):
-        phases = recoveries[row].phases if row < len(recoveries) else {}
+        phases: Mapping[str, float] = recoveries[row].phases if row < len(recoveries) else {}
         times = (f"{1000 * phases[phase]:.1f}" if phase in phases else "" for phase in PHASES)
         table.add_row(str(kill.pid), f"{kill.last_scan:,}", *times)
     return table

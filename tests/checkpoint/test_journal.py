@@ -37,7 +37,6 @@ from holdfast.checkpoint.journal import (
 from holdfast.checkpoint.sqlite import SqliteJournal
 
 A, B = "/app/bank/alice", "/app/bank/bob"
-Open = Callable[[], SqliteJournal]
 
 
 @pytest.fixture
@@ -175,7 +174,7 @@ written = st.tuples(
 
 
 @given(batches=st.lists(st.lists(written, max_size=5), max_size=5))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=40)
 def test_entries_come_back_exactly(path: Path, batches: list[list[tuple[str, Entry]]]) -> None:
     shutil.rmtree(path.parent)
     path.parent.mkdir()
@@ -250,7 +249,7 @@ def test_positions_that_the_address_has_not_are_ignored(store: SqliteJournal) ->
 
 
 @given(data=st.data())
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=50)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
 def test_the_store_agrees_with_a_naive_model(path: Path, data: st.DataObject) -> None:
     """Any sequence of appends, cuts, erases and reopenings loads as a dictionary of lists does."""
     shutil.rmtree(path.parent)
@@ -643,7 +642,7 @@ def contents(path: Path) -> tuple[Saved, Saved, bytes | None]:
 
 
 def test_a_flipped_bit_in_an_entry_is_found(filled: Path) -> None:
-    edit(filled, "UPDATE entries SET data = CAST(data AS TEXT) || 'x' WHERE position = 6")
+    edit(filled, "UPDATE entries SET data = CAST(data || 'x' AS BLOB) WHERE position = 6")
     with closing(SqliteJournal(filled)) as journal:
         assert numbers(journal.load(A)) == [4, 5, 6]  # The others work.
         with pytest.raises(DamagedStore) as caught:
@@ -653,15 +652,16 @@ def test_a_flipped_bit_in_an_entry_is_found(filled: Path) -> None:
     assert numbers(contents(filled)[1]) == []
 
 
-@pytest.mark.parametrize("position", range(3, 15))
-def test_an_entry_that_is_gone_is_missed(filled: Path, position: int) -> None:
-    before = contents(filled)
-    with closing(sqlite3.connect(filled, isolation_level=None)) as db:
-        if not db.execute("DELETE FROM entries WHERE position = ? RETURNING 1", (position,)).fetchone():
-            pytest.skip("taken by a cut")
-    with pytest.raises(DamagedStore):
-        contents(filled)
-    assert before
+def test_no_entry_goes_unmissed_not_even_the_last(filled: Path) -> None:
+    intact = filled.read_bytes()
+    with closing(sqlite3.connect(filled)) as db:
+        positions = [position for (position,) in db.execute("SELECT position FROM entries")]
+    assert len(positions) == 11
+    for position in positions:
+        filled.write_bytes(intact)
+        edit(filled, f"DELETE FROM entries WHERE position = {position}")
+        with pytest.raises(DamagedStore):
+            contents(filled)
 
 
 def test_a_hole_in_the_middle_is_located_and_leaves_others_alone(filled: Path) -> None:
@@ -693,6 +693,7 @@ def test_a_hole_in_the_middle_is_located_and_leaves_others_alone(filled: Path) -
         "UPDATE entries SET kind = 'out' WHERE position = 6",
         "UPDATE entries SET crc = crc + 1 WHERE position = 6",
         "UPDATE entries SET data = NULL WHERE position = 6",
+        "UPDATE entries SET data = CAST(x'ff' AS TEXT) WHERE position = 6",
         "UPDATE addresses SET path = '/c' WHERE id = 2",
         "UPDATE addresses SET removed = removed + 1 WHERE id = 2",
         "UPDATE addresses SET kept = '' WHERE id = 2",
@@ -796,7 +797,7 @@ def test_after_a_power_loss_a_torn_tail_is_cut(path: Path) -> None:
     assert numbers(reopened(path)) == []
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_no_flipped_bit_changes_what_is_read(filled: Path, tmp_path: Path, seed: int) -> None:
     """Flip random bits of the database: it is read as before, or refused, or an older snapshot says why."""
     choose = random.Random(seed)

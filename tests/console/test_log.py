@@ -159,6 +159,9 @@ def test_a_log_without_a_scan(tmp_path: Path, text: str) -> None:
 
 
 def test_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    def find_nothing(name: str) -> None:
+        return None
+
+    monkeypatch.setattr("importlib.util.find_spec", find_nothing)
     with pytest.raises(LogError, match=r"pip install holdfast\[demo\]"):
         killian_court()

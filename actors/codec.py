@@ -1,0 +1,196 @@
+"""The wire codec: typed payloads as MessagePack by msgspec, with refs and numpy arrays as extensions. No pickle.
+
+A payload is decoded only into a type that the receiver itself names: a handler's message class, or the reply type of
+what was asked. Nothing that comes over a wire makes this process import or construct anything else.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from .errors import (
+    AskFailed,
+    BadMessage,
+    HoldfastError,
+    RemoteCrash,
+    rebuild_error,
+    remote_crash,
+    type_name,
+)
+from .message import Message, Refusal, UnknownRefusal, find_refusal, message_name, reply_type
+from .ref import ActorRef
+
+if TYPE_CHECKING:
+    from .cell import Cell
+
+MAX_BYTES = 16 * 1024 * 1024
+"""The largest message, in bytes of payload."""
+
+REF, ARRAY, EXTENSIONS = 1, 2, (1, 2)
+
+Raw = msgspec.Raw
+
+
+class Parcel:
+    """A message that is still encoded: what a router passes on and a journal keeps."""
+
+    __slots__ = ("body", "name")
+
+    def __init__(self, name: str, body: bytes) -> None:
+        self.name, self.body = name, body
+
+    def __repr__(self) -> str:
+        return f"<Parcel {self.name} {len(self.body)} bytes>"
+
+
+class Codec:
+    """Encodes and decodes for one node: refs in payloads are refs of that node."""
+
+    def __init__(self, cell_at: Callable[[str], Cell]) -> None:
+        self._cell_at = cell_at
+        self.encoder = msgspec.msgpack.Encoder(enc_hook=encode_special)
+        self._decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
+
+    def encode(self, value: object, actor: str) -> bytes:
+        """The payload's bytes.
+
+        Raises:
+            BadMessage: naming the type and what in it cannot be coded, or that it is too large.
+        """
+        try:
+            body = self.encoder.encode(value)
+        except Exception as error:  # msgspec raises what a hook or a field's own code raises: all means "not codable".
+            raise BadMessage(actor, type_name(type(value)), unencodable(value, error)) from error
+        if len(body) > MAX_BYTES:
+            raise BadMessage(actor, type_name(type(value)), too_large(value, len(body)))
+        return body
+
+    def parcel(self, message: Message[Any], actor: str) -> Parcel:
+        """A message, encoded."""
+        return Parcel(message_name(type(message)), self.encode(message, actor))
+
+    def decode(self, kind: Any, body: Any) -> Any:
+        """A payload as `kind`; copies what it keeps.
+
+        Raises:
+            msgspec.DecodeError: the bytes are no such value; the text names the field.
+        """
+        decoder = self._decoders.get(kind)
+        if decoder is None:
+            decoder = self._decoders[kind] = msgspec.msgpack.Decoder(
+                kind, dec_hook=check_special, ext_hook=self._decode_special
+            )
+        return decoder.decode(body)
+
+    def decode_reply(self, message: type[Message[Any]], body: Any) -> Any:
+        """A reply, as the type that the message declares."""
+        return self.decode(reply_type(message), body)
+
+    def _decode_special(self, code: int, data: memoryview) -> object:
+        if code == REF:
+            return ActorRef[Any](self._cell_at(str(data, "utf-8")))
+        if code == ARRAY:
+            return decode_array(data)
+        raise msgspec.ValidationError(f"unknown extension {code}")
+
+    # -- errors -----------------------------------------------------------------------------------------------------
+
+    def encode_error(self, error: BaseException) -> tuple[str, str, bytes]:
+        """An error as (kind, class name, payload): a Refusal or a HoldfastError stays its class, all else is a crash."""
+        if isinstance(error, Refusal):
+            schema = type(error).schema()
+            fields = schema(*(getattr(error, name) for name in schema.__struct_fields__))
+            return "refusal", message_name(type(error)), self.encode(fields, "")
+        if isinstance(error, HoldfastError) and not isinstance(error, RemoteCrash):
+            return "error", type_name(type(error)), self.encode(error.args, "")
+        crash = remote_crash(error)
+        return "crash", "", self.encode((crash.type_name, crash.text, crash.traceback), "")
+
+    def decode_error(self, kind: str, name: str, body: Any) -> HoldfastError:
+        """The error that another process sent."""
+        if kind == "refusal":
+            found = find_refusal(name)
+            if found is None:
+                return UnknownRefusal(type_name=name, fields=self.decode(list[Any], body))
+            fields = self.decode(found.schema(), body)
+            return found(*(getattr(fields, field) for field in fields.__struct_fields__))
+        args = tuple(self.decode(list[Any], body))
+        if kind == "crash":
+            return RemoteCrash(*args)
+        return rebuild_error(name, args) or AskFailed(name, ", ".join(map(str, args)))
+
+
+def encode_special(value: Any) -> Any:
+    """Refs and arrays as extensions; anything else is refused by name."""
+    if isinstance(value, ActorRef):
+        return msgspec.msgpack.Ext(REF, value.path.encode())
+    numpy = sys.modules.get("numpy")
+    if numpy is not None:
+        if isinstance(value, numpy.ndarray):
+            return msgspec.msgpack.Ext(ARRAY, encode_array(value))
+        if isinstance(value, numpy.generic):
+            return value.item()
+    raise TypeError(f"a value of type {type_name(type(value))} cannot be sent")
+
+
+def encode_array(array: Any) -> bytearray:
+    """dtype, shape and the elements in C order, in one copy."""
+    if array.dtype.hasobject:
+        raise TypeError("a numpy array of objects cannot be sent")
+    head = msgspec.msgpack.encode((array.dtype.str if array.dtype.names is None else array.dtype.descr, array.shape))
+    data = bytearray(4 + len(head) + array.nbytes)
+    data[0:4] = len(head).to_bytes(4, "little")
+    data[4 : 4 + len(head)] = head
+    target = sys.modules["numpy"].frombuffer(data, dtype=array.dtype, offset=4 + len(head), count=array.size)
+    target.reshape(array.shape)[...] = array
+    return data
+
+
+def decode_array(data: memoryview) -> Any:
+    """The array, owning its memory and writable."""
+    import numpy as np
+
+    length = int.from_bytes(data[:4], "little")
+    kind, shape = msgspec.msgpack.decode(data[4 : 4 + length], type=tuple[Any, tuple[int, ...]])
+    dtype = np.dtype(kind if isinstance(kind, str) else [tuple(field) for field in kind])
+    if dtype.hasobject:
+        raise msgspec.ValidationError("an array of objects is not accepted")
+    count = 1
+    for extent in shape:
+        count *= extent
+    if len(data) - 4 - length != count * dtype.itemsize:
+        raise msgspec.ValidationError(f"array of {shape} {dtype} does not have {len(data) - 4 - length} bytes")
+    return np.frombuffer(data, dtype=dtype, offset=4 + length, count=count).reshape(shape).copy()
+
+
+def check_special(kind: Any, value: Any) -> Any:
+    """Fields typed as refs or arrays: accept what the extension gave, refuse anything else."""
+    origin = getattr(kind, "__origin__", kind)
+    if isinstance(origin, type) and isinstance(value, origin):
+        return value
+    raise TypeError(f"expected {getattr(origin, '__name__', origin)}, got {type(value).__name__}")
+
+
+def unencodable(value: object, error: BaseException) -> str:
+    """Which field cannot be coded, and why."""
+    for name in getattr(value, "__struct_fields__", ()):
+        field = getattr(value, name)
+        try:
+            msgspec.msgpack.encode(field, enc_hook=encode_special)
+        except Exception as inner:
+            return f"field {name!r}: {inner}"
+    return str(error)
+
+
+def too_large(value: object, size: int) -> str:
+    """Which field makes it too large."""
+    sizes = {
+        name: len(msgspec.msgpack.encode(getattr(value, name), enc_hook=encode_special))
+        for name in getattr(value, "__struct_fields__", ())
+    }
+    largest = max(sizes, key=lambda name: sizes[name], default="")
+    return f"field {largest!r}: the message has {size} bytes, the limit is {MAX_BYTES}; send it in parts"

@@ -1,0 +1,121 @@
+"""Frames: what travels between the root and an actor process, both ways.
+
+A frame is a 4-byte length and a MessagePack array `[kind, ...]`. Addresses and type names are sent as text once, and as
+a number from then on. `body` is a payload that whoever routes the frame does not decode.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+Raw = msgspec.Raw
+Name = int | str
+"""An address or type name: text the first time, its number in order of first use from then on."""
+
+
+class Frame(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
+    """Base of all frames."""
+
+
+class Tell(Frame, tag=1):
+    """A message nobody waits for; `number` counts those to an actor with a process of its own (0: it has none)."""
+
+    to: Name
+    name: Name
+    body: Raw
+    number: int = 0
+    sender: Name | None = None
+
+
+class Ask(Frame, tag=2):
+    """A message whose outcome is awaited under `id`; `left` seconds from now."""
+
+    id: int
+    to: Name
+    name: Name
+    body: Raw
+    left: float
+    number: int = 0
+    sender: Name | None = None
+    chain: tuple[tuple[str, int], ...] = ()
+
+
+class Reply(Frame, tag=3):
+    """The reply to the ask with this id."""
+
+    id: int
+    body: Raw
+
+
+class Failure(Frame, tag=4):
+    """The ask with this id failed."""
+
+    id: int
+    kind: str
+    name: str
+    body: Raw
+
+
+class Launch(Frame, tag=5):
+    """Start an actor at an address: `recipe` is its class and arguments; `options` are the host's."""
+
+    id: int
+    to: Name
+    life: int
+    recipe: bytes
+    options: dict[str, Any]
+
+
+class Launched(Frame, tag=6):
+    """The actor is up, or (`problem`) is not."""
+
+    id: int
+    problem: str = ""
+
+
+class Ended(Frame, tag=7):
+    """The life at an address has ended."""
+
+    to: Name
+    life: int
+    reason: dict[str, Any]
+
+
+class Command(Frame, tag=8):
+    """A command or signal to the actor at an address: stop, kill, exit, down, bind..."""
+
+    to: Name
+    verb: str
+    data: dict[str, Any] = {}
+
+
+class Publish(Frame, tag=9):
+    """Publish on a topic."""
+
+    topic: str
+    name: Name
+    body: Raw
+    sender: Name | None = None
+
+
+class Beat(Frame, tag=10):
+    """The sender's loop turns."""
+
+
+class Note(Frame, tag=11):
+    """An event of the other node, for the log and the event stream."""
+
+    kind: str
+    data: dict[str, Any]
+
+
+class Record(Frame, tag=12):
+    """For the recovery method at an address; its payload is that method's own."""
+
+    to: Name
+    body: Raw
+
+
+AnyFrame = Tell | Ask | Reply | Failure | Launch | Launched | Ended | Command | Publish | Beat | Note | Record

@@ -1,0 +1,235 @@
+"""The guest: what runs inside an actor's OS process. A node with one actor (or one subtree), joined to the root."""
+
+from __future__ import annotations
+
+import asyncio
+import mmap
+import os
+import socket
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import uvloop
+
+from .. import lives
+from ..cell import RUNNING, Cell
+from ..errors import HoldfastError, StartFailed
+from ..events import Event, event_data
+from ..exits import ExitReason, pack_exit, unpack_exit
+from ..links import Down, Exit, Monitor
+from ..node import Node
+from . import frames
+from .connection import Connection
+from .recipe import unpack_recipe
+from .relay import OutsideHost, Peer
+
+Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
+"""Begins the life a launch frame asks for; the composition root gives one that knows recovery and supervision."""
+
+
+def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
+    """Serve the root until its socket ends. Returns the exit code."""
+    page = memoryview(mmap.mmap(page_fd, mmap.PAGESIZE)).cast("Q")
+    os.close(page_fd)
+    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+        return runner.run(_serve(sock, page, launcher, prepare))
+
+
+async def _serve(
+    sock: socket.socket, page: memoryview, launcher: Launcher, prepare: Callable[[Guest], None]
+) -> int:
+    guest = Guest(asyncio.get_running_loop(), page, launcher)
+    prepare(guest)
+    guest.connection = Connection(guest.on_frame, guest.on_lost)
+    await guest.connection.open(sock)
+    code = await guest.ended
+    # Handlers may hold threads or swallow cancellation: the process ends here, not when they are ready.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+class GuestHost(lives.LocalHost):
+    """The host of the process's own actor: its address is kept at the root, so its end is only reported."""
+
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+
+    def retired(self, cell: Cell) -> None:
+        if cell.queue:
+            cell.queue.clear()  # Its home has these, and sends them to the next life.
+        more = cell.more
+        self._guest.report_end(cell, more.reason if more is not None else None)
+
+
+class Guest(Peer):
+    """The child's end of the connection, and its node."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, page: memoryview, launcher: Launcher) -> None:
+        super().__init__(Node("guest", loop))
+        self.page = page
+        self.ended: asyncio.Future[int] = loop.create_future()
+        self.on_record: Callable[[frames.Record], None] | None = None
+        self._launcher = launcher
+        self._targets: dict[int, Cell] = {}
+        self._outside: dict[str, Cell] = {}
+        self._monitors: dict[str, list[Monitor]] = {}
+        self._host = OutsideHost(self)
+        self.node.outside = self.outside
+        self.node.uplink = self
+        self.node.events.add_sink(self._on_event)
+
+    # -- the world outside ------------------------------------------------------------------------------------------
+
+    def outside(self, path: str) -> Cell:
+        """The stand-in for an address that is not in this process."""
+        cell = self._outside.get(path)
+        if cell is None:
+            cell = self._outside[path] = Cell(self.node, None, path, self._host)
+            cell.state = RUNNING
+            cell.admit = self._host.admit
+        return cell
+
+    def publish(self, topic: str, message: Any, sender: Cell | None) -> None:
+        """Publish through the root."""
+        name, body = self._payload(message)
+        source = None if sender is None else self.connection.name_out(sender.path)
+        self.connection.send(frames.Publish(topic, name, body, source), topic)
+
+    def command(self, cell: Cell, verb: str, **data: Any) -> None:
+        """Ask the root to do something to an address."""
+        self.connection.send(frames.Command(self.connection.name_out(cell.path), verb, data))
+
+    def monitor(self, watch: Monitor) -> None:
+        """Watch an address outside."""
+        self._monitors.setdefault(watch.target.path, []).append(watch)
+        self.command(watch.target, "monitor", watcher=watch.watcher.path, for_good=watch.for_good)
+
+    def _on_event(self, event: Event) -> None:
+        self.connection.send(frames.Note(type(event).__name__, event_data(event)))
+
+    # -- frames from the root ---------------------------------------------------------------------------------------
+
+    def on_frame(self, frame: frames.AnyFrame) -> None:
+        """Whatever the root sends."""
+        match frame:
+            case frames.Tell():
+                cell = self._target(frame.to)
+                self.on_tell(cell, frame, self.page if frame.number else None)
+            case frames.Ask():
+                cell = self._target(frame.to)
+                self.on_ask(cell, frame, self.page if frame.number else None)
+            case frames.Reply():
+                self.on_reply(frame)
+            case frames.Failure():
+                self.on_failure(frame)
+            case frames.Launch():
+                self._launch(frame)
+            case frames.Command():
+                self._command(self._target(frame.to), frame)
+            case frames.Record():
+                if self.on_record is not None:
+                    self.on_record(frame)
+            case _:
+                raise HoldfastError(f"the root sent a {type(frame).__name__}")
+
+    def _target(self, to: frames.Name) -> Cell:
+        """The cell at an address of this process."""
+        if type(to) is int and (cell := self._targets.get(to)) is not None:
+            return cell
+        path = self.connection.name_in(to)
+        cell = self.node.find(path)
+        assert cell is not None
+        if cell is self.node.root:  # Cells of a subtree come and go; ours stays.
+            self._targets[self.connection.number_in(path)] = cell
+        return cell
+
+    def _launch(self, frame: frames.Launch) -> None:
+        path = self.connection.name_in(frame.to)
+        limits = frame.options.get("limits") or {}
+        _apply(limits)
+        if limits.get("beat"):
+            self._beat(float(limits["beat"]))
+        node = self.node
+        cell = node.root = Cell(node, None, path, GuestHost(self))
+        cell.life = frame.life - 1
+        try:
+            cell.extra().start = unpack_recipe(frame.recipe)
+            up = self._launcher(self, cell, frame)
+        except (HoldfastError, ImportError) as error:
+            self._launched(frame.id, error.reason if isinstance(error, StartFailed) else str(error))
+            return
+        if up is None:
+            self._launched(frame.id, "")
+        else:
+            up.add_done_callback(lambda done: self._on_up(frame.id, done))
+
+    def _on_up(self, key: int, done: asyncio.Future[None]) -> None:
+        error = done.exception()
+        if isinstance(error, StartFailed):
+            self._launched(key, error.reason)
+        else:
+            self._launched(key, "" if error is None else str(error))
+
+    def _launched(self, key: int, problem: str) -> None:
+        self.connection.send(frames.Launched(key, problem))
+
+    def _command(self, cell: Cell, frame: frames.Command) -> None:
+        data = frame.data
+        match frame.verb:
+            case "stop":
+                cell.request_stop(unpack_exit(data["reason"]))
+            case "kill":
+                cell.kill()
+            case "exit":
+                cell.push(Exit(self.node.cell_at(data["source"]), unpack_exit(data["reason"])))
+            case "down":
+                self._down(cell, data)
+            case "bind":
+                cell.extra().bindings[data["port"]] = self.node.cell_at(data["target"])
+            case verb:
+                raise HoldfastError(f"unknown command {verb!r}")
+
+    def _down(self, cell: Cell, data: dict[str, Any]) -> None:
+        watches = self._monitors.get(data["source"], [])
+        for watch in [watch for watch in watches if watch.watcher is cell]:
+            watches.remove(watch)
+            cell.push(Down(watch, unpack_exit(data["reason"]), recovering=bool(data["recovering"])))
+            break
+
+    # -- the end ----------------------------------------------------------------------------------------------------
+
+    def report_end(self, cell: Cell, reason: ExitReason | None) -> None:
+        """The process's own actor has ended: tell why, and end with it."""
+        told = pack_exit(reason if reason is not None else lives.SHUTDOWN)
+        self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
+        self.connection.close()
+
+    def on_lost(self, error: Exception | None) -> None:
+        """The root is gone, or we have closed: nothing is left to live for."""
+        if isinstance(error, HoldfastError):
+            print(f"holdfast: {error}", file=sys.stderr)
+        if not self.ended.done():
+            self.ended.set_result(0 if error is None else 70)
+
+    def _beat(self, interval: float) -> None:
+        if self.connection.is_open:
+            self.connection.send(frames.Beat())
+            self.node.loop.call_later(interval, self._beat, interval)
+
+
+def _apply(limits: dict[str, Any]) -> None:
+    """Set the limits that a process sets for itself."""
+    import resource
+
+    if limits.get("address_space_bytes"):
+        most = int(limits["address_space_bytes"])
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    if limits.get("open_files"):
+        most = int(limits["open_files"])
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    if limits.get("niceness"):
+        os.nice(int(limits["niceness"]))
+
+

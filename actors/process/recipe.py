@@ -1,0 +1,98 @@
+"""Recipes as bytes: a `Start` with its class by name, so that another process can begin the same actor."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+from typing import Any
+
+from ..actor import Actor, Start
+from ..errors import SpecError, type_name
+from ..message import message_name
+from ..values import decode_value, encode_value
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Packed:
+    """A Start inside saved arguments."""
+
+    kind: str
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _PackedData:
+    """A dataclass that holds a Start somewhere, such as a child spec."""
+
+    kind: str
+    fields: dict[str, Any]
+
+
+def pack_recipe(start: Start[Any], where: str) -> bytes:
+    """The recipe as bytes.
+
+    Raises:
+        UnsavableValue: naming the argument that cannot be encoded.
+        SpecError: the class cannot be found by name.
+    """
+    kind = start.kind
+    if "<locals>" in kind.__qualname__:
+        raise SpecError(where, f"{type_name(kind)} is defined in a function, so another process cannot import it")
+    return encode_value(_lower(start), where=f"{where}: start({kind.__name__}, ...)")
+
+
+def unpack_recipe(data: bytes) -> Start[Any]:
+    """The recipe again. Imports the module that defines the class.
+
+    Raises:
+        SpecError: the class cannot be found, or is no actor.
+    """
+    start = _raise_up(decode_value(data))
+    if not isinstance(start, Start):
+        raise SpecError("recipe", "the data is no actor recipe")
+    return start
+
+
+def _lower(value: Any) -> Any:
+    """`value` with every Start replaced by plain data."""
+    if isinstance(value, Start):
+        return _Packed(message_name(value.kind), _lower(value.args), _lower(value.kwargs))
+    if type(value) in (list, tuple):
+        return type(value)(_lower(inner) for inner in value)
+    if type(value) is dict:
+        return {key: _lower(inner) for key, inner in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        if any(isinstance(inner, Start) for inner in fields.values()):
+            return _PackedData(message_name(type(value)), {name: _lower(inner) for name, inner in fields.items()})
+    return value
+
+
+def _raise_up(value: Any) -> Any:
+    if isinstance(value, _Packed):
+        return Start(_find(value.kind, Actor), _raise_up(value.args), _raise_up(value.kwargs))
+    if isinstance(value, _PackedData):
+        return _find(value.kind, object)(**_raise_up(value.fields))
+    if type(value) in (list, tuple):
+        return type(value)(_raise_up(inner) for inner in value)
+    if type(value) is dict:
+        return {key: _raise_up(inner) for key, inner in value.items()}
+    return value
+
+
+def _find(name: str, base: type) -> type[Any]:
+    """The class with this name, if it is of the expected kind."""
+    module_name, _, path = name.partition(":")
+    try:
+        found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)
+        for part in path.split("."):
+            found = getattr(found, part)
+    except (ImportError, AttributeError) as error:
+        raise SpecError("recipe", f"{name} cannot be imported: {error}") from error
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise SpecError("recipe", f"{name} is no {base.__name__}")
+    if base is object and not dataclasses.is_dataclass(found):
+        raise SpecError("recipe", f"{name} is no dataclass")
+    return found

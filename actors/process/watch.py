@@ -1,0 +1,87 @@
+"""The watch over one process: beats of its loop, memory and CPU through psutil."""
+
+from __future__ import annotations
+
+import asyncio
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import psutil
+
+from ..exits import OutOfMemory, Signal
+from .limits import Limits
+
+if TYPE_CHECKING:
+    from .workers import Worker
+
+
+class Watch:
+    """Ends a process that hangs or takes more than its limits allow."""
+
+    def __init__(self, worker: Worker, limits: Limits) -> None:
+        self.limits = limits
+        self._worker = worker
+        self._loop = worker.node.loop
+        self._last_beat = self._loop.time()
+        self._process = psutil.Process(worker.pid)
+        self._timers: list[asyncio.TimerHandle] = []
+        if limits.memory_bytes is not None or limits.cpu_share is not None:
+            self._cpu_before = self._cpu()
+            self._timers.append(self._loop.call_later(limits.watch_interval, self._look))
+        if limits.hung_after is not None:
+            self._timers.append(self._loop.call_later(limits.hung_after, self._listen))
+
+    def beat(self) -> None:
+        """The loop in the process turns."""
+        self._last_beat = self._loop.time()
+
+    def _listen(self) -> None:
+        hung_after = self.limits.hung_after
+        assert hung_after is not None
+        silent = self._loop.time() - self._last_beat
+        if silent >= hung_after:
+            self._worker.hung(silent)
+            return
+        self._timers.append(self._loop.call_later(hung_after - silent, self._listen))
+        del self._timers[:-2]
+
+    def _cpu(self) -> float:
+        times = self._process.cpu_times()
+        return float(times.user + times.system)
+
+    def _look(self) -> None:
+        limits = self.limits
+        try:
+            resident = self._process.memory_info().rss
+            cpu = self._cpu()
+        except psutil.Error:
+            return  # It has ended: its socket tells.
+        share = (cpu - self._cpu_before) / limits.watch_interval
+        self._cpu_before = cpu
+        if limits.memory_bytes is not None and resident > limits.memory_bytes:
+            self._worker.kill(OutOfMemory(f"{resident} bytes resident, the limit is {limits.memory_bytes}"))
+        elif limits.cpu_share is not None and share > limits.cpu_share:
+            self._worker.kill(Signal(signal.SIGXCPU))  # The system's own name for it.
+        else:
+            self._timers.append(self._loop.call_later(limits.watch_interval, self._look))
+            del self._timers[:-2]
+
+    def close(self) -> None:
+        """Stop watching."""
+        for timer in self._timers:
+            timer.cancel()
+
+
+def oom_kills() -> int:
+    """How often the kernel's out-of-memory killer struck in our cgroup; 0 where that cannot be read."""
+    try:
+        group = Path("/proc/self/cgroup").read_text().splitlines()[-1].rpartition(":")[2]
+        events = Path(f"/sys/fs/cgroup{group}/memory.events").read_text()
+    except (OSError, IndexError):
+        return 0
+    for line in events.splitlines():
+        name, _, count = line.partition(" ")
+        if name == "oom_kill":
+            return int(count)
+    return 0

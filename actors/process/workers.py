@@ -1,0 +1,360 @@
+"""Workers: the OS processes of one root, forked ahead of need, watched, and always reaped."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import signal
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..cell import Cell
+from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed
+from ..events import LogLine, ProcessDied, ProcessStarted
+from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpack_exit
+from ..mail import Ask
+from . import frames
+from .connection import Connection
+from .forkserver import Forked, ForkServer
+from .limits import Limits
+from .output import OutputReader
+from .relay import Peer
+from .watch import Watch, oom_kills
+
+if TYPE_CHECKING:
+    from ..node import Node
+
+REAPED_WITHIN = 2.0
+"""Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
+LAUNCH_SECONDS = 60.0
+
+
+class Worker(Peer):
+    """One OS process: its connection, the actor it was given, and how it ends."""
+
+    def __init__(self, workers: Workers, forked: Forked) -> None:
+        super().__init__(workers.node)
+        self.forked = forked
+        self.pid = forked.pid
+        self.page = memoryview(forked.page).cast("Q")
+        self.targets: dict[int, Cell] = {}
+        self.cell: Cell | None = None
+        self.on_record: Callable[[frames.Record], None] = _no_records
+        self._workers = workers
+        self._died: Callable[[Cell, ExitReason], None] | None = None
+        self._launches: dict[int, asyncio.Future[None]] = {}
+        self._told: ExitReason | None = None  # the reason the actor itself gave
+        self._killed_for: ExitReason | None = None
+        self._status: int | None = None
+        self._lost = False
+        self._buried = False
+        self._grave: asyncio.Future[None] = self.node.loop.create_future()
+        self._oom_before = oom_kills()
+        self._watch: Watch | None = None
+        self._outputs: list[OutputReader] = []
+
+    # -- its life ---------------------------------------------------------------------------------------------------
+
+    async def connect(self) -> None:
+        """Take over the socket and the output pipes."""
+        loop, forked = self.node.loop, self.forked
+        self.connection = Connection(self._on_frame, self._on_lost)
+        await self.connection.open(forked.sock)
+        for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
+            fd = getattr(forked, name)
+            setattr(forked, name, -1)
+            self._outputs.append(OutputReader(loop, fd, lambda text, stream=stream: self._on_line(stream, text)))
+
+    def adopt(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
+        """This process is now that of the actor at `cell`."""
+        self.cell, self._died = cell, died
+        self._workers.by_cell[cell] = self
+        if limits is not None:
+            self._watch = Watch(self, limits)
+        if self.node.watched:
+            self.node.emit(ProcessStarted(cell.path, self.pid))
+
+    async def launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
+        """Begin the life in it.
+
+        Raises:
+            StartFailed: the actor's `__init__` or `on_start` raised, or the process ended.
+        """
+        self._last_id = key = self._last_id + 1
+        up = self._launches[key] = self.node.loop.create_future()
+        if self._buried:
+            raise StartFailed(cell.path, "its process has ended")
+        connection = self.connection
+        limits = self._watch.limits if self._watch is not None else None
+        options = dict(options, limits=_limit_options(limits))
+        connection.send(frames.Launch(key, connection.name_out(cell.path), cell.life, recipe, options), cell.path)
+        try:
+            await up
+        finally:
+            self._launches.pop(key, None)
+
+    def kill(self, why: ExitReason) -> None:
+        """SIGKILL, by pidfd; its end is then called `why`."""
+        if self._killed_for is None:
+            self._killed_for = why
+        self.forked.kill(signal.SIGKILL)
+
+    def hung(self, seconds: float) -> None:
+        """The watch has seen no beat."""
+        self.kill(Hung(seconds))
+
+    def beat(self) -> None:
+        """Its loop turns."""
+        if self._watch is not None:
+            self._watch.beat()
+
+    def gone(self) -> asyncio.Future[None]:
+        """A future that ends when the process is dead, reaped and told of; it is killed now if it was not."""
+        self.kill(KILLED)
+        return self._grave
+
+    # -- what it says -----------------------------------------------------------------------------------------------
+
+    def _on_frame(self, frame: frames.AnyFrame) -> None:
+        self._workers.on_frame(self.node, self, frame)
+
+    def on_launched(self, frame: frames.Launched) -> None:
+        """A launch has come to its end."""
+        up = self._launches.get(frame.id)
+        if up is None or up.done():
+            return
+        if frame.problem:
+            up.set_exception(StartFailed(self.cell.path if self.cell is not None else "", frame.problem))
+        else:
+            up.set_result(None)
+
+    def on_ended(self, frame: frames.Ended) -> None:
+        """The actor's life has ended by itself; its process has nothing more to do."""
+        self._told = unpack_exit(frame.reason)
+        self.forked.kill(signal.SIGKILL)
+
+    def on_note(self, frame: frames.Note) -> None:
+        """An event of the process."""
+        self._workers.on_note(self, frame)
+
+    def _on_line(self, stream: str, text: str) -> None:
+        if self.node.watched:
+            path = self.cell.path if self.cell is not None else f"process {self.pid}"
+            self.node.emit(LogLine(path, stream, text))
+
+    # -- its end ----------------------------------------------------------------------------------------------------
+
+    def _on_lost(self, error: Exception | None) -> None:
+        self._lost = True
+        if isinstance(error, HoldfastError):
+            self.kill(Exited(70))  # It spoke nonsense: EX_SOFTWARE.
+        if self._status is not None:
+            self._bury()
+        else:
+            self.forked.kill(signal.SIGKILL)  # Whoever closes its socket has to end.
+            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+
+    def on_exit(self, status: int) -> None:
+        """The fork server has reaped it."""
+        self._status = status
+        if self._lost:
+            self._bury()
+        else:
+            # What it wrote before its end may still be in the socket: the end of the socket comes behind it.
+            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+
+    def _bury(self) -> None:
+        if self._buried:
+            return
+        self._buried = True
+        reason = self._reason()
+        self.connection.close()
+        for output in self._outputs:
+            output.close()
+        if self._watch is not None:
+            self._watch.close()
+        cell = self.cell
+        if cell is not None and self.node.watched:
+            self.node.emit(ProcessDied(cell.path, self.pid, reason))
+        for up in self._launches.values():
+            if not up.done():
+                up.set_exception(StartFailed(cell.path if cell is not None else "", str(reason)))
+        if cell is not None and self._died is not None:
+            self._died(cell, reason)
+            if self._workers.by_cell.get(cell) is self:
+                del self._workers.by_cell[cell]
+        self.fail_pending(AskFailed(cell.path if cell is not None else "", str(reason)))
+        self.page.release()
+        self.forked.close()
+        self._workers.buried(self)
+        if not self._grave.done():
+            self._grave.set_result(None)
+
+    def take_pending(self) -> list[Ask]:
+        """The asks that waited for this process, now the caller's."""
+        pending, self.pending = self.pending, {}
+        return list(pending.values())
+
+    def _reason(self) -> ExitReason:
+        """Why it ended: what it said itself, what we killed it for, or what the system reports."""
+        if self._told is not None:
+            return self._told
+        if self._killed_for is not None:
+            return self._killed_for
+        status = self._status
+        if status is None:
+            return Signal(signal.SIGKILL)  # Ended with its fork server.
+        if os.WIFSIGNALED(status):
+            number = os.WTERMSIG(status)
+            if number == signal.SIGKILL and oom_kills() > self._oom_before:
+                return OutOfMemory("killed by the kernel")
+            return Signal(number)
+        return Exited(os.waitstatus_to_exitcode(status))
+
+
+def _no_records(frame: frames.Record) -> None:
+    """Nobody recovers the actor of this process."""
+
+
+def _limit_options(limits: Limits | None) -> dict[str, Any]:
+    """What the process sets for itself."""
+    if limits is None:
+        return {}
+    return {
+        "address_space_bytes": limits.address_space_bytes,
+        "open_files": limits.open_files,
+        "niceness": limits.niceness,
+        "beat": None if limits.hung_after is None else limits.hung_after / 4,
+    }
+
+
+class Workers:
+    """The pool: one fork server, its children, and a warm one in reserve."""
+
+    def __init__(
+        self,
+        node: Node,
+        entry: str,
+        preload: Sequence[str],
+        on_frame: Callable[[Node, Worker, frames.AnyFrame], None],
+        *,
+        warm: int = 1,
+    ) -> None:
+        self.node = node
+        self.on_frame = on_frame
+        self.by_cell: dict[Cell, Worker] = {}
+        self._entry, self._preload, self._warm = entry, list(preload), warm
+        self._server: ForkServer | None = None
+        self._opening = asyncio.Lock()
+        self._alive: dict[int, Worker] = {}
+        self._ready: list[Worker] = []
+        self._refilling: asyncio.Task[None] | None = None
+        self._closed = False
+
+    def of(self, cell: Cell) -> Worker | None:
+        """The process of an actor, if it has one now."""
+        return self.by_cell.get(cell)
+
+    def want(self, module: str) -> None:
+        """Have the fork server import a module before the next fork."""
+        if module in self._preload or module == "__main__":
+            return
+        self._preload.append(module)
+        if self._server is not None:
+            self._server.preload(module)
+
+    async def take(self) -> Worker:
+        """A process that waits for an actor.
+
+        Raises:
+            ProcessUnavailable: none could be forked.
+        """
+        while self._ready:
+            worker = self._ready.pop()
+            if worker.connection.is_open:
+                self._refill()
+                return worker
+        worker = await self._fork()
+        self._refill()
+        return worker
+
+    async def _fork(self) -> Worker:
+        for attempt in (1, 2):
+            server = await self._open()
+            try:
+                forked = await server.fork()
+                break
+            except ProcessUnavailable:
+                if attempt == 2 or self._closed:
+                    raise
+                if self._server is server:  # It died under us: start another one, once.
+                    self._server = None
+        worker = Worker(self, forked)
+        self._alive[forked.pid] = worker
+        await worker.connect()
+        return worker
+
+    async def _open(self) -> ForkServer:
+        async with self._opening:
+            if self._closed:
+                raise ProcessUnavailable("the system is shutting down")
+            if self._server is None:
+                server = ForkServer(self._entry, self._preload, on_exit=self._on_exit, on_lost=self._on_lost)
+                await server.start()
+                self._server = server
+            return self._server
+
+    def _refill(self) -> None:
+        if self._refilling is None and len(self._ready) < self._warm and not self._closed:
+            self._refilling = self.node.loop.create_task(self._refill_now(), name="warm processes")
+
+    async def _refill_now(self) -> None:
+        try:
+            while len(self._ready) < self._warm and not self._closed:
+                self._ready.append(await self._fork())
+        except ProcessUnavailable:
+            return  # Whoever needs a process asks for it, and is told why there is none.
+        finally:
+            self._refilling = None
+
+    def _on_exit(self, pid: int, status: int) -> None:
+        worker = self._alive.get(pid)
+        if worker is not None:
+            worker.on_exit(status)
+
+    def _on_lost(self) -> None:
+        """The fork server died: its children die with it, each is seen by its socket; the next fork starts another."""
+        self._server = None
+
+    def buried(self, worker: Worker) -> None:
+        """A process is gone for good."""
+        if self._alive.get(worker.pid) is worker:
+            del self._alive[worker.pid]
+        with contextlib.suppress(ValueError):
+            self._ready.remove(worker)
+
+    def on_note(self, worker: Worker, frame: frames.Note) -> None:
+        """An event from a process: shown under its actor's address."""
+        from ..events import event_from
+
+        event = event_from(frame.kind, frame.data)
+        if event is not None and self.node.watched:
+            self.node.emit(event)
+
+    def processes(self) -> dict[str, int]:
+        """Address to pid."""
+        return {cell.path: worker.pid for cell, worker in self.by_cell.items()}
+
+    async def close(self) -> None:
+        """End every process and the fork server."""
+        self._closed = True
+        if self._refilling is not None:
+            self._refilling.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._refilling
+        graves = [worker.gone() for worker in list(self._alive.values())]
+        if graves:
+            await asyncio.wait(graves, timeout=REAPED_WITHIN * 2)
+        if self._server is not None:
+            await self._server.stop()

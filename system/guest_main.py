@@ -1,0 +1,23 @@
+"""The entry point of actor processes: gives a guest what only the composition root knows."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+
+from ..actors.cell import Cell
+from ..actors.process import frames, guest
+
+
+def main(sock: socket.socket, page_fd: int) -> int:
+    """Called by the fork server in each child."""
+    return guest.main(sock, page_fd, launch, prepare)
+
+
+def prepare(host: guest.Guest) -> None:
+    """Before the root's first frame."""
+
+
+def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:
+    """Begin the life that the root asks for."""
+    return cell.host.start(cell)
