@@ -18,6 +18,7 @@ from holdfast.actors.errors import (
     NameTaken,
     NoSuchActor,
     ProcessUnavailable,
+    Quarantined,
     RemoteCrash,
     ReplayDiverged,
     SendError,
@@ -27,7 +28,23 @@ from holdfast.actors.errors import (
     UnknownMessage,
     WrongActor,
 )
-from holdfast.actors.events import Event, EventStream
+from holdfast.actors.events import (
+    ActorCrashed,
+    ActorStarted,
+    ChildRestarted,
+    DeadLetter,
+    Event,
+    EventStream,
+    LogLine,
+    MessageQuarantined,
+    ProcessDied,
+    ProcessStarted,
+    Recovered,
+    RecoveryFailed,
+    SnapshotFailed,
+    SnapshotTaken,
+    SupervisorGaveUp,
+)
 from holdfast.actors.exits import (
     KILLED,
     NOPROC,
@@ -51,6 +68,7 @@ from holdfast.actors.message import Message, Refusal
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
+from holdfast.checkpoint.method import Method, fresh, hybrid
 from holdfast.supervision.backoff import Backoff
 from holdfast.supervision.spec import ChildSpec, child
 from holdfast.supervision.supervisor import Supervisor, supervisor
@@ -60,7 +78,9 @@ from holdfast.system.system import ActorSystem
 __all__ = [
     "Actor",
     "ActorContext",
+    "ActorCrashed",
     "ActorRef",
+    "ActorStarted",
     "ActorStopped",
     "ActorSystem",
     "AskDeadlock",
@@ -69,8 +89,10 @@ __all__ = [
     "Backoff",
     "BadMessage",
     "Binding",
+    "ChildRestarted",
     "ChildSpec",
     "Crash",
+    "DeadLetter",
     "Event",
     "EventStream",
     "ExitReason",
@@ -80,8 +102,11 @@ __all__ = [
     "KILLED",
     "Killed",
     "Limits",
+    "LogLine",
     "MailboxFull",
     "Message",
+    "MessageQuarantined",
+    "Method",
     "Monitor",
     "NOPROC",
     "NORMAL",
@@ -90,7 +115,12 @@ __all__ = [
     "NoSuchActor",
     "Normal",
     "OutOfMemory",
+    "ProcessDied",
+    "ProcessStarted",
     "ProcessUnavailable",
+    "Quarantined",
+    "Recovered",
+    "RecoveryFailed",
     "Refusal",
     "RemoteCrash",
     "ReplayDiverged",
@@ -99,10 +129,13 @@ __all__ = [
     "SendError",
     "Shutdown",
     "Signal",
+    "SnapshotFailed",
+    "SnapshotTaken",
     "SpecError",
     "Start",
     "StartFailed",
     "Supervisor",
+    "SupervisorGaveUp",
     "Timer",
     "TreeFailed",
     "Unbound",
@@ -110,6 +143,8 @@ __all__ = [
     "WrongActor",
     "bounded",
     "child",
+    "fresh",
+    "hybrid",
     "on",
     "run",
     "start",

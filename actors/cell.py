@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from . import mailbox
@@ -61,6 +61,18 @@ class Host(Protocol):
         """Put an item of the runtime's own in its place behind the messages."""
         ...
 
+    def recovers(self, reason: ExitReason) -> bool:
+        """Whether a life that ended for this reason is brought back with its state."""
+        ...
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        """Admit a message for a sender that waits until it is accepted. None: it is."""
+        ...
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """A link or monitor at this cell was made or removed: its actor's own process has to know."""
+        ...
+
 
 class More:
     """What only some cells have; made when first needed, so that an idle actor stays small."""
@@ -77,6 +89,7 @@ class More:
         "outlet",
         "reason",
         "start",
+        "starting",
         "stash",
         "tasks",
         "timers",
@@ -98,6 +111,7 @@ class More:
         self.outlet: Any = None  # the way into another process (process.remote.Outlet)
         self.reason: ExitReason = SHUTDOWN
         self.start: Start[Any] | None = None
+        self.starting: asyncio.Future[None] | None = None  # whoever waits for `on_start` of this life waits for it
         self.stash: deque[Any] | None = None
         self.tasks: set[asyncio.Task[Any]] = set()
         self.timers: set[Any] = set()

@@ -17,11 +17,12 @@ from .errors import (
     BadMessage,
     HoldfastError,
     RemoteCrash,
+    UnknownMessage,
     rebuild_error,
     remote_crash,
     type_name,
 )
-from .message import Message, Refusal, UnknownRefusal, find_refusal, message_name, reply_type
+from .message import Message, Refusal, UnknownRefusal, by_name, find_refusal, message_name, reply_type
 from .ref import ActorRef
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class Codec:
     def __init__(self, cell_at: Callable[[str], Cell]) -> None:
         self._cell_at = cell_at
         self.encoder = msgspec.msgpack.Encoder(enc_hook=encode_special)
+        self._kinds: dict[tuple[int, str], type[Message[Any]]] = {}
         self._decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
 
     def encode(self, value: object, actor: str) -> bytes:
@@ -85,6 +87,26 @@ class Codec:
                 kind, dec_hook=check_special, ext_hook=self._decode_special
             )
         return decoder.decode(body)
+
+    def message_in(self, cell: Cell, name: str, body: Any) -> Any:
+        """A message that came encoded, for a cell: decoded if its actor is here, else as it came.
+
+        Raises:
+            UnknownMessage: its class has no handler for this name. BadMessage: the payload does not fit the type.
+        """
+        if cell.host.takes_parcels and cell.actor is None:
+            return Parcel(name, bytes(body))
+        table = cell.table
+        kind = self._kinds.get((id(table), name))
+        if kind is None:
+            kind = by_name(table).get(name)
+            if kind is None:
+                raise UnknownMessage(cell.path, name.replace(":", "."))
+            self._kinds[id(table), name] = kind
+        try:
+            return self.decode(kind, body)
+        except msgspec.DecodeError as error:
+            raise BadMessage(cell.path, name.replace(":", "."), str(error)) from error
 
     def decode_reply(self, message: type[Message[Any]], body: Any) -> Any:
         """A reply, as the type that the message declares."""

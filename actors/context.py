@@ -92,11 +92,16 @@ class ActorContext:
         cell.admit(cell, Envelope(message, self.cell))
 
     async def send(self, cell: Cell, message: Message[Any]) -> None:
-        """Send and wait for room."""
+        """Send and wait until it is accepted."""
         self._alive()
         while (room := cell.room()) is not None:
             await room
-        self.tell(cell, message)
+            self._alive()
+        if type(message) not in cell.table:
+            cell.require(message)
+        accepted = cell.host.offer(cell, Envelope(message, self.cell))
+        if accepted is not None:
+            await accepted
 
     def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
         """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once."""
@@ -106,7 +111,7 @@ class ActorContext:
         node = self.cell.node
         future: asyncio.Future[R] = node.loop.create_future()
         chain = self.chain()
-        if waits_for(cell, chain):
+        if waits_for(self, cell, chain):
             future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
             return future
         ask = Ask(message, self.cell, chain, timeout, node.loop.time() + timeout, future)
@@ -126,8 +131,16 @@ class ActorContext:
         return ((self.path, self._turn), *getattr(self.item, "chain", ()))
 
     def turn_in(self, chain: Chain) -> bool:
-        """Whether the turn in hand is one of those in the chain."""
+        """Whether this actor's suspended turn is one of those in the chain."""
+        more = self.cell.more
+        if more is None or more.turn is None:  # Its last turn has ended: nobody waits here.
+            return False
         return self._asking is self.item and (self.path, self._turn) in chain
+
+    def in_turn(self) -> bool:
+        """Whether a turn of this actor runs, seen from its own code: from a background task it may be idle."""
+        more = self.cell.more
+        return (more is not None and more.turn is not None) or self.cell.node.is_stepping()
 
     def _alive(self) -> None:
         if self.closed:
@@ -135,6 +148,7 @@ class ActorContext:
 
     def forward(self, to: ActorRef[Any]) -> None:
         """Hand the message in hand on: the receiver sees the original sender, and its reply goes to the asker."""
+        self._alive()
         item = self.item
         if isinstance(item, Ask):
             cell: Cell = to._cell
@@ -143,8 +157,8 @@ class ActorContext:
             cell.admit(cell, item)
         elif isinstance(item, Envelope):
             to._cell.admit(to._cell, Envelope(item.message, item.sender))
-        else:
-            to._cell.admit(to._cell, item)
+        elif (message := getattr(item, "message", item)) is not None:  # A timer's or a pipe's is an item of this life.
+            to._cell.admit(to._cell, message)
 
     def reply_handle(self) -> ReplyHandle[Any]:
         """The right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
@@ -153,6 +167,11 @@ class ActorContext:
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Publish from this actor; waits for room at bounded subscribers."""
+        uplink = self.cell.node.uplink
+        if uplink is not None:  # The subscribers are known to the root only.
+            self._alive()
+            await uplink.publish(topic, message, self.cell)
+            return
         for cell in self.cell.node.topics.subscribers(topic):
             await self.send(cell, message)
 
@@ -163,10 +182,12 @@ class ActorContext:
 
     def tell_after(self, delay: float, message: Message[Any]) -> Timer:
         """The message comes to this actor itself after `delay` seconds; the timer ends with this life."""
+        self._alive()
         return Timer(self.cell, message, delay, None)
 
     def every(self, interval: float, message: Message[Any]) -> Timer:
         """The message comes every `interval` seconds; ticks that fall due while one waits are left out."""
+        self._alive()
         return Timer(self.cell, message, interval, interval)
 
     def pipe_to_self(
@@ -204,21 +225,21 @@ class ActorContext:
 
     def stash(self) -> None:
         """Put the message in hand aside; it comes again after `unstash`. Its turn ends without a reply."""
+        self._alive()
         item = self.item
+        if isinstance(item, Stashed):
+            raise StashError(f"{self.path}: this message was stashed or forwarded already")
         if isinstance(item, Item) and item.of_life:
             raise StashError(f"{self.path}: only a message can be stashed")
         more = self.cell.extra()
         if more.stash is None:
             more.stash = deque()
-        stash = more.stash
-        if stash and stash[-1] is item:
-            raise StashError(f"{self.path}: this message is stashed already")
-        stash.append(item)
-        if isinstance(item, Ask):
-            self.item = Stashed(item)
+        more.stash.append(item)
+        self.item = Stashed(item)
 
     def unstash(self) -> None:
         """Put all stashed messages back, in order, in front of what is queued."""
+        self._alive()
         more = self.cell.extra()
         stash = more.stash
         if not stash:
@@ -256,6 +277,7 @@ class ActorContext:
 
     def link(self, other: ActorRef[Any]) -> None:
         """Link two lives: an abnormal end of one ends the other."""
+        self._alive()
         links.link(self.cell, other._cell)
 
     def unlink(self, other: ActorRef[Any]) -> None:
@@ -264,14 +286,17 @@ class ActorContext:
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears of the end of the present life there."""
+        self._alive()
         return links.monitor(self.cell, other._cell, for_good=False)
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
         """`on_down` hears once, when the address is gone for good."""
+        self._alive()
         return links.monitor(self.cell, other._cell, for_good=True)
 
     def subscribe(self, topic: str) -> None:
         """Get what is published there from now on."""
+        self._alive()
         self.cell.node.topics.subscribe(topic, self.cell)
 
     def unsubscribe(self, topic: str) -> None:
@@ -286,6 +311,7 @@ class ActorContext:
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
         """End this life after the turn in hand."""
+        self._alive()
         self.cell.request_stop(reason)
 
     def close(self) -> None:
@@ -307,12 +333,12 @@ class ActorContext:
 
 
 class Stashed(Envelope):
-    """The rest of a turn whose ask was stashed: whatever the handler returns is no reply."""
+    """The rest of a turn whose message was stashed or forwarded: whatever the handler returns is no reply."""
 
     __slots__ = ()
 
-    def __init__(self, ask: Ask) -> None:
-        super().__init__(ask.message, cast("Any", ask.sender))
+    def __init__(self, item: Any) -> None:
+        super().__init__(getattr(item, "message", item), getattr(item, "sender", cast("Any", None)))
 
 
 class Piped(Item):
@@ -330,7 +356,9 @@ class Piped(Item):
         return actor._table[type(item.message)](actor, item.message)
 
 
-def waits_for(cell: Cell, chain: Chain) -> bool:
+def waits_for(asker: ActorContext, cell: Cell, chain: Chain) -> bool:
     """Whether the turn that runs at `cell` is in the chain: an ask to it would wait for itself."""
     ctx = cell.ctx
+    if ctx is asker:
+        return asker.in_turn()
     return ctx is not None and ctx.turn_in(chain)

@@ -26,7 +26,7 @@ class Deadlines:
         if queue is None:
             if not ask.timeout > 0:
                 raise SpecError("ask", f"timeout must be a number of seconds > 0, not {ask.timeout!r}")
-            queue = self._queues[ask.timeout] = _Queue(self._loop)
+            queue = self._queues[ask.timeout] = _Queue(self._loop, self._queues, ask.timeout)
         asks = queue.asks
         while asks and asks[0][0].future.done():
             asks.popleft()
@@ -47,10 +47,10 @@ class Deadlines:
 class _Queue:
     """The asks of one time-out value, oldest first."""
 
-    __slots__ = ("_loop", "asks", "limit", "timer")
+    __slots__ = ("_loop", "_queues", "_timeout", "asks", "limit", "timer")
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop = loop
+    def __init__(self, loop: asyncio.AbstractEventLoop, queues: dict[float, _Queue], timeout: float) -> None:
+        self._loop, self._queues, self._timeout = loop, queues, timeout
         self.asks: deque[tuple[Ask, Cell]] = deque()
         self.limit = 1024
         self.timer: asyncio.TimerHandle | None = None
@@ -64,7 +64,11 @@ class _Queue:
         """Wake at the deadline of the oldest ask that waits."""
         while self.asks and self.asks[0][0].future.done():
             self.asks.popleft()
-        self.timer = self._loop.call_at(self.asks[0][0].deadline, self._expire) if self.asks else None
+        if self.asks:
+            self.timer = self._loop.call_at(self.asks[0][0].deadline, self._expire)
+        else:  # Computed time-outs are nearly all different: a queue without asks goes.
+            self.timer = None
+            self._queues.pop(self._timeout, None)
 
     def _expire(self) -> None:
         now = self._loop.time()

@@ -10,6 +10,7 @@ HoldfastError
 ├── AskTimeout           no reply before the deadline (`handled` says whether the turn may have run)
 ├── AskFailed            the receiver ended in the middle of the turn
 ├── RemoteCrash          the receiver's handler raised
+├── Quarantined          the message ended its actor's process again and again
 ├── ReplayDiverged       a replayed turn released something else than before
 ├── StartFailed          an actor could not be started
 ├── NameTaken            a living actor has this name already
@@ -155,6 +156,17 @@ class ReplayDiverged(HoldfastError):
             f"replay of {self.actor} diverged at turn {self.turn}, output {self.output}: the handler is not "
             "deterministic; use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
         )
+
+
+class Quarantined(HoldfastError):
+    """The message ended its actor's process again and again; it was put aside."""
+
+    def __init__(self, actor: str, deliveries: int) -> None:
+        super().__init__(actor, deliveries)
+        self.actor, self.deliveries = actor, deliveries
+
+    def __str__(self) -> str:
+        return f"{self.actor}'s process died {self.deliveries} times in a row while it handled this message"
 
 
 class StartFailed(HoldfastError):

@@ -93,7 +93,7 @@ class RecoveryFailed(Event, frozen=True, eq=False):
     reason: str
 
 
-class Quarantined(Event, frozen=True, eq=False):
+class MessageQuarantined(Event, frozen=True, eq=False):
     """A message that ended the process `deliveries` times in a row was put aside."""
 
     message: str

@@ -18,18 +18,20 @@ if TYPE_CHECKING:
 class Monitor:
     """One watch of `target` by `watcher`."""
 
-    __slots__ = ("active", "for_good", "target", "watcher")
+    __slots__ = ("active", "for_good", "life", "target", "watcher")
 
     def __init__(self, watcher: Cell, target: Cell, for_good: bool) -> None:
         self.watcher, self.target, self.for_good = watcher, target, for_good
         self.active = True
+        self.life = watcher.life  # a watch ends with the life that set it
 
     def cancel(self) -> None:
         """No DOWN arrives after this, not even one that is queued already."""
         self.active = False
-        more = self.target.more
-        if more is not None and self in more.monitors:
-            more.monitors.remove(self)
+        target = self.target
+        if target.more is not None and self in target.more.monitors:
+            target.more.monitors.remove(self)
+            target.host.told(target, "demonitor", {"watcher": self.watcher.path, "for_good": self.for_good})
 
 
 def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
@@ -39,7 +41,16 @@ def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
         watcher.push(Down(watch, NOPROC, recovering=False))
     else:
         target.extra().monitors.append(watch)
+        target.host.told(target, "monitor", {"watcher": watcher.path, "for_good": for_good})
     return watch
+
+
+def demonitor(watcher: Cell, target: Cell, *, for_good: bool) -> None:
+    """Cancel one such watch, whichever: they are alike."""
+    for watch in target.more.monitors if target.more is not None else ():
+        if watch.watcher is watcher and watch.for_good is for_good:
+            watch.cancel()
+            return
 
 
 def link(one: Cell, other: Cell) -> None:
@@ -51,13 +62,26 @@ def link(one: Cell, other: Cell) -> None:
         return
     one.extra().links[other] = None
     other.extra().links[one] = None
+    other.host.told(other, "link", {"peer": one.path})
 
 
 def unlink(one: Cell, other: Cell) -> None:
-    """Remove the link; no EXIT from it arrives afterwards."""
+    """Remove the link; no EXIT from it arrives afterwards, not even one that is queued already."""
+    if sever(one, other):
+        other.host.told(other, "unlink", {"peer": one.path})
+    for item in one.queue or ():
+        if type(item) is Exit and item.source is other:
+            item.active = False
+
+
+def sever(one: Cell, other: Cell) -> bool:
+    """Forget the link on both sides. Returns whether there was one."""
+    found = False
     for cell, peer in ((one, other), (other, one)):
-        if cell.more is not None:
-            cell.more.links.pop(peer, None)
+        if cell.more is not None and peer in cell.more.links:
+            del cell.more.links[peer]
+            found = True
+    return found
 
 
 def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
@@ -93,17 +117,32 @@ def gone(cell: Cell, reason: ExitReason) -> None:
         watch.watcher.push(Down(watch, reason, recovering=False))
 
 
+def down_arrived(watcher: Cell, target: Cell, reason: ExitReason, *, recovering: bool, for_good: bool) -> None:
+    """A DOWN came from another process: it belongs to the oldest such watch that is still wanted."""
+    monitors: list[Monitor] = target.more.monitors if target.more is not None else []
+    for watch in monitors:
+        if watch.watcher is watcher and watch.for_good is for_good:
+            monitors.remove(watch)
+            if recovering:
+                monitors.append(watch)  # Behind those like it: each gets its own DOWN.
+            watcher.push(Down(watch, reason, recovering))
+            return
+
+
 class Exit(Item):
     """An EXIT signal over a link, in its place after earlier messages."""
 
-    __slots__ = ("reason", "source")
+    __slots__ = ("active", "reason", "source")
 
     def __init__(self, source: Cell, reason: ExitReason) -> None:
         self.source, self.reason = source, reason
+        self.active = True
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         cell: Cell = actor.ctx.cell
+        if not item.active:
+            return None
         if cell.more is not None and cell.more.trap_exits:
             return actor.on_exit(item.source.ref, item.reason)
         if item.reason != NORMAL:
@@ -121,6 +160,6 @@ class Down(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        if not item.watch.active:
+        if not item.watch.active or item.watch.life != actor.ctx.life:
             return None
         return actor.on_down(item.watch.target.ref, item.reason, item.recovering)

@@ -15,14 +15,16 @@ from . import exits, links, mailbox
 from .actor import Actor
 from .cell import DOWN, ENDING, GONE, RUNNING, Cell
 from .context import ActorContext
-from .errors import StartFailed, remote_crash
+from .errors import AskFailed, StartFailed, remote_crash
 from .events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
 from .exits import KILLED, SHUTDOWN, ExitReason
-from .mail import LEAVE, Item
+from .mail import LEAVE, Ask, Item
+from .message import Refusal
 from .ref import current
 
 if TYPE_CHECKING:
     from .actor import Start
+    from .loop import Suspended
 
 GRACE = 1.0
 """Seconds a killed turn may take to end after its cancellation, before its life is abandoned."""
@@ -33,6 +35,9 @@ class LocalHost:
 
     takes_parcels = False
 
+    def recovers(self, reason: ExitReason) -> bool:
+        return False
+
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
         assert start is not None
@@ -42,7 +47,13 @@ class LocalHost:
         if cell.state is not RUNNING:
             return
         if cell.scheduled or cell.children or type(cell.actor).on_stop is not Actor.on_stop:
-            cell.urge(Stop(reason))
+            queue = cell.queue
+            if queue and type(queue[0]) is FirstTurn:  # `on_start` comes first, or `on_stop` would find nothing done.
+                first = queue.popleft()
+                cell.urge(Stop(reason))
+                queue.appendleft(first)
+            else:
+                cell.urge(Stop(reason))
         else:
             ended(cell, reason)  # Idle, and nothing of the user's has to run: it is over at once.
 
@@ -50,7 +61,7 @@ class LocalHost:
         turn = cell.more.turn if cell.more is not None else None
         if turn is not None:
             turn.kill()
-            cell.node.loop.call_later(GRACE, abandon, cell, cell.life)
+            cell.node.loop.call_later(GRACE, abandon, turn)
         elif cell.state is RUNNING:
             cell.urge(Kill())
 
@@ -60,6 +71,12 @@ class LocalHost:
     def push(self, cell: Cell, item: Item) -> None:
         mailbox.queue_of(cell).append(item)
         cell.schedule()
+
+    def offer(self, cell: Cell, item: Any) -> None:
+        cell.admit(cell, item)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        pass
 
 
 LOCAL = LocalHost()
@@ -88,6 +105,8 @@ def begin(
         up(cell)
         return None
     started: asyncio.Future[None] = node.loop.create_future()
+    if cell.more is not None:  # Supervised: somebody waits, also if the life ends before its first turn has.
+        cell.more.starting = started
     mailbox.queue_of(cell).appendleft(FirstTurn(restored, started))
     up(cell)
     return started
@@ -106,6 +125,9 @@ def build(cell: Cell, start: Start[Any], context_type: type[ActorContext]) -> No
         if isinstance(error, KeyboardInterrupt):
             raise
         ctx.close()
+        _kill_orphans(cell)
+        if cell.more is not None:
+            _undo(cell)
         cell.actor = cell.ctx = None
         reason = exits.crash(error)
         if cell.more is not None:
@@ -138,9 +160,12 @@ class FirstTurn(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        result = actor.on_start(item.restored)
+        try:
+            result = actor.on_start(item.restored)
+        except Refusal as no:  # Nobody asked: an actor that refuses to start has failed to.
+            raise StartFailed(actor.ctx.path, str(no)) from no
         if asyncio.iscoroutine(result):
-            return _first(result, item.started)
+            return _first(actor, result, item.started)
         item.done()
         return None
 
@@ -151,10 +176,14 @@ class FirstTurn(Item):
     def undelivered(self, cell: Cell, reason: str) -> None:
         if not self.started.done():
             self.started.set_exception(StartFailed(cell.path, reason))
+            self.started.exception()  # Seen: if nobody waits for it, asyncio need not complain.
 
 
-async def _first(hook: Any, started: asyncio.Future[None]) -> None:
-    await hook
+async def _first(actor: Actor, hook: Any, started: asyncio.Future[None]) -> None:
+    try:
+        await hook
+    except Refusal as no:
+        raise StartFailed(actor.ctx.path, str(no)) from no
     if not started.done():
         started.set_result(None)
 
@@ -206,6 +235,12 @@ def killed(cell: Cell) -> None:
         ended(cell, KILLED)
 
 
+def cut_off(cell: Cell, item: Any) -> None:
+    """The turn of `item` was killed: its asker hears of it now, not at the deadline."""
+    if isinstance(item, Ask):  # An input of a recorded actor will be handled again instead.
+        item.fail(AskFailed(cell.path, str(KILLED)))
+
+
 def finish(cell: Cell, reason: ExitReason) -> None:
     """End a life in good order: children, `on_stop`, then `ended`. Called in the actor's own context."""
     actor = cell.actor
@@ -236,8 +271,6 @@ async def _farewell(cell: Cell, reason: ExitReason) -> None:
         result = actor.on_stop(reason)
         if asyncio.iscoroutine(result):
             await result
-    except asyncio.CancelledError:
-        raise
     except BaseException as error:  # A failing hook must not keep the end from being told.
         cell.node.emit(HookFailed(cell.path, "on_stop", exits.crash(error)))
 
@@ -250,19 +283,25 @@ async def _kill_children(cell: Cell) -> None:
         retire(child, "its parent was killed")
 
 
-def abandon(cell: Cell, life: int) -> None:
+def abandon(turn: Suspended) -> None:
     """A killed turn that swallows its cancellation: its life is over all the same, and its sends are refused."""
+    cell = turn.cell
     more = cell.more
-    if cell.life != life or more is None or more.turn is None:
+    if more is None or more.turn is not turn:
         return
-    turn, more.turn = more.turn, None
+    more.turn = None
+    cut_off(cell, turn.item)
     cell.node.turns_held -= 1
-    cell.node.emit(LifeAbandoned(cell.path, life))
-    assert turn.killed
-    for child in list((cell.children or {}).values()):
-        child.kill()
-        retire(child, "its parent was abandoned")
+    cell.node.emit(LifeAbandoned(cell.path, cell.life))
+    _kill_orphans(cell)
     ended(cell, KILLED)
+
+
+def _kill_orphans(cell: Cell) -> None:
+    """Kill the children of a life that cannot wait for their end; their names are free at once."""
+    children, cell.children = cell.children, None
+    for child in reversed(list((children or {}).values())):
+        child.kill()
 
 
 def ended(cell: Cell, reason: ExitReason) -> None:
@@ -279,10 +318,13 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     more = cell.more
     if more is not None:
         more.reason = reason
+        starting, more.starting = more.starting, None
+        if starting is not None and not starting.done():
+            starting.set_exception(StartFailed(cell.path, str(reason)))
         _undo(cell)
     if cell.spec is not None and cell.parent is not None:
         if more is not None:
-            links.announce(cell, reason, recovering=False)
+            links.announce(cell, reason, recovering=cell.host.recovers(reason))
             _tell_enders(more, reason)
         cell.parent.push(ChildExit(cell, cell.life, reason))
     else:
@@ -347,6 +389,7 @@ def retire(cell: Cell, why: object) -> None:
             for ask in waiting:
                 ask.undelivered(cell, str(why))
             more.bound.release()
+        links.announce(cell, more.reason, recovering=False)  # Links of a recorded actor wait for this.
         links.gone(cell, more.reason)
     while queue:
         item = deque.popleft(queue)

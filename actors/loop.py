@@ -114,6 +114,8 @@ class RunLoop:
     def enter(self) -> None:
         """Step coroutines in a runner's name from here to the end of the slice."""
         runner = self._idle.pop() if self._idle else Runner(self)
+        while runner.task.cancelling():  # Cancelled while it was idle: that cancel is for none of our turns.
+            runner = self._idle.pop() if self._idle else Runner(self)
         self.entered = runner
         _enter_task(self.loop, runner.task)
 
@@ -128,6 +130,11 @@ class RunLoop:
         else:
             self._idle.append(runner)
         return runner
+
+    def is_stepping(self) -> bool:
+        """Whether the code that asks runs in a step of the run loop, not in a task of its own."""
+        task = asyncio.current_task(self.loop)
+        return task is None or (self.entered is not None and task is self.entered.task)
 
     def step(self, cell: Cell, item: Any, turn: Any) -> bool:
         """Run a coroutine's first step inside the cell's context. False: it is suspended, its runner has it now.
@@ -156,16 +163,17 @@ class RunLoop:
 
     def turn_over(self, turn: Suspended, error: BaseException | None) -> None:
         """A suspended turn has ended; its actor goes on."""
-        self.turns_held -= 1
         cell = turn.cell
         more = cell.extra()
         if more.turn is not turn:
-            return  # The life was abandoned meanwhile.
+            return  # The life was abandoned meanwhile, and this turn is not counted any more.
+        self.turns_held -= 1
         more.turn = None
-        if turn.then is not None:
+        if turn.then is not None and not (turn.killed and cell.children):
             turn.then()
         elif turn.killed or error is not None:
             # What follows is again user code, maybe: it runs on the run queue, not in this runner's name.
+            turn.item = turn.item if cell.ctx is None else cell.ctx.item  # It may have been forwarded or stashed.
             mailbox.queue_of(cell).appendleft(TurnEnded(turn, error))
             self.make_ready(cell)
         elif cell.queue:
@@ -236,7 +244,7 @@ def run_turns(cell: Cell, most: int) -> bool:
     except BaseException as error:  # Whatever user code raises ends this life, and only this life.
         if isinstance(error, KeyboardInterrupt):
             raise
-        lives.crash(cell, item, error)
+        lives.crash(cell, ctx.item, error)  # Not `item`: that may have been forwarded or stashed.
         return False
     return True
 
@@ -254,6 +262,7 @@ class TurnEnded(Item):
         turn: Suspended = item.turn
         cell = turn.cell
         if turn.killed:
+            lives.cut_off(cell, turn.item)
             lives.killed(cell)
         elif isinstance(item.error, Refusal):
             cell.node.refused(cell, turn.item, item.error)
@@ -348,9 +357,11 @@ def _drive(
         try:
             if cancelled is not None:
                 error, cancelled = cancelled, None
-                if waiting is not None:
-                    waiting._asyncio_future_blocking = False  # We do not wait for it after all.
-                raise error
+                if waiting is None:
+                    raise error
+                if not waiting.cancel():  # As `Task.cancel` does: what is waited for is cancelled first.
+                    waiting._asyncio_future_blocking = False  # It is done, and we do not wait for it after all.
+                    raise error
             value = yield waiting
         except GeneratorExit:
             turn.close()

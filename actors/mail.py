@@ -12,7 +12,7 @@ from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 from .errors import AskTimeout, HoldfastError, UnknownMessage, type_name
-from .message import Message, Refusal
+from .message import Message, Refusal, by_name
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -59,12 +59,22 @@ class Table(dict[type, Handler]):
         if issubclass(kind, Item):
             self[kind] = kind.run
         else:
-            self[kind] = next((self[base] for base in kind.__mro__[1:] if base in self), unhandled)
+            found = next((self[base] for base in kind.__mro__[1:] if base in self), None)
+            if found is None:
+                return unhandled  # Not remembered: what is in the table is admitted without another look.
+            self[kind] = found
         return self[kind]
 
     def knows(self, kind: type) -> bool:
         """Whether messages of this type have a handler."""
         return self[kind] is not unhandled
+
+    def kind_named(self, name: str) -> type[Message[Any]]:
+        """The handled message type with this wire name. Raises UnknownMessage."""
+        kind = by_name(self).get(name)
+        if kind is None:
+            raise UnknownMessage("the actor", name.replace(":", "."))
+        return kind
 
 
 class AnyTable(Table):

@@ -7,6 +7,7 @@ tested per message.
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from collections import deque
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -176,7 +177,20 @@ class Bound:
 
 def counts(item: Any) -> bool:
     """Whether an item takes one of a bounded mailbox's places: messages do, the runtime's own do not."""
-    return not isinstance(item, Item) or hasattr(item, "message")
+    return not isinstance(item, Item) or not item.of_life
+
+
+class _Nothing(Item):
+    """A turn in which nothing is done."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        return None
+
+
+NOTHING = _Nothing()
 
 
 class BoundedQueue(deque[Any]):
@@ -187,6 +201,8 @@ class BoundedQueue(deque[Any]):
         self._cell = cell
 
     def popleft(self) -> Any:
+        if not self:
+            return NOTHING  # A turn of this slice has made an overflow drop what the run loop had counted.
         item = super().popleft()
         if counts(item):
             bound = self._cell.extra().bound
@@ -195,13 +211,12 @@ class BoundedQueue(deque[Any]):
         return item
 
 
+@dataclasses.dataclass(frozen=True, slots=True, repr=False)
 class Bounded:
     """The choice of a bounded mailbox, for a child spec; made by `bounded`."""
 
-    __slots__ = ("capacity", "overflow")
-
-    def __init__(self, capacity: int, overflow: Overflow) -> None:
-        self.capacity, self.overflow = capacity, overflow
+    capacity: int
+    overflow: Overflow
 
     def __repr__(self) -> str:
         return f"bounded({self.capacity}, overflow={self.overflow!r})"

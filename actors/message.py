@@ -33,6 +33,7 @@ class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
     """
 
 
+@functools.cache
 def message_name(kind: type) -> str:
     """The name a message type has on the wire and in journals: `module:Class`."""
     module = kind.__module__

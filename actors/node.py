@@ -50,7 +50,8 @@ class Node(RunLoop):
         self.outside: Callable[[str], Cell | None] | None = None  # finds cells of other processes
         self.root: Cell | None = None
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
-        self.host_for: Callable[[Any], Host] = lambda spec: LOCAL  # chooses where a child spec's lives are lived
+        self.here: Host = LOCAL  # lives in this very process
+        self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
         self._seeds = random.Random(seed)
         self._numbers = itertools.count(1)
         self._turns = itertools.count(1)
@@ -87,7 +88,7 @@ class Node(RunLoop):
 
     # -- the tree ---------------------------------------------------------------------------------------------------
 
-    def cell_below(self, parent: Cell | None, name: str | None, host: Host = LOCAL) -> Cell:
+    def cell_below(self, parent: Cell | None, name: str | None, host: Host | None = None) -> Cell:
         """A new cell in the tree.
 
         Raises:
@@ -97,7 +98,7 @@ class Node(RunLoop):
             name = f"${next(self._numbers)}"
         elif parent is not None and (not name or "/" in name):
             raise SpecError("name", f"an actor's name must be text without '/', not {name!r}")
-        cell = Cell(self, parent, name, host)
+        cell = Cell(self, parent, name, self.here if host is None else host)
         if parent is not None:
             if parent.children is None:
                 parent.children = {}
@@ -186,7 +187,9 @@ class Node(RunLoop):
             NameTaken: another living actor has it.
         """
         holder = self.names.get(name)
-        if holder is not None and holder is not cell:
+        if holder is cell:
+            return
+        if holder is not None:
             raise NameTaken(name)
         if cell.state is not RUNNING:
             raise ActorStopped(cell.path)

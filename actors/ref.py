@@ -69,7 +69,9 @@ class ActorRef(Generic[A_co]):
             return
         while (room := cell.room()) is not None:
             await room
-        cell.admit(cell, message)
+        accepted = cell.host.offer(cell, message)
+        if accepted is not None:
+            await accepted
 
     def ask(self, message: Message[R], timeout: float = DEFAULT_TIMEOUT) -> asyncio.Future[R]:
         """Send now, and return an awaitable with exactly one outcome.

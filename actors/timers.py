@@ -75,6 +75,11 @@ class Tick(Item):
     def __init__(self, timer: Timer) -> None:
         self.timer = timer
 
+    @property
+    def message(self) -> Message[Any]:
+        """What the timer sends."""
+        return self.timer.message
+
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         timer: Timer = item.timer

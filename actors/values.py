@@ -1,26 +1,26 @@
 """Values without a schema as bytes, for snapshots: each returns with its type, or is refused by name.
 
-`_Encoder` first looks through the value a level at a time, at C speed. If nothing in it is reached twice, msgpack's C
-packer takes it as it is and calls back for what is not JSON-like. If something is shared, or cannot be saved, `_Walk`
-goes through it in Python: it knows the path, and what it has met before.
+A value is first lowered to a tree of what msgpack has types for: lists, dicts with scalars for keys, scalars. What is
+so already is left as it is. Anything else becomes a list that starts with a mark, which is an empty extension value;
+the mark's code is that of the type, and the rest of the list are the value's parts.
 
-The bytes: version, flag; with flag 0 one msgpack value; with flag 1 the length of the msgpack tree (8 bytes, big
-endian), the tree, and the raw buffers to which it points. A list in the tree that starts with a mark, which is an empty
-extension value, stands for a value of the type with the mark's code, and the rest of the list are its parts.
+The bytes: version, flag; with flag 0 a msgpack tree without marks; with flag 1 the length of the tree (8 bytes, big
+endian), the tree, and the raw buffers that its marks mention, in that order.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import enum
-import gc
 import hashlib
+import math
+import re
 import reprlib
 import struct
 import sys
 import types
 from collections import Counter, OrderedDict, defaultdict, deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from datetime import date, datetime, time, timedelta, timezone
 from decimal import Decimal
 from fractions import Fraction
@@ -40,8 +40,9 @@ from .errors import HoldfastError
 
 __all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest"]
 
-FORMAT: Final = 1
+_FORMAT: Final = 1
 _HEAD: Final = struct.Struct(">BBQ")  # format, flag, length of the tree
+_HEAD_ALONE: Final = bytes((_FORMAT, 0))
 
 
 class UnsavableValue(HoldfastError):
@@ -129,13 +130,13 @@ def decode_value(data: bytes | memoryview) -> object:
     view = memoryview(data).cast("B")
     if len(view) < 2:
         raise DamagedValue("it is cut short")
-    if view[0] != FORMAT:
-        raise DamagedValue(f"it has format {view[0]}, and only format {FORMAT} is known")
+    if view[0] != _FORMAT or view[1] > 1:
+        raise DamagedValue(f"it has format {view[0]}.{view[1]}, and only format {_FORMAT} is known")
     try:
         if view[1] == 0:
             return _unpack(view[2:], ext_hook=_make_int)
-        length = _HEAD.unpack_from(view)[2]
-        return _Decoder(view[_HEAD.size + length :]).value(view[_HEAD.size : _HEAD.size + length])
+        tree_bytes = _HEAD.unpack_from(view)[2]
+        return _Decoder(view[_HEAD.size + tree_bytes :]).value(view[_HEAD.size : _HEAD.size + tree_bytes])
     except (DamagedValue, MemoryError):  # Out of memory is no damage: the bytes may be good.
         raise
     except Exception as error:
@@ -146,7 +147,7 @@ class _Blob:
     """A buffer that goes behind the tree: it is copied once, when the pieces are joined."""
 
     def __init__(self, buffer: Any) -> None:
-        self.view = memoryview(buffer)
+        self.buffer = buffer  # no memoryview: as long as one lives, a bytearray cannot grow
 
 
 class _Mark(int):
@@ -157,7 +158,7 @@ def _flat(mapping: dict[Any, Any]) -> Iterable[Any]:
     return chain.from_iterable(mapping.items())
 
 
-def _pairs(parts: tuple[Any, ...]) -> dict[Any, Any]:
+def _pairs(parts: Sequence[Any]) -> dict[Any, Any]:
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
@@ -165,14 +166,6 @@ def _make_counter(*parts: Any) -> Counter[Any]:
     counter = Counter[Any]()
     dict.update(counter, _pairs(parts))  # Counter's own update would add.
     return counter
-
-
-def _moment_parts(moment: Any) -> tuple[Any, ...]:
-    return moment.replace(tzinfo=None).isoformat(), moment.fold, moment.tzinfo
-
-
-def _make_moment(kind: Any, text: str, fold: int, zone: Any) -> object:
-    return kind.fromisoformat(text).replace(fold=fold, tzinfo=zone)
 
 
 def _zone_parts(zone: ZoneInfo) -> tuple[str]:
@@ -204,9 +197,11 @@ _TYPES: Final[tuple[tuple[int, type, Callable[[Any], Iterable[Any]], Callable[..
     (11, Decimal, lambda x: (str(x),), Decimal),
     (12, Fraction, lambda x: (x.numerator, x.denominator), Fraction),
     (13, UUID, lambda x: (x.bytes, x.is_safe.value), lambda raw, safe: UUID(bytes=raw, is_safe=SafeUUID(safe))),
-    (14, date, lambda x: (x.isoformat(),), date.fromisoformat),
-    (15, time, _moment_parts, partial(_make_moment, time)),
-    (16, datetime, _moment_parts, partial(_make_moment, datetime)),
+    (14, date, lambda x: (x.year, x.month, x.day), date),
+    (15, time, lambda x: (x.fold, x.hour, x.minute, x.second, x.microsecond, x.tzinfo),
+     lambda fold, *parts: time(*parts, fold=fold)),
+    (16, datetime, lambda x: (x.fold, x.year, x.month, x.day, x.hour, x.minute, x.second, x.microsecond, x.tzinfo),
+     lambda fold, *parts: datetime(*parts, fold=fold)),
     (17, timedelta, lambda x: (x.days, x.seconds, x.microseconds), timedelta),
     (18, timezone, lambda x: x.__getinitargs__(), timezone),
     (19, ZoneInfo, _zone_parts, ZoneInfo),
@@ -214,167 +209,16 @@ _TYPES: Final[tuple[tuple[int, type, Callable[[Any], Iterable[Any]], Callable[..
     (21, PurePosixPath, lambda x: (str(x),), PurePosixPath),
     (22, PureWindowsPath, lambda x: (str(x),), PureWindowsPath),
     (23, Random, Random.getstate, _make_random),
-)
+)  # fmt: skip
 _KNOWN: Final = {kind: (ExtType(code, b""), parts) for code, kind, parts, _ in _TYPES}
-_SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes, _Blob})
-_NATIVE: Final = frozenset({list, dict, tuple, set, frozenset})  # the garbage collector knows what they refer to
-_CHANGING: Final = frozenset({list, dict, set, OrderedDict, Counter, deque, bytearray, Random})
-# The marks of what has readers of its own, below.
-_SHARED, _AGAIN, _BUFFER, _DEFAULTDICT, _ENUM, _DATACLASS, _STRUCT, _NAMEDTUPLE = (
-    ExtType(n, b"") for n in range(32, 40)
-)
+_TUPLE: Final = _KNOWN[tuple][0]
+# The marks of what is not in the table.
+_SHARED, _AGAIN, _BUFFER, _DEFAULTDICT, _ENUM, _DATACLASS, _STRUCT, _NAMED = (ExtType(n, b"") for n in range(32, 40))
 _ARRAY, _TEXT, _BITS, _SEED, _GENERATOR, _RANDOM_STATE = (ExtType(n, b"") for n in range(48, 54))
 
-
-def _pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
-    encoder = _Encoder(canonical=canonical)
-    try:
-        if not encoder.is_tree(value):
-            walk = _Walk(encoder, shared=set())
-            tree = walk.lowered(value)
-            value = tree if canonical or not walk.again else _Walk(encoder, shared=walk.again).lowered(value)
-        packed = encoder.packed(value, None)
-    except UnsavableValue as refusal:
-        path = refusal.where if len(refusal.where) < 200 else f"{refusal.where[:90]} ... {refusal.where[-90:]}"
-        raise UnsavableValue(where + path, refusal.problem) from None
-    except (RecursionError, ValueError) as error:
-        raise UnsavableValue(where, f"a value that is nested too deep or too large ({error})") from None
-    if not encoder.is_marked:
-        return [bytes((FORMAT, 0)), packed]
-    return [_HEAD.pack(FORMAT, 1, len(packed)), packed, *encoder.blobs]
-
-
-class _Encoder:
-    """One value on its way to bytes. `canonical`: the order of sets, and what is shared, leave no trace."""
-
-    def __init__(self, *, canonical: bool) -> None:
-        self.canonical = canonical
-        self.is_marked = False
-        self.forms: dict[int, list[Any]] = {}  # made by `is_tree` for the packer, by id
-        self.classes: dict[type, tuple[ExtType, str, dict[str, Any]]] = {}
-        self.blobs: list[memoryview] = []
-        self.blob_bytes = 0
-
-    def is_tree(self, value: object) -> bool:
-        """Whether all of it can be saved, and nothing that can change is reached twice."""
-        level, ids, n_ids = [value], set[int](), 0
-        while kinds := set(map(type, level)) - _SCALARS:
-            changing = {kind for kind in kinds if _can_change(kind)}
-            found = [id(x) for x in level if type(x) in changing]
-            ids.update(found)
-            n_ids += len(found)
-            if len(ids) != n_ids:
-                return False
-            # Twice as fast as iterating: CPython does not report the keys of a dict if they all are of type str.
-            below = gc.get_referents(*[x for x in level if type(x) in _NATIVE])
-            if not kinds <= _NATIVE:
-                try:
-                    for x in level:
-                        if type(x) in kinds and type(x) not in _NATIVE:
-                            form = self.forms[id(x)] = self.form(x)
-                            below += form[1:]
-                except UnsavableValue:  # `walked` meets it again, and knows where
-                    return False
-            level = below
-        return True
-
-    def packed(self, tree: object, unicode_errors: str | None) -> Any:
-        packer = Packer(
-            default=self.default, strict_types=True, autoreset=False, buf_size=1024, unicode_errors=unicode_errors
-        )
-        try:
-            packer.pack(tree)
-        except UnicodeEncodeError:  # A lone surrogate, as in file names that are not UTF-8: rare, so tried second.
-            self.blobs, self.blob_bytes = [], 0
-            return self.packed(tree, "surrogatepass")
-        return packer.getbuffer()
-
-    def default(self, x: Any) -> Any:
-        """What the packer packs in place of `x`, which it does not know."""
-        if type(x) is int:
-            return ExtType(0, x.to_bytes(x.bit_length() // 8 + 1, "big", signed=True))
-        if type(x) is _Blob:
-            self.blobs.append(x.view)
-            self.blob_bytes += x.view.nbytes
-            return [_BUFFER, self.blob_bytes - x.view.nbytes, x.view.nbytes]
-        return self.forms.get(id(x)) or self.form(x)
-
-    def form(self, x: Any) -> list[Any]:
-        """A mark and the parts of `x`."""
-        self.is_marked = True
-        kind = type(x)
-        if kind in _KNOWN:
-            mark, parts = _KNOWN[kind]
-            if self.canonical and (kind is set or kind is frozenset):
-                is_ordered = set(map(type, x)) in ({int}, {str})
-                return [mark, *sorted(x, key=None if is_ordered else _canonical_bytes)]
-            return [mark, *parts(x)]
-        if kind is defaultdict:
-            return [_DEFAULTDICT, _factory_name(x.default_factory), *_flat(x)]
-        if kind.__module__.startswith("numpy") and (np := sys.modules.get("numpy")) and (form := _numpy_form(np, x)):
-            return form
-        if kind not in self.classes:
-            mark = _class_mark(kind)
-            if mark is None:
-                raise UnsavableValue("", f"a value of type {_type_name(kind)}")
-            self.classes[kind] = mark, _class_name(kind), _slots(kind)
-        mark, name, slots = self.classes[kind]
-        return [mark, name, *_class_parts(x, slots)]
-
-
-class _Walk:
-    """The slow way, object by object: for a value with shared objects, or with something that cannot be saved."""
-
-    def __init__(self, encoder: _Encoder, shared: set[int]) -> None:
-        self.encoder, self.shared = encoder, shared
-        self.numbers: dict[int, int] = {}  # of the shared ones that are in the tree already, by id
-        self.seen: dict[int, object] = {}  # by id: None while inside it, then itself, so that the id is not used again
-        self.again: set[int] = set()
-
-    def lowered(self, x: Any) -> Any:
-        if type(x) in _SCALARS:
-            return x
-        if not _can_change(type(x)):
-            return self.inside(x)
-        key = id(x)
-        if key in self.seen:
-            if self.seen[key] is None:
-                raise UnsavableValue("", f"a {_type_name(type(x))} that contains itself")
-            if key in self.numbers:
-                return [_AGAIN, self.numbers[key]]
-            self.again.add(key)
-            if not self.encoder.canonical:
-                return None  # This tree is thrown away: the next walk knows what is shared.
-        self.seen[key] = None
-        lowered = self.inside(x)
-        self.seen[key] = x
-        if key in self.shared:
-            self.encoder.is_marked = True
-            self.numbers[key] = len(self.numbers)
-            return [_SHARED, self.numbers[key], lowered]
-        return lowered
-
-    def inside(self, x: Any) -> Any:
-        if type(x) is list:
-            return self.each(x, x)
-        if type(x) is dict and _SCALARS.issuperset(map(type, x)):
-            return _pairs((*self.each(x, [*_flat(x)]),))
-        mark, *parts = self.encoder.form(x)
-        return [mark, *self.each(x, parts)]
-
-    def each(self, x: Any, parts: list[Any]) -> list[Any]:
-        lowered: list[Any] = []
-        try:
-            for part in parts:
-                lowered.append(self.lowered(part))  # noqa: PERF401 - the error needs the index
-        except UnsavableValue as refusal:  # on its way out each level adds its step to the path
-            refusal.where = _step(x, parts, len(lowered)) + refusal.where
-            raise
-        return lowered
-
-
-def _canonical_bytes(x: object) -> bytes:
-    return b"".join(_pieces(x, "{...}", canonical=True))
+_SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes, _Blob})
+_are_scalars: Final = _SCALARS.issuperset
+_CHANGING: Final = frozenset({list, dict, set, OrderedDict, Counter, deque, bytearray, Random})
 
 
 def _can_change(kind: type) -> bool:
@@ -384,11 +228,132 @@ def _can_change(kind: type) -> bool:
     return kind.__module__ != "numpy" or kind.__name__ in ("ndarray", "void")  # the others are numpy's scalars
 
 
-def _step(x: Any, parts: list[Any], index: int) -> str:
+# --- Writing ---
+
+
+def _pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
+    try:
+        encoder = _Encoder(canonical, shared=set())
+        tree = encoder.lowered(value)
+        if encoder.met_again and not canonical:
+            encoder = _Encoder(canonical, shared=encoder.met_again)
+            tree = encoder.lowered(value)
+        packed = encoder.packed(tree, None)
+    except UnsavableValue as refusal:
+        path = refusal.where if len(refusal.where) < 200 else f"{refusal.where[:90]} ... {refusal.where[-90:]}"
+        raise UnsavableValue(where + path, refusal.problem) from None
+    except (RecursionError, ValueError) as error:
+        raise UnsavableValue(where, f"a value that is nested too deep or too large ({error})") from None
+    if not encoder.has_marks:
+        return [_HEAD_ALONE, packed]
+    return [_HEAD.pack(_FORMAT, 1, len(packed)), packed, *encoder.blobs]
+
+
+class _Encoder:
+    """One walk through a value. `canonical`: the order of sets and arrays, and what is shared, leave no trace."""
+
+    def __init__(self, canonical: bool, shared: set[int]) -> None:
+        self.canonical = canonical
+        self.shared = shared  # the ids of what is known to be reached twice
+        self.met_again: set[int] = set()  # and of what turned out to be
+        self.numbers: dict[int, int] = {}  # of the shared ones that are in the tree already, by id
+        self.walked: dict[int, object] = {}  # by id: None while inside it, then itself, so that the id stays in use
+        self.classes: dict[type, tuple[ExtType, str, dict[str, Any]]] = {}
+        self.blobs: list[Any] = []
+        self.has_marks = False
+
+    def lowered(self, x: Any) -> Any:
+        kind, key = type(x), id(x)
+        if kind in _SCALARS:
+            return x
+        if kind not in _CHANGING and not _can_change(kind):
+            return self.inside(kind, x)
+        if key in self.walked:
+            if self.walked[key] is None:
+                raise UnsavableValue("", f"a {_type_name(kind)} that contains itself")
+            if key in self.numbers:
+                return [_AGAIN, self.numbers[key]]
+            self.met_again.add(key)
+            if not self.canonical:
+                return None  # This tree is thrown away: the next walk knows what is shared.
+        self.walked[key] = None
+        lowered = self.inside(kind, x)
+        self.walked[key] = x
+        if key in self.shared:
+            self.has_marks = True
+            self.numbers[key] = len(self.numbers)
+            return [_SHARED, self.numbers[key], lowered]
+        return lowered
+
+    def inside(self, kind: type, x: Any) -> Any:
+        if kind is list:
+            return x if _are_scalars(map(type, x)) else self.each(x, x)
+        if kind is dict and _are_scalars(map(type, x)):
+            return x if _are_scalars(map(type, x.values())) else _pairs(self.each(x, [*_flat(x)]))
+        if kind is tuple:  # as `form` would do it, only faster
+            self.has_marks = True
+            return [_TUPLE, *(x if _are_scalars(map(type, x)) else self.each(x, x))]
+        mark, *parts = self.form(kind, x)
+        return [mark, *(parts if _are_scalars(map(type, parts)) else self.each(x, parts))]
+
+    def each(self, x: Any, parts: Sequence[Any]) -> list[Any]:
+        lowered: list[Any] = []
+        try:
+            for part in parts:
+                lowered.append(part if type(part) in _SCALARS else self.lowered(part))  # noqa: PERF401 - see below
+        except UnsavableValue as refusal:  # On its way out each level adds its step to the path.
+            refusal.where = _step(x, parts, len(lowered)) + refusal.where
+            raise
+        return lowered
+
+    def form(self, kind: type, x: Any) -> list[Any]:
+        """A mark and the parts of `x`."""
+        self.has_marks = True
+        if kind in _KNOWN:
+            mark, parts = _KNOWN[kind]
+            if self.canonical and (kind is set or kind is frozenset):
+                is_ordered = {*map(type, x)} in ({int}, {str})
+                return [mark, *sorted(x, key=None if is_ordered else _canonical)]
+            return [mark, *parts(x)]
+        if kind is defaultdict:
+            return [_DEFAULTDICT, _factory_name(x.default_factory), *_flat(x)]
+        if kind not in self.classes:
+            if kind.__module__.startswith("numpy") and (np := sys.modules.get("numpy")):
+                form = _numpy_form(np, x, in_order=not self.canonical)
+                if form is not None:
+                    return form
+            if (mark := _class_mark(kind)) is None:
+                raise UnsavableValue("", f"a value of type {_type_name(kind)}")
+            self.classes[kind] = mark, _class_name(kind), _slots(kind)
+        mark, name, slots = self.classes[kind]
+        return [mark, name, *_class_parts(x, slots)]
+
+    def packed(self, tree: object, unicode_errors: str | None) -> Any:
+        packer = Packer(default=self.default, autoreset=False, buf_size=1024, unicode_errors=unicode_errors)
+        try:
+            packer.pack(tree)
+        except UnicodeEncodeError:  # A lone surrogate, as in file names that are not UTF-8: rare, so tried second.
+            self.blobs = []
+            return self.packed(tree, "surrogatepass")
+        return packer.getbuffer()
+
+    def default(self, x: Any) -> Any:
+        """What the packer packs in place of `x`, for which msgpack has no type."""
+        if type(x) is _Blob:
+            self.blobs.append(x.buffer)
+            return [_BUFFER, len(x.buffer)]
+        return ExtType(0, x.to_bytes(x.bit_length() // 8 + 1, "big", signed=True))
+
+
+def _canonical(x: object) -> bytes:
+    return b"".join(_pieces(x, "{...}", canonical=True))
+
+
+def _step(x: Any, parts: Sequence[Any], index: int) -> str:
     """The way from `x` to one of its parts, as a reader would write it."""
     if isinstance(x, dict):
-        index -= isinstance(x, defaultdict)  # which has its factory in front
-        return f"[{reprlib.repr(parts[index - 1])}]" if index % 2 else f".keys()[{index // 2}]"
+        position = index - isinstance(x, defaultdict)  # which has its factory in front
+        return f"[{reprlib.repr(parts[index - 1])}]" if position % 2 else f".keys()[{position // 2}]"
     if isinstance(x, (set, frozenset)):
         return "{...}"
     if isinstance(x, (date, time)):
@@ -398,7 +363,7 @@ def _step(x: Any, parts: list[Any], index: int) -> str:
     return f".{parts[index - 1]}" if index and isinstance(parts[index - 1], str) else ""
 
 
-# Classes: Enum, dataclass, Struct, NamedTuple.
+# --- Classes of users: Enum, dataclass, Struct, NamedTuple ---
 
 
 def _type_name(kind: type) -> str:
@@ -440,7 +405,7 @@ def _class_mark(kind: type) -> ExtType | None:
     if dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__:
         return _DATACLASS
     if issubclass(kind, tuple) and hasattr(kind, "_fields"):
-        return _NAMEDTUPLE
+        return _NAMED
     return None
 
 
@@ -478,18 +443,23 @@ def _factory_name(factory: Any) -> str | None:
     return _class_name(factory)
 
 
-# What numpy has, if the program has imported it.
+# --- numpy, if the program has imported it ---
 
 _LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0, "SFC64": 0}
+# Of numbers, text, bytes, times. Other names mean objects, or (a time unit of 0 seconds) end the process.
+_DTYPE: Final = re.compile(r"[<>|=]([biufcSUV]\d{1,9}|[qQ]|[mM]8(\[([1-9]\d{0,8})?[a-zA-Z]+\])?)")
 _LARGEST_POOL: Final = 64  # A SeedSequence takes time with the square of its pool.
 
 
-def _numpy_form(np: Any, x: Any) -> list[Any] | None:
+def _numpy_form(np: Any, x: Any, *, in_order: bool) -> list[Any] | None:
     kind = type(x)
     if kind is np.str_ or kind is np.bytes_:  # as an array it would lose the NULs at its end
         return [_TEXT, str.__str__(x) if kind is np.str_ else bytes(x)]
     if kind is np.ndarray or (issubclass(kind, np.generic) and kind is x.dtype.type):
-        order = "F" if x.flags.f_contiguous and not x.flags.c_contiguous else "C"
+        order = "F" if in_order and x.flags.f_contiguous and not x.flags.c_contiguous else "C"
+        if x.dtype.names:  # What happens to be between its fields is left out.
+            x, old = np.zeros_like(x), x
+            x[...] = old
         flat = np.ascontiguousarray(x.T if order == "F" else x).reshape(-1)
         dtype, blob = _dtype_parts(x.dtype), _Blob(flat.view(np.uint8) if flat.nbytes else b"")
         return [_ARRAY, dtype, x.shape, order if kind is np.ndarray else "", blob]
@@ -502,6 +472,12 @@ def _numpy_form(np: Any, x: Any) -> list[Any] | None:
     if kind is np.random.SeedSequence and x.pool_size <= _LARGEST_POOL:
         return [_SEED, x.entropy, x.spawn_key, x.pool_size, x.n_children_spawned]
     return None
+
+
+def _numpy() -> Any:
+    import numpy as np
+
+    return np
 
 
 def _dtype_parts(dtype: Any) -> Any:
@@ -522,8 +498,10 @@ def _dtype_parts(dtype: Any) -> Any:
 
 
 def _make_dtype(parts: Any) -> Any:
-    np = import_module("numpy")
+    np = _numpy()
     if isinstance(parts, str):
+        if not _DTYPE.fullmatch(parts):
+            raise DamagedValue(f"it has an array of dtype {parts}")
         dtype = np.dtype(parts)
     elif len(parts) == 2:
         dtype = np.dtype((_make_dtype(parts[0]), tuple(parts[1])))
@@ -542,24 +520,21 @@ def _make_dtype(parts: Any) -> Any:
 
 
 def _make_array(dtype: Any, shape: tuple[int, ...], order: Any, data: memoryview) -> Any:
-    np = import_module("numpy")
-    array = np.ndarray(shape, _make_dtype(dtype), data, order=order or "C")
-    if array.shape != shape or array.nbytes != len(data):
-        raise DamagedValue(f"it has {len(data)} bytes for an array of shape {shape} and dtype {array.dtype}")
-    array = array.copy(order or "C")
+    made = _make_dtype(dtype)
+    # Numpy would take a size of -1 for "as many as there are", and divide by the size of an item.
+    if min(shape, default=0) < 0 or math.prod(shape) * made.itemsize != len(data):
+        raise DamagedValue(f"it has {len(data)} bytes for an array of shape {shape} and dtype {made}")
+    array = _numpy().ndarray(shape, made, data, order=order or "C").copy(order or "C")
+    if array.shape != shape:
+        raise DamagedValue(f"it has an array of shape {shape}")
     return array if order else array[()]
-
-
-def _make_text(text: str | bytes) -> Any:
-    np = import_module("numpy")
-    return np.str_(text) if isinstance(text, str) else np.bytes_(text)
 
 
 def _make_bits(state: dict[str, Any], seed: Any) -> Any:
     kind, position = state["bit_generator"], state.get("buffer_pos", state["state"].get("pos", 0))
     if not 0 <= position <= _LAST_POSITION[kind]:  # Numpy does not check, and would read what is there.
         raise DamagedValue(f"it has a {kind} at position {position}")
-    bits = getattr(import_module("numpy.random"), kind)(0 if seed is None else seed)
+    bits = getattr(_numpy().random, kind)(0 if seed is None else seed)
     bits.state = state
     return bits
 
@@ -567,20 +542,17 @@ def _make_bits(state: dict[str, Any], seed: Any) -> Any:
 def _make_seed(entropy: Any, spawn_key: tuple[int, ...], pool_size: int, n_children: int) -> Any:
     if pool_size > _LARGEST_POOL:
         raise DamagedValue(f"it has a SeedSequence with a pool of {pool_size}")
-    return import_module("numpy.random").SeedSequence(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children)
-
-
-def _make_generator(bits: Any) -> Any:
-    return import_module("numpy.random").Generator(bits)
+    make = _numpy().random.SeedSequence
+    return make(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children)
 
 
 def _make_random_state(state: dict[str, Any]) -> Any:
-    made = import_module("numpy.random").RandomState(_make_bits(state, None))
+    made = _numpy().random.RandomState(_make_bits(state, None))
     made.set_state(state)
     return made
 
 
-# Reading.
+# --- Reading ---
 
 
 def _make_int(code: int, data: bytes) -> int:
@@ -589,14 +561,15 @@ def _make_int(code: int, data: bytes) -> int:
     return int.from_bytes(data, "big", signed=True)
 
 
+_MARKS: Final = {code: _Mark(code) for code in range(1, 64)}
 _unpack: Final = partial(unpackb, strict_map_key=False, unicode_errors="surrogatepass")
 _MAKE: Final[dict[int, Callable[..., Any]]] = {
     **{code: make for code, _, _, make in _TYPES},
     _ARRAY.code: _make_array,
-    _TEXT.code: _make_text,
+    _TEXT.code: lambda text: (_numpy().str_ if isinstance(text, str) else _numpy().bytes_)(text),
     _BITS.code: _make_bits,
     _SEED.code: _make_seed,
-    _GENERATOR.code: _make_generator,
+    _GENERATOR.code: lambda bits: _numpy().random.Generator(bits),
     _RANDOM_STATE.code: _make_random_state,
 }
 
@@ -605,37 +578,45 @@ class _Decoder:
     """What msgpack calls for each extension value and each list, inner ones first."""
 
     def __init__(self, buffers: memoryview) -> None:
+        self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
         self.open_marks = 0
         self.shared: dict[int, object] = {}
         self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any]]] = {}
         self.make = _MAKE | {
-            _BUFFER.code: lambda start, n_bytes: buffers[start : start + n_bytes],
+            _BUFFER.code: self.make_buffer,
             _SHARED.code: self.make_shared,
             _AGAIN.code: self.shared.__getitem__,
             _DEFAULTDICT.code: self.make_defaultdict,
             _ENUM.code: self.make_enum,
             _DATACLASS.code: partial(self.make_record, _DATACLASS),
             _STRUCT.code: partial(self.make_record, _STRUCT),
-            _NAMEDTUPLE.code: partial(self.make_record, _NAMEDTUPLE),
+            _NAMED.code: partial(self.make_record, _NAMED),
         }
 
     def value(self, tree: memoryview) -> object:
         value = _unpack(tree, ext_hook=self.on_extension, list_hook=self.on_list)
-        if self.open_marks:
-            raise DamagedValue("it has a mark that opens no list")
+        if self.open_marks or self.buffers:
+            raise DamagedValue("it has something that belongs nowhere")
         return value
 
     def on_extension(self, code: int, data: bytes) -> int:
         if code == 0:
             return _make_int(code, data)
         self.open_marks += 1
-        return _Mark(code)
+        return _MARKS[code]
 
     def on_list(self, parts: list[Any]) -> Any:
         if not parts or type(parts[0]) is not _Mark:
             return parts
         self.open_marks -= 1
-        return self.make[parts[0]](*parts[1:])
+        mark, parts = parts[0], parts[1:]
+        return tuple(parts) if mark == _TUPLE.code else self.make[mark](*parts)
+
+    def make_buffer(self, n_bytes: int) -> memoryview:
+        if not 0 <= n_bytes <= len(self.buffers):
+            raise DamagedValue("it is cut short")
+        buffer, self.buffers = self.buffers[:n_bytes], self.buffers[n_bytes:]
+        return buffer
 
     def make_shared(self, number: int, x: object) -> object:
         self.shared[number] = x
@@ -673,9 +654,11 @@ class _Decoder:
             made = kind(**{field: attributes[field] for field in kind.__struct_fields__ if field in attributes})
         else:
             made = tuple.__new__(kind, [attributes.pop(field) for field in kind._fields])
-        for attribute, value in attributes.items():
-            if attribute in slots:
-                slots[attribute].__set__(made, value)  # also where it is frozen
-            else:
-                made.__dict__[attribute] = value
+        for attribute, slot in slots.items():
+            if attribute in attributes:
+                slot.__set__(made, attributes.pop(attribute))  # also where it is frozen
+        if attributes:
+            if not hasattr(made, "__dict__"):
+                raise DamagedValue(f"class {name} has no {', '.join(attributes)}")
+            made.__dict__.update(attributes)
         return made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import random
 
 from ..actors.errors import SpecError
@@ -27,6 +28,10 @@ class Backoff:
     reset_after: float = 10.0
 
     def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+                raise SpecError("Backoff", f"{field.name} must be a finite number, not {value!r}")
         if not 0 <= self.initial <= self.maximum:
             raise SpecError("Backoff", f"0 <= initial <= maximum must hold, not {self.initial!r}, {self.maximum!r}")
         if not self.factor >= 1:
@@ -45,5 +50,5 @@ class Backoff:
         try:
             grown = self.initial * self.factor**attempt
         except OverflowError:
-            grown = self.maximum
+            grown = self.maximum if self.initial else 0.0
         return min(self.maximum, grown) * (1.0 + rng.random() * self.jitter)

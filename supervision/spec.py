@@ -13,6 +13,8 @@ from ..actors.errors import SpecError, type_name
 from ..actors.exits import ExitReason
 from ..actors.mailbox import Bounded
 from ..actors.process.limits import Limits
+from ..actors.process.recipe import pack_recipe
+from ..actors.values import UnsavableValue
 from .backoff import Backoff
 
 Restart = Literal["permanent", "transient", "temporary"]
@@ -66,18 +68,28 @@ class ChildSpec:
         _choose(where, "restart", self.restart, Restart)
         _choose(where, "isolation", self.isolation, Isolation)
         if self.shutdown not in ("brutal_kill", "infinity") and not (_number(self.shutdown) and self.shutdown >= 0):
-            raise SpecError(
-                where, f"shutdown must be seconds >= 0, 'brutal_kill' or 'infinity', not {self.shutdown!r}"
-            )
-        unknown = sorted(set(self.bindings) - self.start.kind._bindings)
+            raise SpecError(where, f"shutdown must be seconds >= 0, 'brutal_kill' or 'infinity', not {self.shutdown!r}")
+        _of_kind(where, "mailbox", self.mailbox, Bounded, "bounded(...)")
+        _of_kind(where, "backoff", self.backoff, Backoff, "Backoff(...)")
+        _of_kind(where, "limits", self.limits, Limits, "Limits(...)")
+        _of_kind(where, "bindings", self.bindings, Mapping, "a mapping of port names to addresses")
+        unknown = sorted(set(self.bindings) - self.start.kind._bindings, key=str)
         if unknown:
             raise SpecError(where, f"{type_name(self.start.kind)} has no binding {unknown[0]!r}")
+        for port, path in self.bindings.items():
+            if not isinstance(path, str) or not path.startswith("/"):
+                raise SpecError(where, f"bindings must name an address such as '/app/bank' for {port!r}, not {path!r}")
         if self.recovery is not None:
+            if not hasattr(self.recovery, "check"):
+                raise SpecError(
+                    where, f"recovery must be a method such as hybrid(...) or left out, not {self.recovery!r}"
+                )
             self.recovery.check(where, self.start.kind)
-        if self.isolation == "process" and "<locals>" in self.start.kind.__qualname__:
-            raise SpecError(
-                where, f"{type_name(self.start.kind)} is defined in a function, so another process cannot import it"
-            )
+        if self.isolation == "process":
+            try:
+                pack_recipe(self.start, where)
+            except UnsavableValue as error:
+                raise SpecError(error.where, f"{error.problem} cannot be sent to another process") from error
 
     async def stop(self, cell: Cell, reason: ExitReason = lives.SHUTDOWN) -> ExitReason:
         """Stop the child as its spec says: ask, wait, kill. Returns the reason it ended with."""
@@ -96,7 +108,7 @@ class ChildSpec:
 
 
 def child(
-    id: str,  # noqa: A002 - OTP's word for it, and the one users look for
+    id: str,
     start: Start[Any],
     *,
     restart: Restart = "permanent",
@@ -126,7 +138,16 @@ def child(
         SpecError: naming the child, the option, and what it may be.
     """
     return ChildSpec(
-        id, start, restart, shutdown, isolation, recovery, mailbox, backoff, limits, dict(bindings or {})
+        id,
+        start,
+        restart,
+        shutdown,
+        isolation,
+        recovery,
+        mailbox,
+        backoff,
+        limits,
+        dict(bindings) if isinstance(bindings, Mapping) else bindings or {},
     )
 
 
@@ -141,6 +162,11 @@ def check_ids(where: str, children: Iterable[ChildSpec]) -> tuple[ChildSpec, ...
             raise SpecError(where, f"two children have the id {spec.id!r}")
         seen.add(spec.id)
     return specs
+
+
+def _of_kind(where: str, name: str, value: object, kind: type, form: str) -> None:
+    if value is not None and not isinstance(value, kind):
+        raise SpecError(where, f"{name} must be {form} or left out, not {value!r}")
 
 
 def _number(value: object) -> bool:

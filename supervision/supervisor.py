@@ -103,6 +103,7 @@ class Child:
     attempts: int = 0  # restarts in a row without a healthy life
     up_since: float = 0.0
     retry: int = 0  # the number of the retry that counts; stale ones are dropped
+    up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
 
 
 class Retry(Item):
@@ -121,14 +122,14 @@ class Retry(Item):
 class StartOver(Item):
     """A child's start, waited for outside the supervisor's turn, has come to its end."""
 
-    __slots__ = ("child", "error", "life")
+    __slots__ = ("child", "up")
 
-    def __init__(self, child: Child, life: int, error: BaseException | None) -> None:
-        self.child, self.life, self.error = child, life, error
+    def __init__(self, child: Child, up: asyncio.Future[None]) -> None:
+        self.child, self.up = child, up
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        return actor.start_over(item.child, item.life, item.error)
+        return actor.start_over(item.child, item.up)
 
 
 class Supervisor(Actor):
@@ -155,7 +156,13 @@ class Supervisor(Actor):
         """
         up = self._launch(one)
         if up is not None:
-            await up
+            try:
+                await up
+            except asyncio.CancelledError as error:
+                task = asyncio.current_task()
+                if task is not None and task.cancelling():
+                    raise  # It is our own turn that is killed.
+                raise StartFailed(f"{self.ctx.path}/{one.spec.id}", "it was killed while it started") from error
         self._is_up(one)
 
     def _launch(self, one: Child) -> asyncio.Future[None] | None:
@@ -174,16 +181,19 @@ class Supervisor(Actor):
     def _new_cell(self, spec: ChildSpec) -> Cell:
         own = self.ctx.cell
         node = own.node
+        targets = {port: node.find(path) for port, path in spec.bindings.items()}
+        for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
+            if target is None:
+                missing = NoSuchActor(spec.bindings[port])
+                raise StartFailed(f"{own.path}/{spec.id}", f"binding {port!r}: {missing}") from missing
         cell = node.cell_below(own, spec.id, node.host_for(spec))
         cell.spec = spec
         more = cell.extra()
         more.start = spec.start
         if spec.mailbox is not None:
             node.bound(cell, spec.mailbox)
-        for port, path in spec.bindings.items():
-            target = node.find(path)
-            if target is None:
-                raise NoSuchActor(path)
+        for port, target in targets.items():
+            assert target is not None
             node.bind(cell, port, target)
         return cell
 
@@ -199,8 +209,12 @@ class Supervisor(Actor):
         if one is None or one.cell is not cell:
             lives.retire(cell, reason)
             return None
-        if life <= one.ignored_life or one.state == STOPPED:
-            return None
+        if life <= one.ignored_life or one.state != UP:
+            return None  # We stopped it, or its start failed: that is told by who waits for the start.
+        if one.up is not None:
+            if not has_succeeded(one.up):
+                return None  # It ended while it started: `start_over` hears of that, and it counts once.
+            one.up = None
         if not is_restarted(one.spec.restart, reason):
             self._give_up_address(one, reason)
             return None
@@ -275,16 +289,15 @@ class Supervisor(Actor):
             return
         if one.spec.recovery is not None:
             one.state = RECOVERING
-        cell = one.cell
-        assert cell is not None
-        life = cell.life
-        up.add_done_callback(lambda done: self._post(StartOver(one, life, done.exception())))
+        one.up = up
+        up.add_done_callback(lambda done: self._post(StartOver(one, done)))
 
-    def start_over(self, one: Child, life: int, error: BaseException | None) -> None:
-        """A restart has come to its end."""
-        if one.cell is None or one.state not in (RESTARTING, RECOVERING):
+    def start_over(self, one: Child, up: asyncio.Future[None]) -> None:
+        """A restart has come to its end, unless the child was stopped meanwhile or has ended again."""
+        if one.up is not up or one.cell is None:
             return
-        if error is None:
+        one.up = None
+        if has_succeeded(up):
             self._is_up(one)
             return
         one.ignored_life = one.cell.life
@@ -317,7 +330,7 @@ class Supervisor(Actor):
             except StartFailed:
                 if one.cell is not None:
                     one.ignored_life = one.cell.life
-                self._try_again(failed if self._flags.strategy == "one_for_all" else one, reason)
+                self._try_again(one, reason)  # Of the group, it is the one that does not run.
                 return
 
     async def _stop(self, one: Child) -> None:
@@ -325,17 +338,23 @@ class Supervisor(Actor):
         cell = one.cell
         one.retry += 1
         one.state = STOPPED
-        if cell is None or cell.state in (DOWN, GONE):
+        starting, one.up = one.up, None
+        if cell is None or cell.state is GONE:
             return
-        one.ignored_life = cell.life
-        await one.spec.stop(cell)
+        one.ignored_life = cell.life  # Also if it has ended just now: its end is in our queue, and is known here.
+        if cell.state is not DOWN:
+            await one.spec.stop(cell)
+        elif starting is not None:
+            cell.kill()
 
     # -- administration ---------------------------------------------------------------------------------------------
 
     @on(StartChild)
     async def start_child(self, message: StartChild) -> Any:
         """Add and start a child."""
-        spec: ChildSpec = message.spec
+        spec = message.spec
+        if not isinstance(spec, ChildSpec):
+            return self._fail(SpecError("StartChild", f"takes child(...) or supervisor(...), not {spec!r}"))
         known = self._children.get(spec.id)
         if known is not None:
             raise AlreadyPresent(spec.id) if known.state == STOPPED else AlreadyStarted(spec.id)
@@ -367,7 +386,7 @@ class Supervisor(Actor):
         try:
             await self._start(one)
         except HoldfastError as error:
-            one.state = STOPPED
+            self._give_up_address(one, "it could not be started")
             return self._fail(error)
         assert one.cell is not None
         return one.cell.ref
@@ -379,6 +398,8 @@ class Supervisor(Actor):
         if one.state != STOPPED:
             raise ChildBusy(message.id)
         del self._children[message.id]
+        if one.cell is not None:
+            lives.retire(one.cell, "it was deleted")
 
     @on(WhichChildren, readonly=True)
     def which_children(self, message: WhichChildren) -> list[ChildInfo]:
@@ -400,6 +421,11 @@ class Supervisor(Actor):
         handle = self.ctx.reply_handle()
         handle.fail(error)
         return handle
+
+
+def has_succeeded(up: asyncio.Future[None]) -> bool:
+    """Whether a start has come to its end, and a good one."""
+    return up.done() and not up.cancelled() and up.exception() is None
 
 
 def supervisor(
@@ -430,7 +456,13 @@ def supervisor(
         SpecError: naming the option and what it may be.
     """
     specs = check_ids(f"supervisor {name!r}", children)
-    start = Start(Supervisor, (Flags(strategy, intensity, period), specs))
+    try:
+        flags = Flags(strategy, intensity, period)
+    except SpecError as error:
+        raise SpecError(f"supervisor {name!r}", error.problem) from None
+    start = Start(Supervisor, (flags, specs))
     if isolation == "process" and any(spec.isolation == "process" for spec in specs):
-        raise SpecError(f"supervisor {name!r}", "a subtree in a process cannot hold process children: its own is theirs")
+        raise SpecError(
+            f"supervisor {name!r}", "a subtree in a process cannot hold process children: its own is theirs"
+        )
     return ChildSpec(name, start, restart, shutdown, isolation, limits=limits, is_supervisor=True)

@@ -7,6 +7,7 @@ import socket
 
 from ..actors.cell import Cell
 from ..actors.process import frames, guest
+from ..checkpoint.controller import RecordedGuest
 
 
 def main(sock: socket.socket, page_fd: int) -> int:
@@ -15,9 +16,14 @@ def main(sock: socket.socket, page_fd: int) -> int:
 
 
 def prepare(host: guest.Guest) -> None:
-    """Before the root's first frame."""
+    """Before the root's first frame: a recorded life may get its state before it is launched."""
+    host.recovery = RecordedGuest(host)
 
 
 def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:
     """Begin the life that the root asks for."""
-    return cell.host.start(cell)
+    recorded = frame.options.get("recorded")
+    if recorded is None:
+        return cell.host.start(cell)
+    host.recovery.start(cell, recorded)
+    return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Callable
 
 import structlog
 
@@ -16,8 +16,8 @@ from ..actors.events import (
     JournalFull,
     LifeAbandoned,
     LogLine,
+    MessageQuarantined,
     ProcessDied,
-    Quarantined,
     Recovered,
     RecoveryFailed,
     SnapshotFailed,
@@ -33,8 +33,9 @@ BURST = 10
 class LogSink:
     """Writes what an operator wants to see; formats only what is written."""
 
-    def __init__(self, system: str) -> None:
+    def __init__(self, system: str, clock: Callable[[], float]) -> None:
         self._log = structlog.get_logger("holdfast", system=system)
+        self._clock = clock  # the loop's
         self._second: dict[type, tuple[int, int]] = {}
 
     def __call__(self, event: Event) -> None:
@@ -51,7 +52,7 @@ class LogSink:
 
     def _admit(self, kind: type) -> int | None:
         """None: this second has had its records. Else how many were left out before."""
-        second = int(time.monotonic())
+        second = int(self._clock())
         then, count = self._second.get(kind, (second, 0))
         if then != second:
             self._second[kind] = (second, 1)
@@ -70,7 +71,7 @@ LEVELS: dict[type, str] = {
     ProcessDied: "warning",
     Recovered: "info",
     RecoveryFailed: "error",
-    Quarantined: "error",
+    MessageQuarantined: "error",
     SnapshotFailed: "error",
     JournalFull: "warning",
     LogLine: "info",
@@ -85,7 +86,7 @@ NAMES: dict[type, str] = {
     ProcessDied: "process died",
     Recovered: "actor recovered",
     RecoveryFailed: "recovery failed",
-    Quarantined: "message quarantined",
+    MessageQuarantined: "message quarantined",
     SnapshotFailed: "snapshot failed",
     JournalFull: "journal full",
     LogLine: "output",

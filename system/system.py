@@ -21,8 +21,10 @@ from ..actors.node import Node
 from ..actors.process.remote import ProcessHost, on_frame
 from ..actors.process.workers import Workers
 from ..actors.ref import ActorRef
+from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
+from ..checkpoint.stores import open_journal
 from ..supervision.spec import ChildSpec, Flags
-from ..supervision.supervisor import DeleteChild, StartChild, Supervisor, TerminateChild
+from ..supervision.supervisor import DeleteChild, NoSuchChild, StartChild, Supervisor, TerminateChild
 from .logs import LogSink
 
 A = TypeVar("A", bound=Actor)
@@ -82,10 +84,11 @@ class ActorSystem:
         if self._node is not None:
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
+        self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
         if self._log:
-            node.events.add_sink(LogSink(self.name))
+            node.events.add_sink(LogSink(self.name, node.loop.time))
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
         up = lives.begin(root, Start(Supervisor, (self._flags, ())))
@@ -97,11 +100,12 @@ class ActorSystem:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        body = self._body
         await self.shutdown()
         if self._failure is not None:
             failure, self._failure = self._failure, None
-            if self._body is not None and isinstance(error, asyncio.CancelledError):
-                self._body.uncancel()
+            if body is not None:  # The cancel was ours: whoever catches TreeFailed must not look cancelled.
+                body.uncancel()
             raise failure from (None if isinstance(error, asyncio.CancelledError) else error)
 
     async def shutdown(self) -> None:
@@ -116,6 +120,7 @@ class ActorSystem:
         await lives.stop_and_wait(root)
         await self._workers.close()
         await node.close()
+        self._homes.close()
         node.deadlines.close()
         node.events.close()
 
@@ -123,7 +128,11 @@ class ActorSystem:
         """Where a child's lives are lived."""
         if spec.isolation == "process":
             self._workers.want(spec.start.kind.__module__)
+            if spec.recovery is not None and spec.recovery.records:
+                return RecordedProcessHost(self._workers, spec.limits, self._homes, spec.recovery)
             return ProcessHost(self._workers, spec.limits)
+        if spec.recovery is not None and spec.recovery.records:
+            return TaskHost(self._homes, spec.recovery)
         return LOCAL
 
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
@@ -170,9 +179,11 @@ class ActorSystem:
         parent = cell.parent
         if cell.spec is not None and parent is not None and isinstance(parent.actor, Supervisor):
             supervisor = ActorRef[Supervisor](parent)
-            await supervisor.ask(TerminateChild(cell.name), ADMIN_TIMEOUT)
-            if cell.spec.restart != "temporary":
+            try:
+                await supervisor.ask(TerminateChild(cell.name), ADMIN_TIMEOUT)
                 await supervisor.ask(DeleteChild(cell.name), ADMIN_TIMEOUT)
+            except NoSuchChild:  # It has stopped already, or was temporary: its spec went with it.
+                pass
         elif not cell.is_dead:
             await lives.stop_and_wait(cell, reason)
 

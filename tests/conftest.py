@@ -1,6 +1,7 @@
 """Every async test runs under both event loops, and no test leaves anything behind.
 
-A test that must not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories=["uvloop"])`.
+A test that must not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories=["uvloop"])`; one
+that is about time asks for `loop_factories=["virtual"]`, where nothing waits (`holdfast.testing.clock`).
 """
 
 import asyncio
@@ -17,6 +18,8 @@ import pytest
 import pytest_asyncio
 import uvloop
 
+from holdfast.testing.clock import virtual_loop_factory
+
 # A whole actor system may start and stop within one example, on a machine that is busy with other things.
 hypothesis.settings.register_profile("holdfast", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("holdfast")
@@ -32,7 +35,14 @@ OPEN_FILES = Path("/proc/self/fd")
 def pytest_asyncio_loop_factories(
     config: pytest.Config, item: pytest.Item
 ) -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
-    return {"uvloop": uvloop.new_event_loop, "asyncio": asyncio.new_event_loop}
+    factories: dict[str, Callable[[], asyncio.AbstractEventLoop]] = {
+        "uvloop": uvloop.new_event_loop,
+        "asyncio": asyncio.new_event_loop,
+    }
+    marker = item.get_closest_marker("asyncio")
+    if marker is not None and "virtual" in marker.kwargs.get("loop_factories", ()):
+        factories["virtual"] = virtual_loop_factory  # by name only: other tests run under the two real loops
+    return factories
 
 
 @pytest.fixture(scope="session", autouse=True)

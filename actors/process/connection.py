@@ -76,14 +76,14 @@ class Connection(asyncio.BufferedProtocol):
         if type(name) is str:
             self._names_in.append(name)
             return name
-        try:
-            return self._names_in[cast("int", name)]
-        except IndexError:
-            raise BadFrame(f"name {name} was never introduced") from None
+        number = cast("int", name)
+        if not 0 <= number < len(self._names_in):
+            raise BadFrame(f"name {number} was never introduced")
+        return self._names_in[number]
 
-    def number_in(self, text: str) -> int:
-        """The number under which the peer will send this name again."""
-        return self._names_in.index(text)
+    def number_in(self, name: Name) -> int:
+        """The number of the name that `name_in` was given last: the peer uses it from now on."""
+        return len(self._names_in) - 1 if type(name) is str else cast("int", name)
 
     # -- writing ----------------------------------------------------------------------------------------------------
 

@@ -92,8 +92,9 @@ class Command(Frame, tag=8):
 
 
 class Publish(Frame, tag=9):
-    """Publish on a topic."""
+    """Publish on a topic; answered under `id` when every subscriber has accepted."""
 
+    id: int
     topic: str
     name: Name
     body: Raw
@@ -118,4 +119,33 @@ class Record(Frame, tag=12):
     body: Raw
 
 
-AnyFrame = Tell | Ask | Reply | Failure | Launch | Launched | Ended | Command | Publish | Beat | Note | Record
+class Offer(Frame, tag=13):
+    """A message whose acceptance is awaited under `id`, its handling is not."""
+
+    id: int
+    to: Name
+    name: Name
+    body: Raw
+    sender: Name | None = None
+
+
+class Moved(Frame, tag=14):
+    """The page has changed: told to a bounded mailbox only, at most once per loop tick."""
+
+
+AnyFrame = (
+    Tell
+    | Ask
+    | Reply
+    | Failure
+    | Launch
+    | Launched
+    | Ended
+    | Command
+    | Publish
+    | Beat
+    | Note
+    | Record
+    | Offer
+    | Moved
+)

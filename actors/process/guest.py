@@ -71,6 +71,7 @@ class Guest(Peer):
         self.page = page
         self.ended: asyncio.Future[int] = loop.create_future()
         self.on_record: Callable[[frames.Record], None] | None = None
+        self.recovery: Any = None  # the recovery method's side in this process, if it has one
         self._launcher = launcher
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}

@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import asyncio
+import math
 import types
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
+from .. import links
 from ..codec import Codec, Parcel, Raw
-from ..errors import BadMessage, HoldfastError, UnknownMessage
+from ..errors import BadMessage, HoldfastError
+from ..exits import ExitReason, pack_exit, unpack_exit
 from ..mail import Ask, Chain, Envelope, Item
-from ..message import Message, by_name, message_name
+from ..message import Message, message_name
 from . import frames
-from .connection import Connection
+from .connection import BadFrame, Connection
 
 if TYPE_CHECKING:
     from ..cell import Cell
     from ..node import Node
 
 Coroutine_ = types.CoroutineType
+NIL = msgspec.msgpack.encode(None)
 
 
 class Peer:
@@ -28,7 +34,6 @@ class Peer:
         self.node = node
         self.connection = cast("Connection", connection)
         self.pending: dict[int, Ask] = {}
-        self._kinds: dict[tuple[int, str], Any] = {}
         self._last_id = 0
 
     @property
@@ -45,29 +50,50 @@ class Peer:
             BadMessage: it cannot be coded.
         """
         connection = self.connection
-        kind = type(item)
-        if kind is Envelope:
-            sender, message = connection.name_out(item.sender.path), item.message
-        elif isinstance(item, Ask):
+        if isinstance(item, Ask):
             self._send_ask(cell, path, item, number)
             return
-        else:
-            sender, message = None, item
+        source, message = (item.sender, item.message) if isinstance(item, Envelope) else (None, item)
+        # Names are numbered by first use: here in the order in which the other side reads them.
+        to = connection.name_out(path)
         name, body = self._payload(message)
-        connection.send(frames.Tell(connection.name_out(path), name, body, number, sender), path)
+        sender = None if source is None else connection.name_out(source.path)
+        connection.send(frames.Tell(to, name, body, number, sender), path)
 
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
         self._last_id = key = self._last_id + 1
-        sender = None if ask.sender is None else connection.name_out(ask.sender.path)
         left = ask.deadline - self.node.loop.time()
+        to = connection.name_out(path)
         name, body = self._payload(ask.message)
-        frame = frames.Ask(key, connection.name_out(path), name, body, left, number, sender, ask.chain)
+        sender = None if ask.sender is None else connection.name_out(ask.sender.path)
+        frame = frames.Ask(key, to, name, body, left, number, sender, ask.chain)
         connection.send(frame, path)
         self.pending[key] = ask
         ask.started = True  # From here on we cannot know.
         if len(self.pending) > 4096 and key % 1024 == 0:
             self._forget_done()
+
+    def offer(self, path: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
+        """Send a message to `path`; the future ends when it is accepted there.
+
+        Raises:
+            BadMessage: it cannot be coded.
+        """
+        connection = self.connection
+        to = connection.name_out(path)
+        name, body = self._payload(message)
+        source = None if sender is None else connection.name_out(sender.path)
+        key, accepted = self.acceptance()
+        connection.send(frames.Offer(key, to, name, body, source), path)
+        return accepted
+
+    def acceptance(self) -> tuple[int, asyncio.Future[None]]:
+        """A number for the other side to answer under, and the future of its answer."""
+        self._last_id = key = self._last_id + 1
+        accepted: asyncio.Future[None] = self.node.loop.create_future()
+        self.pending[key] = Ask(_ACCEPTANCE, None, (), math.inf, math.inf, accepted)
+        return key, accepted
 
     def _payload(self, message: Any) -> tuple[frames.Name, Any]:
         """Type name and body; a parcel is passed on as it is."""
@@ -110,34 +136,13 @@ class Peer:
         elif ask is not None:
             ask.fail(self.codec.decode_error(frame.kind, frame.name, frame.body))
 
-    def message_in(self, cell: Cell, name: str, body: Any) -> Any:
-        """A message for a cell: decoded if its actor is here, else as it came.
-
-        Raises:
-            UnknownMessage: its class has no handler for this name. BadMessage: the payload does not fit the type.
-        """
-        if cell.host.takes_parcels:
-            return Parcel(name, bytes(body))
-        table = cell.table
-        key = (id(table), name)
-        kind = self._kinds.get(key)
-        if kind is None:
-            kind = by_name(table).get(name)
-            if kind is None:
-                raise UnknownMessage(cell.path, name.replace(":", "."))
-            self._kinds[key] = kind
-        try:
-            return self.codec.decode(kind, body)
-        except msgspec.DecodeError as error:
-            raise BadMessage(cell.path, name.replace(":", "."), str(error)) from error
-
     def on_tell(self, cell: Cell, frame: frames.Tell, page: memoryview | None) -> None:
         """Take in a message."""
         connection = self.connection
         name = connection.name_in(frame.name)
         sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
         try:
-            message = self.message_in(cell, name, frame.body)
+            message = self.codec.message_in(cell, name, frame.body)
         except HoldfastError as error:
             self.node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error))
             if page is not None:
@@ -151,6 +156,15 @@ class Peer:
             except HoldfastError as error:
                 self.node.dead_letter(cell, message, str(error))
 
+    def on_offer(self, cells: Iterable[Cell], frame: frames.Offer | frames.Publish) -> None:
+        """Take in a message whose sender waits until every one of `cells` has accepted it."""
+        connection = self.connection
+        name = connection.name_in(frame.name)
+        sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
+        parcel = Parcel(name, bytes(frame.body))
+        offered = Offered(self, frame.id, list(cells), parcel, sender, is_published=isinstance(frame, frames.Publish))
+        offered.go_on()
+
     def on_ask(self, cell: Cell, frame: frames.Ask, page: memoryview | None) -> None:
         """Take in an ask; its outcome goes back over this connection."""
         connection = self.connection
@@ -158,7 +172,7 @@ class Peer:
         sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
         ask = RelayedAsk(self, frame, sender, page)
         try:
-            ask.message = self.message_in(cell, name, frame.body)
+            ask.message = self.codec.message_in(cell, name, frame.body)
             if ask.chain and (ctx := cell.ctx) is not None and ctx.turn_in(ask.chain):
                 from ..errors import AskDeadlock
 
@@ -168,6 +182,55 @@ class Peer:
             if page is not None:
                 page[1] = frame.number
             ask.fail(error)
+
+
+class Accepted(Message[None]):
+    """Stands for a message whose sender waits for its acceptance only."""
+
+
+_ACCEPTANCE = Accepted()
+
+
+class Offered:
+    """A message from the other side on its way to receivers that may have no room yet."""
+
+    __slots__ = ("_cells", "_id", "_is_published", "_parcel", "_peer", "_sender")
+
+    def __init__(
+        self, peer: Peer, key: int, cells: list[Cell], parcel: Parcel, sender: Cell | None, *, is_published: bool
+    ) -> None:
+        self._peer, self._id, self._cells, self._parcel, self._sender = peer, key, cells, parcel, sender
+        self._is_published = is_published
+
+    def go_on(self, _: object = None) -> None:
+        """Hand it to one receiver after the other; come back when the next one has room."""
+        peer = self._peer
+        if not peer.connection.is_open:
+            return  # Not accepted, and lost with its sender.
+        try:
+            while self._cells:
+                cell = self._cells[0]
+                try:
+                    room = cell.room()
+                    if room is not None:
+                        room.add_done_callback(self.go_on)
+                        return
+                    del self._cells[0]
+                    self._hand_to(cell)
+                except HoldfastError as error:
+                    if not self._is_published:
+                        raise
+                    self._cells = [other for other in self._cells if other is not cell]
+                    peer.node.dead_letter(cell, self._parcel, str(error))  # One's trouble is not another's.
+        except HoldfastError as error:
+            kind, name, body = peer.codec.encode_error(error)
+            peer.connection.send(frames.Failure(self._id, kind, name, Raw(body)))
+        else:
+            peer.connection.send(frames.Reply(self._id, Raw(NIL)))
+
+    def _hand_to(self, cell: Cell) -> None:
+        message = self._peer.codec.message_in(cell, self._parcel.name, self._parcel.body)
+        cell.admit(cell, message if self._sender is None else Envelope(message, self._sender))
 
 
 class Arrived(Envelope):
@@ -269,22 +332,27 @@ class OutsideHost:
     def start(self, cell: Cell) -> None:
         raise HoldfastError(f"{cell.path} is in another process")
 
-    def stop(self, cell: Cell, reason: Any) -> None:
-        from ..exits import pack_exit
-
-        self.command(cell, "stop", {"reason": pack_exit(reason)})
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.told(cell, "stop", {"reason": pack_exit(reason)})
 
     def kill(self, cell: Cell) -> None:
-        self.command(cell, "kill", {})
+        self.told(cell, "kill", {})
 
     def retired(self, cell: Cell) -> None:
         pass
 
+    def recovers(self, reason: ExitReason) -> bool:
+        return False
+
     def push(self, cell: Cell, item: Item) -> None:
         send_signal(self._peer, cell.path, item)
 
-    def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        """Send a command to the actor."""
+    def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
+        if isinstance(item, Envelope):
+            return self._peer.offer(cell.path, item.message, item.sender)
+        return self._peer.offer(cell.path, item, None)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         connection = self._peer.connection
         connection.send(frames.Command(connection.name_out(cell.path), verb, data))
 
@@ -295,15 +363,52 @@ class OutsideHost:
 
 def send_signal(peer: Peer, path: str, item: Item) -> None:
     """Carry an EXIT or DOWN over; other items of the runtime never cross a border."""
-    from ..exits import pack_exit
-    from ..links import Down, Exit
-
     connection = peer.connection
-    if isinstance(item, Exit):
+    if isinstance(item, links.Exit):
         data: dict[str, Any] = {"source": item.source.path, "reason": pack_exit(item.reason)}
         connection.send(frames.Command(connection.name_out(path), "exit", data))
-    elif isinstance(item, Down):
-        data = {"source": item.watch.target.path, "reason": pack_exit(item.reason), "recovering": item.recovering}
+    elif isinstance(item, links.Down):
+        data = {
+            "source": item.watch.target.path,
+            "reason": pack_exit(item.reason),
+            "recovering": item.recovering,
+            "for_good": item.watch.for_good,
+        }
         connection.send(frames.Command(connection.name_out(path), "down", data))
     else:
         raise HoldfastError(f"{type(item).__name__} cannot be sent to {path}")
+
+
+def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
+    """Do what the other side wants of an actor on this one: stop and kill, and all about links and monitors.
+
+    Raises:
+        BadFrame: it is no such command.
+    """
+    data = frame.data
+    try:
+        match frame.verb:
+            case "stop":
+                cell.request_stop(unpack_exit(data["reason"]))
+            case "kill":
+                cell.kill()
+            case "exit":
+                source, reason = node.cell_at(data["source"]), unpack_exit(data["reason"])
+                if links.sever(cell, source):  # Else it was unlinked while this was on its way.
+                    cell.push(links.Exit(source, reason))
+            case "down":
+                source, reason = node.cell_at(data["source"]), unpack_exit(data["reason"])
+                recovering, for_good = bool(data["recovering"]), bool(data["for_good"])
+                links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good)
+            case "monitor":
+                links.monitor(node.cell_at(data["watcher"]), cell, for_good=bool(data["for_good"]))
+            case "demonitor":
+                links.demonitor(node.cell_at(data["watcher"]), cell, for_good=bool(data["for_good"]))
+            case "link":
+                links.link(node.cell_at(data["peer"]), cell)
+            case "unlink":
+                links.sever(node.cell_at(data["peer"]), cell)
+            case verb:
+                raise BadFrame(f"unknown command {verb!r}")
+    except (KeyError, TypeError, AttributeError) as error:
+        raise BadFrame(f"command {frame.verb!r} with {data!r}") from error

@@ -103,6 +103,9 @@ class ProcessHost:
 
     takes_parcels = True
 
+    def recovers(self, reason: Any) -> bool:
+        return False
+
     def __init__(self, workers: Workers, limits: Limits | None, options: dict[str, Any] | None = None) -> None:
         self._workers = workers
         self._limits = limits
@@ -176,6 +179,11 @@ class ProcessHost:
         if worker is None or outlet is None or outlet.worker is None:
             self._stop_wanted = reason
             return
+        self.send_stop(worker, cell, reason)
+
+    @staticmethod
+    def send_stop(worker: Worker, cell: Cell, reason: ExitReason) -> None:
+        """Tell the process that its actor shall end."""
         connection = worker.connection
         connection.send(frames.Command(connection.name_out(cell.path), "stop", {"reason": pack_exit(reason)}))
 
@@ -266,7 +274,7 @@ def _publish(node: Node, worker: Worker, frame: frames.Publish) -> None:
     sender = None if frame.sender is None else node.cell_at(worker.connection.name_in(frame.sender))
     for cell in node.topics.subscribers(frame.topic):
         try:
-            message = worker.message_in(cell, name, frame.body)
+            message = node.codec.message_in(cell, name, frame.body)
             cell.admit(cell, message if sender is None else Envelope(message, sender))
         except Exception as error:  # One subscriber's trouble is not another's.
             node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error))

@@ -6,6 +6,7 @@ import asyncio
 import contextlib
 import os
 import signal
+import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -50,6 +51,7 @@ class Worker(Peer):
         self._lost = False
         self._buried = False
         self._grave: asyncio.Future[None] = self.node.loop.create_future()
+        self.noticed_at = 0.0  # when the first sign of its end came, on the monotonic clock
         self._oom_before = oom_kills()
         self._watch: Watch | None = None
         self._outputs: list[OutputReader] = []
@@ -131,6 +133,7 @@ class Worker(Peer):
 
     def on_ended(self, frame: frames.Ended) -> None:
         """The actor's life has ended by itself; its process has nothing more to do."""
+        self._noticed()
         self._told = unpack_exit(frame.reason)
         self.forked.kill(signal.SIGKILL)
 
@@ -145,8 +148,13 @@ class Worker(Peer):
 
     # -- its end ----------------------------------------------------------------------------------------------------
 
+    def _noticed(self) -> None:
+        if not self.noticed_at:
+            self.noticed_at = time.monotonic()
+
     def _on_lost(self, error: Exception | None) -> None:
         self._lost = True
+        self._noticed()
         if isinstance(error, HoldfastError):
             self.kill(Exited(70))  # It spoke nonsense: EX_SOFTWARE.
         if self._status is not None:
@@ -158,6 +166,7 @@ class Worker(Peer):
     def on_exit(self, status: int) -> None:
         """The fork server has reaped it."""
         self._status = status
+        self._noticed()
         if self._lost:
             self._bury()
         else:

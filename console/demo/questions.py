@@ -62,6 +62,11 @@ class Questions:
         """Count an answer."""
         self.answers[serial] = self.answers.get(serial, 0) + 1
 
+    def note_failure(self, serial: int, error: HoldfastError) -> None:
+        """Keep the first failures: one is enough to see what went wrong."""
+        if len(self.failures) < FAILURES_KEPT:
+            self.failures.append(f"question {serial}: {type(error).__name__}: {error}")
+
     async def drain(self) -> None:
         """Wait until no question is open."""
         while self._waiting:
@@ -81,8 +86,7 @@ class Questions:
         try:
             received = await answer
         except HoldfastError as error:
-            if len(self.failures) < FAILURES_KEPT:
-                self.failures.append(f"question {serial}: {type(error).__name__}: {error}")
+            self.note_failure(serial, error)
             return
         # An answer counts for the question it names: one that went to the wrong asker shows as one lost, one doubled.
         self.note_answer(received.serial)

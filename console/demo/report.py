@@ -161,7 +161,9 @@ def _map_lines(report: Report) -> list[str]:
 
 def _ask_lines(run: Outcome) -> list[str]:
     asks = run.asks
-    lines = [f"asks     {asks.sent:,} sent, {asks.answered:,} answered, {asks.lost} lost, {asks.doubled} doubled"]
+    lines = [f"asks     {asks.sent:,} sent, {asks.answered:,} answered, {asks.lost:,} lost, {asks.doubled:,} doubled"]
+    if asks.lost > asks.sent - asks.answered:
+        lines.append("         lost also counts what was answered and then forgotten with the mapper's state")
     if run.failures:
         lines.append(f"         first failure: {run.failures[0]}")
     return lines

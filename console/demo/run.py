@@ -13,6 +13,8 @@ from ... import (
     ActorRef,
     ActorSystem,
     ChildSpec,
+    HoldfastError,
+    NoSuchActor,
     Recovered,
     bounded,
     checkpoint_only,
@@ -119,7 +121,10 @@ class Run:
         began = monotonic()
 
         def find_pid() -> int | None:
-            return system.pid_of(mapper)
+            try:
+                return system.pid_of(mapper)
+            except NoSuchActor:
+                return None
 
         def learn() -> None:
             killer.saw(questions.last_scan)
@@ -159,6 +164,9 @@ class Run:
             path = await planner.ask(FindPath(serial, found.start, found.farthest, low, high), timeout=PATIENCE)
         except NoWay:
             path = []
+        except HoldfastError as error:
+            questions.note_failure(serial, error)
+            return []
         questions.note_answer(serial)
         return path
 

@@ -1,0 +1,146 @@
+"""What a home and a recorded life say to each other, in one process or across the border of one.
+
+The home (`switch.py`) numbers and journals inputs and feeds them; the life (`life.py`) runs one turn per input and
+reports each turn's outputs and outcome. Payloads stay encoded in between.
+"""
+
+from __future__ import annotations
+
+import zlib
+
+import msgspec
+
+# Kinds of inputs: every call into user code that may change state.
+MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
+# How a turn can end.
+OK, FAILED, DROPPED, STASHED = "ok", "failed", "dropped", "stashed"
+# How an ask can be answered; LATER keeps it open, NOTHING means that nobody asked.
+REPLY, REFUSAL, ERROR, CRASH, LATER, NOTHING = "reply", "refusal", "error", "crash", "later", ""
+
+
+class Out(msgspec.Struct, array_like=True):
+    """One output of a turn; `k` counts them in program order from 1."""
+
+    k: int
+    verb: str
+    to: str
+    name: str = ""
+    body: bytes = b""
+    seconds: float = 0.0
+    interval: float = 0.0
+
+    def digest(self) -> int:
+        """A checksum by which a replayed output is compared with the one released before."""
+        head = f"{self.verb}|{self.to}|{self.name}|{self.seconds}|{self.interval}".encode()
+        return zlib.crc32(self.body, zlib.crc32(head))
+
+
+class Answer(msgspec.Struct, array_like=True):
+    """The outcome of an ask: a reply or an error, encoded."""
+
+    kind: str = NOTHING
+    name: str = ""
+    body: bytes = b""
+
+
+# -- home to life ----------------------------------------------------------------------------------------------------
+
+
+class Feed(msgspec.Struct, array_like=True, tag=1):
+    """An input. `turn` is the number it had before the crash, 0 if it never ended; `pipes` have their result already."""
+
+    id: int
+    turn: int
+    kind: str
+    name: str
+    body: bytes
+    time: float
+    sender: str | None = None
+    is_ask: bool = False
+    chain: tuple[tuple[str, int], ...] = ()
+    pipes: tuple[int, ...] = ()
+
+
+class Outcome(msgspec.Struct, array_like=True, tag=2):
+    """The outcome of the ask that was output (turn, k)."""
+
+    turn: int
+    k: int
+    answer: Answer
+
+
+class Go(msgspec.Struct, array_like=True, tag=3):
+    """Replay is over: call `on_recovered` (if anything was recovered), report, then go on after turn `turn`."""
+
+    recovered: bool
+    turn: int
+
+
+class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
+    """Take a snapshot after the turn in hand."""
+
+
+class Restore(msgspec.Struct, array_like=True, tag=5):
+    """A piece of the state to begin with; the launch comes behind the last one."""
+
+    data: bytes
+
+
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore
+
+
+# -- life to home ----------------------------------------------------------------------------------------------------
+
+
+class Released(msgspec.Struct, array_like=True, tag=11):
+    """Outputs that leave before their turn ends: an ask, a send or a flush wants them out."""
+
+    turn: int
+    id: int
+    outs: list[Out]
+
+
+class TurnEnd(msgspec.Struct, array_like=True, tag=12):
+    """A turn has ended; `outs` are those not released yet."""
+
+    turn: int
+    id: int
+    status: str
+    outs: list[Out]
+    answer: Answer
+
+
+class Live(msgspec.Struct, array_like=True, tag=13):
+    """`Go` was reached: the actor takes new inputs. `restore_seconds` is what putting the state back took."""
+
+    restore_seconds: float
+
+
+class Snapshot(msgspec.Struct, array_like=True, tag=14):
+    """A piece of the state after `turn`; `is_last` completes it."""
+
+    turn: int
+    data: bytes
+    is_last: bool
+    stash: list[int]
+    pause: float
+
+
+class PipeDone(msgspec.Struct, array_like=True, tag=15):
+    """Background work that was output (turn, k) has its result: a message to the actor itself, or an error."""
+
+    turn: int
+    k: int
+    name: str
+    body: bytes
+
+
+ToHome = Released | TurnEnd | Live | Snapshot | PipeDone
+
+PIECE = 4 * 1024 * 1024
+"""Bytes of state per record, so that a large state does not hold up everything else."""
+
+
+def pieces(data: bytes) -> list[bytes]:
+    """`data` in pieces, at least one."""
+    return [data[at : at + PIECE] for at in range(0, len(data), PIECE)] or [b""]

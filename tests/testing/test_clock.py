@@ -1,0 +1,105 @@
+"""The virtual clock: timers take no real time, order is kept, and a loop that would hang says so."""
+
+import asyncio
+import threading
+import time
+
+import pytest
+
+from holdfast.testing.clock import NothingToWaitFor, VirtualClockLoop, virtual_loop_factory
+
+virtual = pytest.mark.asyncio(loop_factories=["virtual"])
+
+
+@virtual
+async def test_a_day_passes_at_once() -> None:
+    loop, began = asyncio.get_running_loop(), time.monotonic()
+    await asyncio.sleep(86_400 * 3)
+    assert loop.time() == 86_400 * 3
+    assert time.monotonic() - began < 5.0
+
+
+@virtual
+async def test_the_clock_stands_still_while_anything_runs() -> None:
+    loop = asyncio.get_running_loop()
+    before = loop.time()
+    for _ in range(1000):
+        await asyncio.sleep(0)
+    assert loop.time() == before
+
+
+@virtual
+async def test_timers_fire_in_order_each_at_its_own_time() -> None:
+    loop = asyncio.get_running_loop()
+    fired: list[tuple[str, float]] = []
+    for name, delay in (("c", 30.0), ("a", 0.1), ("b", 7.25)):
+        loop.call_later(delay, lambda name=name: fired.append((name, loop.time())))
+    await asyncio.sleep(60)
+    assert fired == [("a", 0.1), ("b", 7.25), ("c", 30.0)]
+
+
+@virtual
+async def test_a_timeout_strikes_at_its_virtual_time() -> None:
+    with pytest.raises(TimeoutError):
+        async with asyncio.timeout(600):
+            await asyncio.Event().wait()
+    assert asyncio.get_running_loop().time() == 600
+
+
+@virtual
+async def test_a_thread_takes_no_virtual_time_and_its_result_comes_before_any_timer() -> None:
+    loop, gate = asyncio.get_running_loop(), threading.Event()
+    fired: list[float] = []
+    loop.call_later(1.0, lambda: fired.append(loop.time()))
+    loop.call_soon(gate.set)
+    assert await loop.run_in_executor(None, gate.wait, 10.0)
+    assert (loop.time(), fired) == (0.0, [])
+
+
+@virtual
+async def test_a_socket_is_waited_for_when_no_timer_is_set() -> None:
+    async def echo(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        writer.write(await reader.readline())
+        writer.close()
+        await writer.wait_closed()
+
+    async with await asyncio.start_server(echo, "127.0.0.1", 0) as server:
+        reader, writer = await asyncio.open_connection(*server.sockets[0].getsockname())
+        writer.write(b"hello\n")
+        assert await reader.readline() == b"hello\n"
+        writer.close()
+        await writer.wait_closed()
+
+
+def test_a_loop_that_would_hang_says_so() -> None:
+    with (
+        asyncio.Runner(loop_factory=virtual_loop_factory) as runner,
+        pytest.raises(NothingToWaitFor, match="at virtual time 2 s"),
+    ):
+        runner.run(wait_for_nothing())
+
+
+async def wait_for_nothing() -> None:
+    await asyncio.sleep(2)
+    await asyncio.Event().wait()
+
+
+def test_a_thread_that_the_loop_does_not_know_may_still_wake_it() -> None:
+    async def main() -> str:
+        loop = asyncio.get_running_loop()
+        woken: asyncio.Future[str] = loop.create_future()
+        thread = threading.Thread(target=lambda: loop.call_soon_threadsafe(woken.set_result, "woken"))
+        thread.start()
+        try:
+            return await woken
+        finally:
+            thread.join()
+
+    with asyncio.Runner(loop_factory=virtual_loop_factory) as runner:
+        assert runner.run(main()) == "woken"
+
+
+def test_the_clock_begins_where_it_is_told_to() -> None:
+    with asyncio.Runner(loop_factory=lambda: VirtualClockLoop(start=100.0)) as runner:
+        runner.run(asyncio.sleep(0.5))
+        assert runner.get_loop().time() == 100.5
