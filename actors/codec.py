@@ -86,7 +86,12 @@ class Codec:
             decoder = self._decoders[kind] = msgspec.msgpack.Decoder(
                 kind, dec_hook=check_special, ext_hook=self._decode_special
             )
-        return decoder.decode(body)
+        try:
+            return decoder.decode(body)
+        except msgspec.MsgspecError:
+            raise
+        except Exception as error:  # Text that is no UTF-8, nesting without end, an array of no known type.
+            raise msgspec.DecodeError(f"{type_name(type(error))}: {error}") from error
 
     def message_in(self, cell: Cell, name: str, body: Any) -> Any:
         """A message that came encoded, for a cell: decoded if its actor is here, else as it came.

@@ -16,6 +16,7 @@ from .links import Monitor
 from .mail import Ask, Chain, Envelope, Item, ReplyHandle
 from .message import Message
 from .timers import Timer
+from .topics import NOT_TAKEN
 
 if TYPE_CHECKING:
     from .actor import Actor, Start
@@ -95,7 +96,7 @@ class ActorContext:
         """Send and wait until it is accepted."""
         self._alive()
         while (room := cell.room()) is not None:
-            await room
+            await mailbox.wait_for(cell, room)
             self._alive()
         if type(message) not in cell.table:
             cell.require(message)
@@ -114,8 +115,8 @@ class ActorContext:
         if waits_for(self, cell, chain):
             future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
             return future
-        ask = Ask(message, self.cell, chain, timeout, node.loop.time() + timeout, future)
-        node.deadlines.add(ask, cell)
+        ask = Ask(message, self.cell, chain, timeout, node.loop.time() + timeout, future, cell)
+        node.deadlines.add(ask)
         try:
             cell.admit(cell, ask)
         except BaseException:
@@ -153,7 +154,7 @@ class ActorContext:
         if isinstance(item, Ask):
             cell: Cell = to._cell
             cell.require(item.message)
-            self.item = Stashed(item)
+            self.item = Stashed.of(item)
             cell.admit(cell, item)
         elif isinstance(item, Envelope):
             to._cell.admit(to._cell, Envelope(item.message, item.sender))
@@ -172,8 +173,13 @@ class ActorContext:
             self._alive()
             await uplink.publish(topic, message, self.cell)
             return
-        for cell in self.cell.node.topics.subscribers(topic):
-            await self.send(cell, message)
+        node = self.cell.node
+        for cell in node.topics.subscribers(topic):
+            try:
+                await self.send(cell, message)
+            except NOT_TAKEN as error:
+                self._alive()
+                node.not_taken(cell, message, error)
 
     async def flush(self) -> None:
         """Release what this turn has sent so far (a journaled actor otherwise releases at the end of the turn)."""
@@ -235,7 +241,7 @@ class ActorContext:
         if more.stash is None:
             more.stash = deque()
         more.stash.append(item)
-        self.item = Stashed(item)
+        self.item = Stashed.of(item)
 
     def unstash(self) -> None:
         """Put all stashed messages back, in order, in front of what is queued."""
@@ -332,13 +338,13 @@ class ActorContext:
             self.cell.push(Piped(None, error))
 
 
-class Stashed(Envelope):
+class Stashed(Envelope, eq=False):
     """The rest of a turn whose message was stashed or forwarded: whatever the handler returns is no reply."""
 
-    __slots__ = ()
-
-    def __init__(self, item: Any) -> None:
-        super().__init__(getattr(item, "message", item), getattr(item, "sender", cast("Any", None)))
+    @classmethod
+    def of(cls, item: Any) -> Stashed:
+        """In place of `item`."""
+        return cls(getattr(item, "message", item), getattr(item, "sender", None))
 
 
 class Piped(Item):

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 from .errors import SpecError
 
 if TYPE_CHECKING:
-    from .cell import Cell
     from .mail import Ask
 
 
@@ -20,7 +19,7 @@ class Deadlines:
         self._loop = loop
         self._queues: dict[float, _Queue] = {}
 
-    def add(self, ask: Ask, cell: Cell) -> None:
+    def add(self, ask: Ask) -> None:
         """See to it that the ask has an outcome at its deadline."""
         queue = self._queues.get(ask.timeout)
         if queue is None:
@@ -28,9 +27,9 @@ class Deadlines:
                 raise SpecError("ask", f"timeout must be a number of seconds > 0, not {ask.timeout!r}")
             queue = self._queues[ask.timeout] = _Queue(self._loop, self._queues, ask.timeout)
         asks = queue.asks
-        while asks and asks[0][0].future.done():
+        while asks and asks[0].future.done():
             asks.popleft()
-        asks.append((ask, cell))
+        asks.append(ask)
         if len(asks) > queue.limit:
             queue.tidy()
         if queue.timer is None:
@@ -51,21 +50,21 @@ class _Queue:
 
     def __init__(self, loop: asyncio.AbstractEventLoop, queues: dict[float, _Queue], timeout: float) -> None:
         self._loop, self._queues, self._timeout = loop, queues, timeout
-        self.asks: deque[tuple[Ask, Cell]] = deque()
+        self.asks: deque[Ask] = deque()
         self.limit = 1024
         self.timer: asyncio.TimerHandle | None = None
 
     def tidy(self) -> None:
         """Drop answered asks behind one that still waits, so that they do not stay to the deadline."""
-        self.asks = deque(pair for pair in self.asks if not pair[0].future.done())
+        self.asks = deque(ask for ask in self.asks if not ask.future.done())
         self.limit = max(1024, 2 * len(self.asks))
 
     def arm(self) -> None:
         """Wake at the deadline of the oldest ask that waits."""
-        while self.asks and self.asks[0][0].future.done():
+        while self.asks and self.asks[0].future.done():
             self.asks.popleft()
         if self.asks:
-            self.timer = self._loop.call_at(self.asks[0][0].deadline, self._expire)
+            self.timer = self._loop.call_at(self.asks[0].deadline, self._expire)
         else:  # Computed time-outs are nearly all different: a queue without asks goes.
             self.timer = None
             self._queues.pop(self._timeout, None)
@@ -73,8 +72,8 @@ class _Queue:
     def _expire(self) -> None:
         now = self._loop.time()
         asks = self.asks
-        while asks and asks[0][0].deadline <= now:
-            ask, cell = asks.popleft()
+        while asks and asks[0].deadline <= now:
+            ask = asks.popleft()
             if not ask.future.done():
-                ask.expire(cell)
+                ask.expire()
         self.arm()

@@ -29,6 +29,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+LONGEST_TEXT = 64 * 1024
+"""Characters of an error's text or traceback that are kept."""
+
 
 class HoldfastError(Exception):
     """Base of every error holdfast raises."""
@@ -250,14 +253,34 @@ def format_error(error: BaseException) -> str:
     """The traceback of `error` as text, without the frames of holdfast's own run loop at its top."""
     import traceback
 
-    return "".join(traceback.format_exception(error))
+    return portable("".join(traceback.format_exception(error)))
+
+
+def error_text(error: BaseException) -> str:
+    """What an exception says; a user's `__str__` may itself raise, the report must not."""
+    try:
+        return portable(str(error))
+    except Exception as broken:
+        return f"<its text cannot be shown: {type_name(type(broken))}>"
+
+
+def portable(text: str) -> str:
+    """Text that can cross any border: not longer than `LONGEST_TEXT`, and without halves of surrogate pairs.
+
+    >>> portable("half a pair: \\ud800")
+    'half a pair: ?'
+    """
+    if len(text) > LONGEST_TEXT:
+        half = LONGEST_TEXT // 2
+        text = f"{text[:half]}\n[{len(text) - 2 * half} characters are left out]\n{text[-half:]}"
+    return text if text.isascii() else text.encode("utf-8", "replace").decode()
 
 
 def remote_crash(error: BaseException) -> RemoteCrash:
     """`error` as the asker sees it; the traceback is formatted only if somebody looks."""
     if isinstance(error, RemoteCrash):
         return error
-    crash = RemoteCrash(type_name(type(error)), str(error))
+    crash = RemoteCrash(type_name(type(error)), error_text(error))
     crash.__cause__ = error
     return crash
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import msgspec
 
+from .errors import portable
 from .exits import ExitReason, pack_exit, unpack_exit
 
 
@@ -238,9 +239,9 @@ def event_data(event: Event) -> dict[str, Any]:
 def _field_out(value: Any) -> Any:
     if isinstance(value, ExitReason):
         return {"exit reason": pack_exit(value)}
-    if isinstance(value, (str, int, float, dict)) or value is None:
+    if isinstance(value, (int, float, dict)) or value is None:
         return value
-    return str(value)
+    return portable(str(value))
 
 
 def _field_in(value: Any) -> Any:

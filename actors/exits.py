@@ -9,7 +9,7 @@ import signal
 
 import msgspec
 
-from .errors import format_error, type_name
+from .errors import error_text, format_error, type_name
 
 
 class ExitReason(msgspec.Struct, frozen=True):
@@ -133,12 +133,8 @@ NOPROC = NoProc()
 def crash(error: BaseException) -> ExitReason:
     """The exit reason for an exception that left a handler or hook."""
     if isinstance(error, MemoryError):
-        return OutOfMemory(str(error))
-    try:
-        text = str(error)
-    except Exception as broken:  # A user's __str__ may itself raise; the report must not.
-        text = f"<its text cannot be shown: {type_name(type(broken))}>"
-    return Crash(type_name(type(error)), text, "", error)
+        return OutOfMemory(error_text(error))
+    return Crash(type_name(type(error)), error_text(error), "", error)
 
 
 class _Wire(msgspec.Struct, frozen=True):

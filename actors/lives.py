@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from . import exits, links, mailbox
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from .actor import Start
     from .loop import Suspended
 
+PATIENCE = 5.0
+"""Seconds an actor that nobody supervises may take to stop in good order before it is killed."""
 GRACE = 1.0
 """Seconds a killed turn may take to end after its cancellation, before its life is abandoned."""
 
@@ -97,10 +100,10 @@ def begin(
     build(cell, start, context_type)
     cell.state = RUNNING
     node = cell.node
-    for topic in start.kind._topics:
-        node.topics.subscribe(topic, cell)
     if node.watched:
         node.emit(ActorStarted(cell.path, cell.life))
+    for topic in start.kind._topics:
+        node.topics.subscribe(topic, cell)
     if start.kind.on_start is Actor.on_start:
         up(cell)
         return None
@@ -112,7 +115,7 @@ def begin(
     return started
 
 
-def build(cell: Cell, start: Start[Any], context_type: type[ActorContext]) -> None:
+def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorContext]) -> None:
     """Construct the actor with its `ctx`."""
     kind = start.kind
     ctx = context_type(cell)
@@ -290,6 +293,7 @@ def abandon(turn: Suspended) -> None:
     if more is None or more.turn is not turn:
         return
     more.turn = None
+    more.bindings.update(turn.rebinds or {})
     cut_off(cell, turn.item)
     cell.node.turns_held -= 1
     cell.node.emit(LifeAbandoned(cell.path, cell.life))
@@ -325,16 +329,17 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     if cell.spec is not None and cell.parent is not None:
         if more is not None:
             links.announce(cell, reason, recovering=cell.host.recovers(reason))
-            _tell_enders(more, reason)
+            tell_enders(more, reason)
         cell.parent.push(ChildExit(cell, cell.life, reason))
     else:
         retire(cell, reason)
         if more is not None:
             links.announce(cell, reason, recovering=False)
-            _tell_enders(more, reason)
+            tell_enders(more, reason)
 
 
-def _tell_enders(more: Any, reason: ExitReason) -> None:
+def tell_enders(more: Any, reason: ExitReason) -> None:
+    """Whoever waits for the end hears of it."""
     enders, more.enders = more.enders, []
     for future in enders:
         if not future.done():
@@ -413,6 +418,15 @@ class ChildExit(Item):
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         retire(self.child, "its supervisor has stopped")
+
+
+async def stop_in_time(cell: Cell, reason: ExitReason = SHUTDOWN) -> ExitReason:
+    """Stop an actor that has no spec to say how: ask, wait, kill."""
+    timer = cell.node.loop.call_later(PATIENCE, cell.kill)
+    try:
+        return await stop_and_wait(cell, reason)
+    finally:
+        timer.cancel()
 
 
 def stop_and_wait(cell: Cell, reason: ExitReason = SHUTDOWN) -> asyncio.Future[ExitReason]:

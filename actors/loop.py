@@ -28,6 +28,8 @@ SLICE = 0.0005
 """Seconds after which the loop lets the host program's own callbacks run."""
 MOST = 64
 """Messages one actor may handle before the next actor's turn."""
+STRIDE = 16
+"""Actors run between two looks at the clock, while they are quick."""
 RUNNERS = 8
 """Idle runner tasks kept for the next turns."""
 
@@ -43,8 +45,10 @@ class RunLoop:
         self.awake = False
         self.now = loop.time()
         self.most = MOST
+        self.stride = STRIDE
         self.turns_held = 0
         self.entered: Runner | None = None
+        self._struck: Runner | None = None  # entered too, but cancelled in the step that runs now: only that turn's
         self._idle: list[Runner] = []
         self._runners: set[Runner] = set()
         self._idlers: list[asyncio.Future[None]] = []
@@ -66,6 +70,7 @@ class RunLoop:
         self.now = self.loop.time()
         begin = clock()
         end = begin + SLICE
+        stride = left = self.stride
         while ready:
             cell = ready.popleft()
             context = cell.context
@@ -76,24 +81,38 @@ class RunLoop:
                     ready.append(cell)
                 else:
                     cell.scheduled = False
+            left -= 1
+            if left:
+                continue
+            left = stride
             now = clock()
             if now > end:
-                # Slow handlers get shorter slices, so that the host's own callbacks never wait for many of them.
-                if self.most > 1 and now - begin > SLICE:
-                    self.most //= 2
+                if now - begin > SLICE:
+                    self._shorten()
                 break
             begin = now
         else:
+            if stride < STRIDE:
+                self.stride += 1
             if self.most < MOST:
                 self.most += 1
         if self.entered is not None:
             self._leave()
+        elif self._struck is not None:
+            self._leave_struck()
         if ready:
             self.loop.call_soon(self._drain)
         else:
             self.awake = False
             if self._idlers and not self.turns_held:
                 self._tell_idlers()
+
+    def _shorten(self) -> None:
+        """Handlers are slow: look at the clock more often, so that the host's own callbacks wait for few of them."""
+        if self.stride > 1:
+            self.stride = 1
+        elif self.most > 1:
+            self.most //= 2
 
     def settled(self) -> asyncio.Future[None]:
         """A future that ends when no actor of this node has anything to do (suspended turns included)."""
@@ -113,28 +132,39 @@ class RunLoop:
 
     def enter(self) -> None:
         """Step coroutines in a runner's name from here to the end of the slice."""
+        if self._struck is not None:
+            self._leave_struck()
         runner = self._idle.pop() if self._idle else Runner(self)
         while runner.task.cancelling():  # Cancelled while it was idle: that cancel is for none of our turns.
             runner = self._idle.pop() if self._idle else Runner(self)
         self.entered = runner
         _enter_task(self.loop, runner.task)
 
-    def _leave(self) -> Runner:
+    def _leave(self) -> None:
         """Give the runner back to the idle ones."""
         runner = self.entered
         assert runner is not None
         self.entered = None
         _leave_task(self.loop, runner.task)
-        if runner.task.cancelling():  # Somebody kept a handle on it and cancelled it: never use it again.
-            runner.retire()
-        else:
-            self._idle.append(runner)
-        return runner
+        self._idle.append(runner)
+
+    def strike(self, runner: Runner) -> None:
+        """A runner's task is cancelled: if it is entered, the turn in this step is meant, and none after it."""
+        if self.entered is runner:
+            self.entered, self._struck = None, runner
+
+    def _leave_struck(self) -> None:
+        """The turn that was cancelled in its only step has ended without a wait: nobody else gets its cancel."""
+        runner = self._struck
+        assert runner is not None
+        self._struck = None
+        _leave_task(self.loop, runner.task)
 
     def is_stepping(self) -> bool:
         """Whether the code that asks runs in a step of the run loop, not in a task of its own."""
         task = asyncio.current_task(self.loop)
-        return task is None or (self.entered is not None and task is self.entered.task)
+        runner = self.entered or self._struck
+        return task is None or (runner is not None and task is runner.task)
 
     def step(self, cell: Cell, item: Any, turn: Any) -> bool:
         """Run a coroutine's first step inside the cell's context. False: it is suspended, its runner has it now.
@@ -152,9 +182,9 @@ class RunLoop:
 
     def hold(self, cell: Cell, item: Any, turn: Any, waiting: Any) -> None:
         """A coroutine has suspended in its first step: its runner stays with it."""
-        runner = self.entered
+        runner = self.entered or self._struck
         assert runner is not None
-        self.entered = None
+        self.entered = self._struck = None
         _leave_task(self.loop, runner.task)
         self.turns_held += 1
         suspended = Suspended(cell, item, turn, waiting, runner)
@@ -169,6 +199,8 @@ class RunLoop:
             return  # The life was abandoned meanwhile, and this turn is not counted any more.
         self.turns_held -= 1
         more.turn = None
+        if turn.rebinds is not None:
+            more.bindings.update(turn.rebinds)
         if turn.then is not None and not (turn.killed and cell.children):
             turn.then()
         elif turn.killed or error is not None:
@@ -275,11 +307,12 @@ class TurnEnded(Item):
 class Suspended:
     """A turn that waits for something, and the runner that waits with it."""
 
-    __slots__ = ("cell", "coroutine", "item", "killed", "runner", "then", "waiting")
+    __slots__ = ("cell", "coroutine", "item", "killed", "rebinds", "runner", "then", "waiting")
 
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
         self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
         self.killed = False
+        self.rebinds: dict[str, Cell] | None = None  # bindings that change when this turn is over
         self.then: Callable[[], None] | None = None  # set when the coroutine is no turn but a winding down
 
     def kill(self) -> None:
@@ -288,17 +321,30 @@ class Suspended:
         self.runner.task.cancel()
 
 
+class RunnerTask(asyncio.Task[None]):
+    """A runner's task. It tells the run loop of a cancel, which may come from the very step that runs in its name."""
+
+    def __init__(self, runner: Runner, loop: RunLoop) -> None:
+        self._runner, self._run_loop = runner, loop
+        work = runner._run()
+        work.send(None)  # A task that is cancelled before its coroutine has begun would never run it.
+        super().__init__(work, loop=loop.loop, name="holdfast runner")
+
+    def cancel(self, msg: Any = None) -> bool:
+        self._run_loop.strike(self._runner)
+        return super().cancel(msg)
+
+
 class Runner:
     """A task in whose name turns are stepped; when a turn suspends, it becomes that turn's task."""
 
-    __slots__ = ("_call", "_cancelled", "_loop", "_turn", "task")
+    __slots__ = ("_call", "_loop", "_turn", "task")
 
     def __init__(self, loop: RunLoop) -> None:
         self._loop = loop
         self._turn: Suspended | None = None
-        self._cancelled: asyncio.CancelledError | None = None
         self._call: asyncio.Future[None] = loop.loop.create_future()
-        self.task = loop.loop.create_task(self._run(), name="holdfast runner")
+        self.task = RunnerTask(self, loop)
         loop.joined(self)
         self.task.add_done_callback(self._done)
 
@@ -314,24 +360,22 @@ class Runner:
 
     def _done(self, _: object) -> None:
         self._loop.left(self)
-        if self._turn is not None:
-            # A task that is cancelled before its first step never runs: another one delivers the cancel to the turn.
-            successor = Runner(self._loop)
-            self._turn.runner = successor
-            successor._cancelled = asyncio.CancelledError()
-            successor.take(self._turn)
 
     async def _run(self) -> None:
+        begun = False
         while True:
-            cancelled, self._cancelled = self._cancelled, None
-            if not self._call.done():
-                try:
+            cancelled: asyncio.CancelledError | None = None
+            try:
+                if not begun:
+                    begun = True
+                    await _task_begins()
+                if not self._call.done():
                     await self._call
-                except asyncio.CancelledError as error:
-                    # A cancel can come between the turn's first wait and our taking it over: it belongs to the turn.
-                    if self._turn is None:
-                        raise
-                    cancelled = error
+            except asyncio.CancelledError as error:
+                # A cancel can come between the turn's first wait and our taking it over: it belongs to the turn.
+                if self._turn is None:
+                    raise
+                cancelled = error
             turn, self._turn = self._turn, None
             if turn is None:
                 return
@@ -349,6 +393,12 @@ class Runner:
 
 
 @types.coroutine
+def _task_begins() -> Generator[None, None, None]:
+    """Wait for the first step of the task to be."""
+    yield
+
+
+@types.coroutine
 def _drive(
     context: Context, turn: Any, waiting: Any, cancelled: asyncio.CancelledError | None
 ) -> Generator[Any, Any, None]:
@@ -359,7 +409,7 @@ def _drive(
                 error, cancelled = cancelled, None
                 if waiting is None:
                     raise error
-                if not waiting.cancel():  # As `Task.cancel` does: what is waited for is cancelled first.
+                if not waiting.cancel(*error.args):  # As `Task.cancel` does: what is waited for is cancelled first.
                     waiting._asyncio_future_blocking = False  # It is done, and we do not wait for it after all.
                     raise error
             value = yield waiting

@@ -11,6 +11,8 @@ import types
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
+import msgspec
+
 from .errors import AskTimeout, HoldfastError, UnknownMessage, type_name
 from .message import Message, Refusal, by_name
 
@@ -94,14 +96,13 @@ def unhandled(actor: Any, message: Any) -> object:
     return None
 
 
-class Envelope(Item):
-    """A message whose sender is known."""
+class Envelope(Item, msgspec.Struct, eq=False):
+    """A message whose sender is known. (A struct, as an ask is: it is made with every send, and made at once.)"""
 
-    __slots__ = ("message", "sender")
     of_life = False
 
-    def __init__(self, message: Message[Any], sender: Cell) -> None:
-        self.message, self.sender = message, sender
+    message: Any
+    sender: Any  # the sending actor's Cell
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -115,31 +116,26 @@ class Envelope(Item):
 Coroutine_ = types.CoroutineType
 
 
-class Ask(Item):
+class Ask(Item, msgspec.Struct, eq=False):
     """A message that somebody waits for: exactly one outcome reaches `future`."""
 
-    __slots__ = ("chain", "deadline", "future", "message", "sender", "started", "timeout")
     of_life = False
 
-    def __init__(
-        self,
-        message: Message[Any],
-        sender: Cell | None,
-        chain: Chain,
-        timeout: float,
-        deadline: float,
-        future: asyncio.Future[Any],
-    ) -> None:
-        self.message, self.sender, self.chain = message, sender, chain
-        self.timeout, self.deadline, self.future = timeout, deadline, future
-        self.started = False  # whether a turn may have begun; whoever hands it to another process sets it
+    message: Any
+    sender: Any  # the asking actor's Cell; None from outside
+    chain: Chain
+    timeout: float
+    deadline: float  # on the loop's clock
+    future: Any  # asyncio.Future; what else there may be has `done()` too
+    to: Any = None  # the Cell that is asked
+    started: bool = False  # whether a turn may have begun; whoever hands it to another process sets it
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         ctx: ActorContext = actor.ctx
         cell = ctx.cell
         if item.deadline <= cell.node.now:  # Nobody waits any more: not run (unless the wait was only cancelled).
-            item.expire(cell)
+            item.expire()
             return None
         item.started = True
         message = item.message
@@ -175,10 +171,10 @@ class Ask(Item):
         if not self.future.done():
             self.future.set_exception(error)
 
-    def expire(self, cell: Cell) -> None:
+    def expire(self) -> None:
         """The deadline has passed; a turn that has not begun will not begin."""
         self.deadline = 0.0
-        self.fail(AskTimeout(cell.path, self.timeout, None if self.started else False))
+        self.fail(AskTimeout(self.to.path, self.timeout, None if self.started else False))
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         self.fail(cell.stopped_error(reason))

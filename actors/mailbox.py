@@ -126,12 +126,18 @@ class Bound:
             ask = self.waiting.popleft()
             if not ask.is_done:  # Expired or given up while it waited: never admitted.
                 self.put(cell, ask)
-        # One wakes for each free place; it tries again and may find the place taken, then it waits once more.
+        self.wake_sender()
+
+    def wake_sender(self) -> None:
+        """One wakes for each free place; it tries again and may find the place taken, then it waits once more."""
         while self.senders and self.count < self.capacity:
             sender = self.senders.popleft()
             if not sender.done():
                 sender.set_result(None)
                 break
+
+    def moved(self, cell: Cell) -> None:
+        """The actor, in another process, has begun or ended turns."""
 
     def room(self, cell: Cell) -> asyncio.Future[None] | None:
         """For `send`: None if there is room (or the policy never waits)."""
@@ -173,6 +179,16 @@ class Bound:
             else:
                 kept.append(item)
         queue.extendleft(reversed(kept))
+
+
+async def wait_for(cell: Cell, room: asyncio.Future[None]) -> None:
+    """Wait until it is worth trying again to send."""
+    try:
+        await room
+    except asyncio.CancelledError:
+        if room.done() and not room.cancelled() and cell.more is not None and cell.more.bound is not None:
+            cell.more.bound.wake_sender()  # The place that was meant for us is the next one's.
+        raise
 
 
 def counts(item: Any) -> bool:

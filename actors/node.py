@@ -14,7 +14,7 @@ from . import lives
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
-from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
+from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SendError, SpecError, WrongActor, type_name
 from .events import DeadLetter, Event, EventHub
 from .exits import ExitReason
 from .lives import LOCAL
@@ -70,6 +70,11 @@ class Node(RunLoop):
         self.dead_letters += 1
         if self.watched:
             self.events.emit(DeadLetter(cell.path, message, why))
+
+    def not_taken(self, cell: Cell, message: Message[Any], error: SendError) -> None:
+        """A subscriber could not take what was published; one that has ended meanwhile is no subscriber any more."""
+        if not isinstance(error, ActorStopped):
+            self.dead_letter(cell, message, str(error))
 
     def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
         """A tell was answered with a Refusal: there is nobody to hand it to."""
@@ -132,7 +137,7 @@ class Node(RunLoop):
             lives.retire(cell, "its parent has stopped")
             return cell.extra().reason
         stop = getattr(cell.spec, "stop", None)
-        reason: ExitReason = await (stop(cell) if stop is not None else lives.stop_and_wait(cell))
+        reason: ExitReason = await (stop(cell) if stop is not None else lives.stop_in_time(cell))
         lives.retire(cell, "its parent has stopped")
         return reason
 
@@ -212,7 +217,12 @@ class Node(RunLoop):
         if kind is not None and port not in kind._bindings:
             known = ", ".join(sorted(kind._bindings)) or "none"
             raise SpecError(cell.path, f"{type_name(kind)} has no binding {port!r} (it has: {known})")
-        cell.extra().bindings[port] = target
+        more = cell.extra()
+        if more.turn is None:
+            more.bindings[port] = target
+        else:  # One turn sees one target, also if it waits meanwhile.
+            more.turn.rebinds = {**(more.turn.rebinds or {}), port: target}
+        cell.host.told(cell, "bind", {"port": port, "target": target.path})
 
 
 def cell_kind(cell: Cell) -> type[Actor] | None:

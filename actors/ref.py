@@ -6,6 +6,7 @@ import asyncio
 import contextvars
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from . import mailbox
 from .mail import Ask
 from .message import Message
 
@@ -68,7 +69,7 @@ class ActorRef(Generic[A_co]):
             await sender.send(cell, message)
             return
         while (room := cell.room()) is not None:
-            await room
+            await mailbox.wait_for(cell, room)
         accepted = cell.host.offer(cell, message)
         if accepted is not None:
             await accepted
@@ -95,8 +96,8 @@ class ActorRef(Generic[A_co]):
             cell.require(message)
         node = cell.node
         future: asyncio.Future[R] = node.loop.create_future()
-        ask = Ask(message, None, (), timeout, node.loop.time() + timeout, future)
-        node.deadlines.add(ask, cell)
+        ask = Ask(message, None, (), timeout, node.loop.time() + timeout, future, cell)
+        node.deadlines.add(ask)
         try:
             cell.admit(cell, ask)
         except BaseException:

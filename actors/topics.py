@@ -4,8 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from .errors import ActorStopped, MailboxFull, UnknownMessage
+
 if TYPE_CHECKING:
     from .cell import Cell
+
+NOT_TAKEN = (ActorStopped, MailboxFull, UnknownMessage)
+"""Why one subscriber may not take what is published; the others get it all the same."""
 
 
 class Topics:

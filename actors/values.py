@@ -27,16 +27,18 @@ from fractions import Fraction
 from functools import partial
 from importlib import import_module
 from itertools import chain
+from operator import index
 from pathlib import PosixPath, PurePosixPath, PureWindowsPath
 from random import Random
-from typing import Any, Final
+from typing import Any, Final, TypeAlias, cast
 from uuid import UUID, SafeUUID
 from zoneinfo import ZoneInfo
 
+import msgpack
 import msgspec
-from msgpack import ExtType, Packer, unpackb
+from msgpack import ExtType
 
-from .errors import HoldfastError
+from .errors import HoldfastError, type_name
 
 __all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest"]
 
@@ -98,7 +100,8 @@ def encode_value(value: object, *, where: str = "value") -> bytes:
 def state_digest(value: object) -> bytes:
     """Digest a value: 16 bytes (blake2b), the same in every process for values of equal types and contents.
 
-    The order of a dict counts; that of a set does not, nor whether two equal parts are one object.
+    The order of a dict counts; that of a set does not, nor whether two equal parts are one object. Only numpy's
+    longdouble is not covered: some of its bytes have no meaning.
 
     Raises:
         UnsavableValue: as `encode_value`.
@@ -162,7 +165,7 @@ def _pairs(parts: Sequence[Any]) -> dict[Any, Any]:
     return dict(zip(parts[::2], parts[1::2], strict=True))
 
 
-def _make_counter(*parts: Any) -> Counter[Any]:
+def _make_counter(parts: list[Any]) -> Counter[Any]:
     counter = Counter[Any]()
     dict.update(counter, _pairs(parts))  # Counter's own update would add.
     return counter
@@ -174,7 +177,8 @@ def _zone_parts(zone: ZoneInfo) -> tuple[str]:
     return (zone.key,)
 
 
-def _make_random(version: int, internal: tuple[int, ...], gauss: float | None) -> Random:
+def _make_random(parts: list[Any]) -> Random:
+    version, internal, gauss = parts
     if version != 3 or not isinstance(gauss, float | None):
         raise DamagedValue("it has a random.Random of another version")
     made = Random(0)
@@ -182,35 +186,38 @@ def _make_random(version: int, internal: tuple[int, ...], gauss: float | None) -
     return made
 
 
+_Make: TypeAlias = Callable[[list[Any]], Any]
 # Code in the data; type; its parts, which may be anything that can be saved; how the parts make it again.
-_TYPES: Final[tuple[tuple[int, type, Callable[[Any], Iterable[Any]], Callable[..., Any]], ...]] = (
-    (1, tuple, iter, lambda *parts: parts),
-    (2, set, iter, lambda *parts: {*parts}),
-    (3, frozenset, iter, lambda *parts: frozenset(parts)),
-    (4, dict, _flat, lambda *parts: _pairs(parts)),  # marked only where `walked` meets a key that is no scalar
-    (5, OrderedDict, _flat, lambda *parts: OrderedDict(_pairs(parts))),
+_TYPES: Final[tuple[tuple[int, Any, Callable[[Any], Iterable[Any]], _Make], ...]] = (
+    (1, tuple, iter, tuple),
+    (2, set, iter, set),
+    (3, frozenset, iter, frozenset),
+    (4, dict, _flat, _pairs),  # only with keys that are no scalars
+    (5, OrderedDict, _flat, lambda parts: OrderedDict(_pairs(parts))),
     (6, Counter, _flat, _make_counter),
-    (7, deque, lambda x: (x.maxlen, *x), lambda limit, *parts: deque(parts, limit)),
-    (8, bytearray, lambda x: (_Blob(x),), lambda view: bytearray(memoryview(view))),  # of an int it would be zeros
-    (9, complex, lambda x: (x.real, x.imag), complex),
-    (10, range, lambda x: (x.start, x.stop, x.step), range),
-    (11, Decimal, lambda x: (str(x),), Decimal),
-    (12, Fraction, lambda x: (x.numerator, x.denominator), Fraction),
-    (13, UUID, lambda x: (x.bytes, x.is_safe.value), lambda raw, safe: UUID(bytes=raw, is_safe=SafeUUID(safe))),
-    (14, date, lambda x: (x.year, x.month, x.day), date),
+    (7, deque, lambda x: (x.maxlen, *x), lambda parts: deque(parts[1:], parts[0])),
+    (8, bytearray, lambda x: (_Blob(x),), lambda parts: bytearray(memoryview(*parts))),  # an int would be a length
+    (9, complex, lambda x: (x.real, x.imag), lambda parts: complex(*parts)),
+    (10, range, lambda x: (x.start, x.stop, x.step), lambda parts: range(*parts)),
+    (11, Decimal, lambda x: (str(x),), lambda parts: Decimal(*parts)),
+    (12, Fraction, lambda x: (x.numerator, x.denominator), lambda parts: Fraction(*map(index, parts))),
+    (13, UUID, lambda x: (x.bytes, x.is_safe.value), lambda parts: UUID(bytes=parts[0], is_safe=SafeUUID(parts[1]))),
+    (14, date, lambda x: (x.year, x.month, x.day), lambda parts: date(*parts)),
     (15, time, lambda x: (x.fold, x.hour, x.minute, x.second, x.microsecond, x.tzinfo),
-     lambda fold, *parts: time(*parts, fold=fold)),
+     lambda parts: time(*parts[1:], fold=parts[0])),
     (16, datetime, lambda x: (x.fold, x.year, x.month, x.day, x.hour, x.minute, x.second, x.microsecond, x.tzinfo),
-     lambda fold, *parts: datetime(*parts, fold=fold)),
-    (17, timedelta, lambda x: (x.days, x.seconds, x.microseconds), timedelta),
-    (18, timezone, lambda x: x.__getinitargs__(), timezone),
-    (19, ZoneInfo, _zone_parts, ZoneInfo),
-    (20, PosixPath, lambda x: (str(x),), PosixPath),
-    (21, PurePosixPath, lambda x: (str(x),), PurePosixPath),
-    (22, PureWindowsPath, lambda x: (str(x),), PureWindowsPath),
-    (23, Random, Random.getstate, _make_random),
+     lambda parts: datetime(*parts[1:], fold=parts[0])),
+    (17, timedelta, lambda x: (x.days, x.seconds, x.microseconds), lambda parts: timedelta(*parts)),
+    (18, timezone, lambda x: x.__getinitargs__(), lambda parts: timezone(*parts)),
+    (19, ZoneInfo, _zone_parts, lambda parts: ZoneInfo(*parts)),
+    (20, PosixPath, lambda x: (str(x),), lambda parts: PosixPath(*parts)),
+    (21, PurePosixPath, lambda x: (str(x),), lambda parts: PurePosixPath(*parts)),
+    (22, PureWindowsPath, lambda x: (str(x),), lambda parts: PureWindowsPath(*parts)),
+    (23, Random, lambda x: x.getstate(), _make_random),
 )  # fmt: skip
-_KNOWN: Final = {kind: (ExtType(code, b""), parts) for code, kind, parts, _ in _TYPES}
+_KNOWN: Final[dict[type, tuple[ExtType, Callable[[Any], Iterable[Any]]]]] = {
+    kind: (ExtType(code, b""), parts) for code, kind, parts, _ in _TYPES
+}
 _TUPLE: Final = _KNOWN[tuple][0]
 # The marks of what is not in the table.
 _SHARED, _AGAIN, _BUFFER, _DEFAULTDICT, _ENUM, _DATACLASS, _STRUCT, _NAMED = (ExtType(n, b"") for n in range(32, 40))
@@ -218,7 +225,7 @@ _ARRAY, _TEXT, _BITS, _SEED, _GENERATOR, _RANDOM_STATE = (ExtType(n, b"") for n 
 
 _SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes, _Blob})
 _are_scalars: Final = _SCALARS.issuperset
-_CHANGING: Final = frozenset({list, dict, set, OrderedDict, Counter, deque, bytearray, Random})
+_CHANGING: Final[frozenset[type]] = frozenset({list, dict, set, OrderedDict, Counter, deque, bytearray, Random})
 
 
 def _can_change(kind: type) -> bool:
@@ -235,8 +242,8 @@ def _pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
     try:
         encoder = _Encoder(canonical, shared=set())
         tree = encoder.lowered(value)
-        if encoder.met_again and not canonical:
-            encoder = _Encoder(canonical, shared=encoder.met_again)
+        while encoder.met_again and not canonical:
+            encoder = _Encoder(canonical, shared=encoder.shared | encoder.met_again)
             tree = encoder.lowered(value)
         packed = encoder.packed(tree, None)
     except UnsavableValue as refusal:
@@ -262,7 +269,7 @@ class _Encoder:
         self.blobs: list[Any] = []
         self.has_marks = False
 
-    def lowered(self, x: Any) -> Any:
+    def lowered(self, x: object) -> Any:
         kind, key = type(x), id(x)
         if kind in _SCALARS:
             return x
@@ -270,7 +277,7 @@ class _Encoder:
             return self.inside(kind, x)
         if key in self.walked:
             if self.walked[key] is None:
-                raise UnsavableValue("", f"a {_type_name(kind)} that contains itself")
+                raise UnsavableValue("", f"a {type_name(kind)} that contains itself")
             if key in self.numbers:
                 return [_AGAIN, self.numbers[key]]
             self.met_again.add(key)
@@ -300,7 +307,7 @@ class _Encoder:
         lowered: list[Any] = []
         try:
             for part in parts:
-                lowered.append(part if type(part) in _SCALARS else self.lowered(part))  # noqa: PERF401 - see below
+                lowered.append(part if type(part) in _SCALARS else self.lowered(part))  # noqa: PERF401 - its length is used below
         except UnsavableValue as refusal:  # On its way out each level adds its step to the path.
             refusal.where = _step(x, parts, len(lowered)) + refusal.where
             raise
@@ -319,17 +326,18 @@ class _Encoder:
             return [_DEFAULTDICT, _factory_name(x.default_factory), *_flat(x)]
         if kind not in self.classes:
             if kind.__module__.startswith("numpy") and (np := sys.modules.get("numpy")):
-                form = _numpy_form(np, x, in_order=not self.canonical)
+                form = _numpy_form(np, kind, x, in_order=not self.canonical)
                 if form is not None:
                     return form
             if (mark := _class_mark(kind)) is None:
-                raise UnsavableValue("", f"a value of type {_type_name(kind)}")
+                raise UnsavableValue("", f"a value of type {type_name(kind)}")
             self.classes[kind] = mark, _class_name(kind), _slots(kind)
         mark, name, slots = self.classes[kind]
         return [mark, name, *_class_parts(x, slots)]
 
     def packed(self, tree: object, unicode_errors: str | None) -> Any:
-        packer = Packer(default=self.default, autoreset=False, buf_size=1024, unicode_errors=unicode_errors)
+        make = cast("Callable[..., Any]", msgpack.Packer)
+        packer = make(default=self.default, autoreset=False, buf_size=1024, unicode_errors=unicode_errors)
         try:
             packer.pack(tree)
         except UnicodeEncodeError:  # A lone surrogate, as in file names that are not UTF-8: rare, so tried second.
@@ -366,17 +374,13 @@ def _step(x: Any, parts: Sequence[Any], index: int) -> str:
 # --- Classes of users: Enum, dataclass, Struct, NamedTuple ---
 
 
-def _type_name(kind: type) -> str:
-    return kind.__qualname__ if kind.__module__ == "builtins" else f"{kind.__module__}.{kind.__qualname__}"
-
-
 def _find(name: str) -> type:
     """Find the class "module:qualname". Nothing is called for it, except what importing the module does."""
     module, _, qualname = name.partition(":")
     try:
-        found: Any = sys.modules.get(module) or import_module(module)
+        found: object = sys.modules.get(module) or import_module(module)
         for part in qualname.split("."):
-            found = vars(found)[part]
+            found = cast(object, vars(found)[part])
     except (Exception, SystemExit) as error:
         raise DamagedValue(f"class {name} is not there ({type(error).__name__}: {error})") from error
     if not isinstance(found, type):
@@ -393,19 +397,19 @@ def _class_name(kind: type) -> str:
             return name
     except DamagedValue:
         pass
-    raise UnsavableValue("", f"a value of type {_type_name(kind)}, whose class is not found by that name,")
+    raise UnsavableValue("", f"a value of type {type_name(kind)}, whose class is not found by that name,")
 
 
-def _class_mark(kind: type) -> ExtType | None:
+def _class_mark(kind: Any) -> ExtType | None:
     """What instances can be made from again: their attributes, unless they are, say, a dict besides."""
     if issubclass(kind, enum.Enum):
         return _ENUM
     if issubclass(kind, msgspec.Struct):
         return _STRUCT
+    if hasattr(kind, "_fields") and issubclass(kind, tuple):
+        return _NAMED
     if dataclasses.is_dataclass(kind) and kind.__new__ is object.__new__:
         return _DATACLASS
-    if issubclass(kind, tuple) and hasattr(kind, "_fields"):
-        return _NAMED
     return None
 
 
@@ -417,15 +421,15 @@ def _slots(kind: type) -> dict[str, Any]:
 def _class_parts(x: Any, slots: dict[str, Any]) -> list[Any]:
     if isinstance(x, enum.Enum):
         return [x.name if x.name in type(x).__members__ else x.value]  # a value: flags together, without a name
-    parts = [*_flat(getattr(x, "__dict__", {}))]
-    if isinstance(x, tuple):
+    parts: list[Any] = [*_flat(getattr(x, "__dict__", {}))]
+    if issubclass(type(x), tuple):
         parts += chain.from_iterable(zip(x._fields, x, strict=True))
     for name, slot in slots.items():
         try:
             parts += name, slot.__get__(x)
         except AttributeError:  # never set, or deleted
             if isinstance(x, msgspec.Struct):
-                raise UnsavableValue("", f"a {_type_name(type(x))} without its field {name}") from None
+                raise UnsavableValue("", f"a {type_name(type(x))} without its field {name}") from None
     return parts
 
 
@@ -435,12 +439,12 @@ def _is_factory(kind: Any) -> bool:
     )
 
 
-def _factory_name(factory: Any) -> str | None:
+def _factory_name(factory: object) -> str | None:
     if factory is None:
         return None
     if not _is_factory(factory):
-        raise UnsavableValue(".default_factory", f"a value of type {_type_name(type(factory))}")
-    return _class_name(factory)
+        raise UnsavableValue(".default_factory", f"a value of type {type_name(type(factory))}")
+    return _class_name(cast(type, factory))
 
 
 # --- numpy, if the program has imported it ---
@@ -448,11 +452,9 @@ def _factory_name(factory: Any) -> str | None:
 _LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0, "SFC64": 0}
 # Of numbers, text, bytes, times. Other names mean objects, or (a time unit of 0 seconds) end the process.
 _DTYPE: Final = re.compile(r"[<>|=]([biufcSUV]\d{1,9}|[qQ]|[mM]8(\[([1-9]\d{0,8})?[a-zA-Z]+\])?)")
-_LARGEST_POOL: Final = 64  # A SeedSequence takes time with the square of its pool.
 
 
-def _numpy_form(np: Any, x: Any, *, in_order: bool) -> list[Any] | None:
-    kind = type(x)
+def _numpy_form(np: Any, kind: Any, x: Any, *, in_order: bool) -> list[Any] | None:
     if kind is np.str_ or kind is np.bytes_:  # as an array it would lose the NULs at its end
         return [_TEXT, str.__str__(x) if kind is np.str_ else bytes(x)]
     if kind is np.ndarray or (issubclass(kind, np.generic) and kind is x.dtype.type):
@@ -469,7 +471,7 @@ def _numpy_form(np: Any, x: Any, *, in_order: bool) -> list[Any] | None:
         return [_RANDOM_STATE, state]
     if kind.__name__ in _LAST_POSITION and kind is getattr(np.random, kind.__name__):
         return [_BITS, x.state, x.seed_seq]
-    if kind is np.random.SeedSequence and x.pool_size <= _LARGEST_POOL:
+    if kind is np.random.SeedSequence and _is_seed(x.entropy, x.spawn_key, x.pool_size):
         return [_SEED, x.entropy, x.spawn_key, x.pool_size, x.n_children_spawned]
     return None
 
@@ -487,7 +489,7 @@ def _dtype_parts(dtype: Any) -> Any:
         fields = [[name, _dtype_parts(dtype[name]), *dtype.fields[name][1:]] for name in dtype.names]
         parts = [fields, dtype.itemsize, dtype.isalignedstruct]
     elif dtype.subdtype is not None:
-        parts = [_dtype_parts(dtype.base), [*dtype.shape]]
+        parts = [_dtype_parts(dtype.base), dtype.shape]
     try:
         made = _make_dtype(parts)
         if (made, made.type, made.metadata) == (dtype, dtype.type, dtype.metadata):
@@ -504,7 +506,8 @@ def _make_dtype(parts: Any) -> Any:
             raise DamagedValue(f"it has an array of dtype {parts}")
         dtype = np.dtype(parts)
     elif len(parts) == 2:
-        dtype = np.dtype((_make_dtype(parts[0]), tuple(parts[1])))
+        base, shape = parts
+        dtype = np.dtype((_make_dtype(base), shape))
     else:
         fields, size, is_aligned = parts
         columns = {
@@ -519,10 +522,11 @@ def _make_dtype(parts: Any) -> Any:
     return dtype
 
 
-def _make_array(dtype: Any, shape: tuple[int, ...], order: Any, data: memoryview) -> Any:
+def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview) -> Any:
     made = _make_dtype(dtype)
+    sizes = cast("tuple[int, ...]", shape if type(shape) is tuple else (-1,))
     # Numpy would take a size of -1 for "as many as there are", and divide by the size of an item.
-    if min(shape, default=0) < 0 or math.prod(shape) * made.itemsize != len(data):
+    if min(sizes, default=0) < 0 or math.prod(sizes) * made.itemsize != len(data):
         raise DamagedValue(f"it has {len(data)} bytes for an array of shape {shape} and dtype {made}")
     array = _numpy().ndarray(shape, made, data, order=order or "C").copy(order or "C")
     if array.shape != shape:
@@ -530,18 +534,32 @@ def _make_array(dtype: Any, shape: tuple[int, ...], order: Any, data: memoryview
     return array if order else array[()]
 
 
+def _make_text(text: str | bytes) -> Any:
+    kinds = {str: _numpy().str_, bytes: _numpy().bytes_}
+    return kinds[type(text)](text)
+
+
 def _make_bits(state: dict[str, Any], seed: Any) -> Any:
     kind, position = state["bit_generator"], state.get("buffer_pos", state["state"].get("pos", 0))
     if not 0 <= position <= _LAST_POSITION[kind]:  # Numpy does not check, and would read what is there.
         raise DamagedValue(f"it has a {kind} at position {position}")
+    if not all(isinstance(words, int | _numpy().ndarray) for words in state["state"].values()):
+        raise DamagedValue(f"it has a {kind} without a state")
     bits = getattr(_numpy().random, kind)(0 if seed is None else seed)
     bits.state = state
     return bits
 
 
+def _is_seed(entropy: Any, spawn_key: tuple[int, ...], pool_size: int) -> bool:
+    np = _numpy()
+    words: Any = entropy if type(entropy) in (list, tuple, np.ndarray) else [0 if entropy is None else entropy]
+    is_small = type(spawn_key) is tuple and pool_size <= 64  # Its time grows with the square of the pool.
+    return is_small and all(isinstance(word, int | np.integer) for word in (*words, *spawn_key))
+
+
 def _make_seed(entropy: Any, spawn_key: tuple[int, ...], pool_size: int, n_children: int) -> Any:
-    if pool_size > _LARGEST_POOL:
-        raise DamagedValue(f"it has a SeedSequence with a pool of {pool_size}")
+    if not _is_seed(entropy, spawn_key, pool_size):
+        raise DamagedValue("it has a SeedSequence that is none")
     make = _numpy().random.SeedSequence
     return make(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children)
 
@@ -562,15 +580,17 @@ def _make_int(code: int, data: bytes) -> int:
 
 
 _MARKS: Final = {code: _Mark(code) for code in range(1, 64)}
-_unpack: Final = partial(unpackb, strict_map_key=False, unicode_errors="surrogatepass")
-_MAKE: Final[dict[int, Callable[..., Any]]] = {
+_unpack: Final = cast(
+    "Callable[..., Any]", partial(msgpack.unpackb, strict_map_key=False, unicode_errors="surrogatepass")
+)
+_MAKE: Final[dict[int, _Make]] = {
     **{code: make for code, _, _, make in _TYPES},
-    _ARRAY.code: _make_array,
-    _TEXT.code: lambda text: (_numpy().str_ if isinstance(text, str) else _numpy().bytes_)(text),
-    _BITS.code: _make_bits,
-    _SEED.code: _make_seed,
-    _GENERATOR.code: lambda bits: _numpy().random.Generator(bits),
-    _RANDOM_STATE.code: _make_random_state,
+    _ARRAY.code: lambda parts: _make_array(*parts),
+    _TEXT.code: lambda parts: _make_text(*parts),
+    _BITS.code: lambda parts: _make_bits(*parts),
+    _SEED.code: lambda parts: _make_seed(*parts),
+    _GENERATOR.code: lambda parts: _numpy().random.Generator(*parts),
+    _RANDOM_STATE.code: lambda parts: _make_random_state(*parts),
 }
 
 
@@ -582,10 +602,10 @@ class _Decoder:
         self.open_marks = 0
         self.shared: dict[int, object] = {}
         self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any]]] = {}
-        self.make = _MAKE | {
+        self.make: dict[int, _Make] = _MAKE | {
             _BUFFER.code: self.make_buffer,
             _SHARED.code: self.make_shared,
-            _AGAIN.code: self.shared.__getitem__,
+            _AGAIN.code: self.make_again,
             _DEFAULTDICT.code: self.make_defaultdict,
             _ENUM.code: self.make_enum,
             _DATACLASS.code: partial(self.make_record, _DATACLASS),
@@ -594,7 +614,7 @@ class _Decoder:
         }
 
     def value(self, tree: memoryview) -> object:
-        value = _unpack(tree, ext_hook=self.on_extension, list_hook=self.on_list)
+        value: object = _unpack(tree, ext_hook=self.on_extension, list_hook=self.on_list)
         if self.open_marks or self.buffers:
             raise DamagedValue("it has something that belongs nowhere")
         return value
@@ -602,6 +622,8 @@ class _Decoder:
     def on_extension(self, code: int, data: bytes) -> int:
         if code == 0:
             return _make_int(code, data)
+        if data:
+            raise DamagedValue(f"it has an extension value with code {code}")
         self.open_marks += 1
         return _MARKS[code]
 
@@ -609,24 +631,28 @@ class _Decoder:
         if not parts or type(parts[0]) is not _Mark:
             return parts
         self.open_marks -= 1
-        mark, parts = parts[0], parts[1:]
-        return tuple(parts) if mark == _TUPLE.code else self.make[mark](*parts)
+        return self.make[parts.pop(0)](parts)
 
-    def make_buffer(self, n_bytes: int) -> memoryview:
+    def make_buffer(self, parts: list[Any]) -> memoryview:
+        [n_bytes] = parts
         if not 0 <= n_bytes <= len(self.buffers):
             raise DamagedValue("it is cut short")
         buffer, self.buffers = self.buffers[:n_bytes], self.buffers[n_bytes:]
         return buffer
 
-    def make_shared(self, number: int, x: object) -> object:
-        self.shared[number] = x
-        return x
+    def make_shared(self, parts: list[Any]) -> object:
+        number, self.shared[number] = parts
+        return self.shared[number]
 
-    def make_defaultdict(self, factory: str | None, *parts: Any) -> object:
-        kind: Any = None if factory is None else _find(factory)
-        if kind is not None and not _is_factory(kind):
-            raise DamagedValue(f"it has a defaultdict of {factory}")
-        return defaultdict(kind, _pairs(parts))
+    def make_again(self, parts: list[Any]) -> object:
+        [number] = parts
+        return self.shared[number]
+
+    def make_defaultdict(self, parts: list[Any]) -> object:
+        factory: Any = parts[0] and _find(parts[0])
+        if factory is not None and not _is_factory(factory):
+            raise DamagedValue(f"it has a defaultdict of {parts[0]}")
+        return defaultdict(factory, _pairs(parts[1:]))
 
     def find(self, mark: ExtType, name: str) -> tuple[Any, dict[str, Any]]:
         if name not in self.classes:
@@ -637,7 +663,8 @@ class _Decoder:
             raise DamagedValue(f"class {name} is of another kind now")
         return kind, slots
 
-    def make_enum(self, name: str, member: str | int) -> object:
+    def make_enum(self, parts: list[Any]) -> object:
+        name, member = parts
         kind, _ = self.find(_ENUM, name)
         if isinstance(member, str):
             return kind.__members__[member]
@@ -645,9 +672,10 @@ class _Decoder:
             return kind(member)
         raise DamagedValue(f"{name} has no member {member!r}")
 
-    def make_record(self, mark: ExtType, name: str, *parts: Any) -> object:
+    def make_record(self, mark: ExtType, parts: list[Any]) -> object:
+        name = parts[0]
         kind, slots = self.find(mark, name)
-        attributes = _pairs(parts)
+        attributes = _pairs(parts[1:])
         if mark is _DATACLASS:
             made: Any = object.__new__(kind)
         elif mark is _STRUCT:

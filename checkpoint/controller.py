@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..actors import lives
-from ..actors.cell import RUNNING, Cell
+from ..actors.cell import DOWN, GONE, RUNNING, Cell
 from ..actors.errors import HoldfastError, StartFailed
 from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import KILLED, ExitReason
@@ -33,6 +33,9 @@ if TYPE_CHECKING:
     from ..actors.process.guest import Guest
 
 Raw = msgspec.Raw
+
+
+ENDED = "it ended before it was live"
 
 
 class Homes:
@@ -113,15 +116,24 @@ class TaskHost(lives.LocalHost):
         for record in switch.restore_records():
             life.from_home(record)
         recovering = not switch.is_new
-        life.begin(more.start, max(switch.state_turn, -1), switch.stash)
+        life.begin(more.start, switch.state_turn, switch.stash)
         clock.mark("restart")
         for topic in (*more.start.kind._topics, *switch.topics):
             cell.node.topics.subscribe(topic, cell)
         switch.attach(LocalLife(life))
-        return cell.node.loop.create_task(self._follow(cell, live, recovering))
+        task = cell.node.loop.create_task(self._follow(cell, live, recovering), name=f"start of {cell.path}")
+        task.add_done_callback(_seen)
+        return task
 
     async def _follow(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
-        await until_live(cell, live, self._clock, self.switch, recovering)
+        try:
+            await until_live(cell, live, self._clock, self.switch, recovering)
+        except StartFailed as error:
+            if cell.state not in (DOWN, GONE):  # Its replay diverged: the next life begins when this one is over.
+                cell.kill()
+                await cell.ended()
+                raise
+            raise StartFailed(cell.path, error.reason if error.reason != ENDED else str(cell.extra().reason)) from error
         self._clock = None
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
@@ -140,11 +152,14 @@ class TaskHost(lives.LocalHost):
         if switch is None:
             return
         switch.died(-1, ordered=True)
+        if switch.cell is not None:
+            keep_subscriptions(switch.cell)
         self._clock = Clock()
         self._clock.mark("noticed")
         self._clock.mark("detect")
         if switch.live is not None and not switch.live.done():
-            switch.live.set_exception(StartFailed(switch.path, "it ended before it was live"))
+            switch.live.set_exception(StartFailed(switch.path, ENDED))
+            switch.live.exception()  # Nobody may be left to look.
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
@@ -152,7 +167,7 @@ class TaskHost(lives.LocalHost):
 
     def retired(self, cell: Cell) -> None:
         if self.switch is not None:
-            self.switch.drop_all("it has stopped")
+            give_up(self.switch, cell)
 
 
 class LocalHome:
@@ -160,14 +175,17 @@ class LocalHome:
 
     def __init__(self, host: TaskHost) -> None:
         self._host = host
+        self._is_open = True
 
     def to_home(self, record: ToHome) -> None:
         switch = self._host.switch
-        assert switch is not None
-        switch.from_life(record)
+        if switch is not None and self._is_open:
+            switch.from_life(record)
 
     def closed(self) -> None:
-        self._host.closed()
+        if self._is_open:
+            self._is_open = False
+            self._host.closed()
 
 
 class LocalLife:
@@ -206,6 +224,26 @@ async def until_live(
             node.emit(Recovered(cell.path, cell.life, switch.replayed, clock.phases(restore_seconds)))
 
 
+def keep_subscriptions(cell: Cell) -> None:
+    """A life is over, its address is not: what is published in between is admitted there too."""
+    cell.extra().topics.clear()  # what would be unsubscribed with the life
+
+
+def give_up(switch: Switch, cell: Cell) -> None:
+    """The address is free: it hears nothing more."""
+    start = cell.extra().start
+    for topic in (*(start.kind._topics if start is not None else ()), *switch.topics):
+        cell.node.topics.unsubscribe(topic, cell)
+    parent = cell.parent
+    switch.drop_all("it has stopped", keep_tells=parent is not None and parent.state is not RUNNING)
+
+
+def _seen(start: asyncio.Task[None]) -> None:
+    """Look at the outcome of a start: perhaps nobody else does, when the system stops meanwhile."""
+    if not start.cancelled():
+        start.exception()
+
+
 class RecordedProcessHost(ProcessHost):
     """The host of a recorded actor with a process of its own."""
 
@@ -225,6 +263,7 @@ class RecordedProcessHost(ProcessHost):
         more.outlet = switch
         self._stop_wanted = None
         self._starting = cell.node.loop.create_task(self._recover(cell, switch), name=f"start of {cell.path}")
+        self._starting.add_done_callback(_seen)
         return self._starting
 
     async def _recover(self, cell: Cell, switch: Switch) -> None:
@@ -257,7 +296,11 @@ class RecordedProcessHost(ProcessHost):
             raise
         clock.mark("restart")
         switch.attach(port)
-        await until_live(cell, live, clock, switch, recovering)
+        try:
+            await until_live(cell, live, clock, switch, recovering)
+        except StartFailed:
+            await worker.gone()  # The next life begins when this one is over.
+            raise
         self._clock = None
         if self._stop_wanted is not None:
             self.stop(cell, self._stop_wanted)
@@ -282,6 +325,7 @@ class RecordedProcessHost(ProcessHost):
             switch.live.set_exception(StartFailed(cell.path, str(reason)))
             switch.live.exception()  # Nobody may be left to look.
         worker.take_pending()
+        keep_subscriptions(cell)
         lives.ended(cell, reason)
 
     def push(self, cell: Cell, item: Item) -> None:
@@ -295,7 +339,7 @@ class RecordedProcessHost(ProcessHost):
     def retired(self, cell: Cell) -> None:
         super().retired(cell)
         if self.switch is not None:
-            self.switch.drop_all("it has stopped")
+            give_up(self.switch, cell)
 
 
 class RemoteLife:

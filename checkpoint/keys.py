@@ -6,7 +6,7 @@ from typing import Any
 
 from ..actors.actor import Actor
 from ..actors.errors import HoldfastError, type_name
-from ..actors.values import decode_value, encode_value
+from ..actors.values import UnsavableValue, decode_value, encode_value
 
 
 class StateMismatch(HoldfastError):
@@ -26,19 +26,29 @@ def save_state(actor: Actor) -> bytes:
     Raises:
         UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there.
     """
-    where = actor.ctx.path
+    where, kind = actor.ctx.path, type_name(type(actor))
     get_state = getattr(actor, "get_state", None)
     if get_state is not None:
-        return encode_value((actor.schema_version, "state", get_state()), where=f"{where}: get_state()")
+        state = get_state()
+        return _encode(actor, "state", state, [(f"{where}: {kind}.get_state()", state)])
     names = actor.key_variables
     if names is None:
         state = {name: value for name, value in vars(actor).items() if not name.startswith("_") and name != "ctx"}
     else:
         missing = [name for name in names if not hasattr(actor, name)]
         if missing:
-            raise StateMismatch(where, f"{type_name(type(actor))} has no key variable {missing[0]!r}")
+            raise StateMismatch(where, f"{kind} has no key variable {missing[0]!r}")
         state = {name: getattr(actor, name) for name in names}
-    return encode_value((actor.schema_version, "keys", state), where=where)
+    return _encode(actor, "keys", state, [(f"{where}: {kind}.{name}", value) for name, value in state.items()])
+
+
+def _encode(actor: Actor, form: str, state: object, parts: list[tuple[str, object]]) -> bytes:
+    try:
+        return encode_value((actor.schema_version, form, state), where=actor.ctx.path)
+    except UnsavableValue:
+        for name, value in parts:  # Once more, variable by variable: the error shall name the one it is about.
+            encode_value(value, where=name)
+        raise
 
 
 def restore_state(actor: Actor, data: bytes) -> None:

@@ -12,27 +12,25 @@ import random
 import time
 import types
 from collections.abc import Awaitable, Callable
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from ..actors import lives, mailbox
 from ..actors.actor import Actor, Start
 from ..actors.cell import RUNNING, Cell
 from ..actors.context import ActorContext, StashError
-from ..actors.errors import BadMessage, HoldfastError, StartFailed, remote_crash
-from ..actors.exits import ExitReason, unpack_exit
+from ..actors.errors import BadMessage, HoldfastError, RemoteCrash, StartFailed, remote_crash
+from ..actors.exits import NORMAL, ExitReason, unpack_exit
 from ..actors.links import Monitor
 from ..actors.mail import LEAVE, Item, ReplyHandle
 from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from .keys import restore_state, save_state
 from .records import (
-    DOWN,
-    EXIT,
+    CRASH,
+    DROPPED,
     FAILED,
     LATER,
-    NOTHING,
     OK,
-    PIPE,
     REPLY,
     START,
     STASHED,
@@ -50,6 +48,7 @@ from .records import (
     ToHome,
     ToLife,
     TurnEnd,
+    Unsaved,
     pieces,
 )
 
@@ -86,6 +85,9 @@ class Life:
         self.pipes = 0
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
+        self.gone: tuple[int, ...] = ()
+        self.cancelled: set[str] = set()  # timers whose ticks may still be on their way
+        self.stop_wanted: ExitReason | None = None
         self.is_live = False
         self.in_hook = False
         self._snapshot_turn = -1
@@ -105,9 +107,7 @@ class Life:
         """
         cell = self.cell
         cell.life += 1
-        lives.build(cell, start, RecordedContext)
-        ctx = cast("RecordedContext", cell.ctx)
-        ctx.recorded = self
+        lives.build(cell, start, self._context)
         actor = cell.actor
         assert actor is not None
         self.turn = turn
@@ -116,15 +116,23 @@ class Life:
             try:
                 restore_state(actor, b"".join(self._state))
             except Exception as error:
+                self._context_made.close()
+                cell.actor = cell.ctx = None
                 raise StartFailed(cell.path, f"its state could not be restored: {error}") from error
             self._restore_seconds = time.perf_counter() - begin
             self._snapshot_turn = turn
         self._state.clear()
-        self._stashed_ids = stash
+        self._stashed_ids = frozenset(stash)
         cell.state = RUNNING
         if self._has_state and start.kind.on_start is not Actor.on_start:
             mailbox.queue_of(cell).append(Hook(self, "on_start"))
         lives.up(cell)
+
+    def _context(self, cell: Cell) -> RecordedContext:
+        """Made before `__init__` runs: that may use `ctx` already."""
+        self._context_made = RecordedContext(cell)
+        self._context_made.recorded = self
+        return self._context_made
 
     # -- records from home ------------------------------------------------------------------------------------------
 
@@ -137,9 +145,11 @@ class Life:
                 self._outcome(record)
             case Go():
                 self._queue(GoLive(self, record))
-            case SnapshotNow():
+            case SnapshotNow(at_once=True):
                 self._snapshot_wanted = True
                 self._queue(TakeSnapshot(self))
+            case SnapshotNow():
+                self._snapshot_turn = -2  # no turn: the next one that is due is taken
             case Restore():
                 self._has_state = True
                 self._state.append(record.data)
@@ -152,7 +162,9 @@ class Life:
         else:
             sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
             fed = Fed(self, feed, None, sender)
-        if feed.id in self._stashed_ids and not feed.turn and not self.is_live:
+        if feed.origin and feed.origin in self.cancelled and feed.turn < 0:
+            return  # Its timer was cancelled while it was on its way; the home drops it too.
+        if feed.id in self._stashed_ids and feed.turn < 0 and not self.is_live:
             self.stash.append(fed)
             return
         self._queue(fed)
@@ -181,7 +193,7 @@ class Life:
 
     def open_turn(self, feed: Feed) -> None:
         """A turn begins; a replayed one gets the number it had."""
-        self.turn = feed.turn or self.turn + 1
+        self.turn = feed.turn if feed.turn >= 0 else self.turn + 1
         self.feed, self.outs, self.last_k = feed, [], 0
         if self.page is not None:
             self.page[0] = feed.id + 1
@@ -189,7 +201,8 @@ class Life:
     def close_turn(self, status: str, answer: Answer) -> None:
         """A turn has ended: report it, with what it sent."""
         feed = self.feed
-        assert feed is not None
+        if feed is None:
+            return  # The life was abandoned in this very turn: what it says does not count.
         self.feed = None
         self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer))
         self.outs = []
@@ -202,6 +215,7 @@ class Life:
         if feed is None:
             return
         self.outs = []
+        self.in_hook = True  # What is left is `on_stop`.
         crash = remote_crash(error)
         self.close_turn(FAILED, self.answer_error(crash) if feed.is_ask else Answer())
 
@@ -216,7 +230,9 @@ class Life:
         except BadMessage as error:
             return self.answer_error(BadMessage("reply", error.message, error.problem))
 
-    def put(self, verb: str, to: str, name: str = "", body: bytes = b"", *, seconds: float = 0.0, interval: float = 0.0) -> int:
+    def put(
+        self, verb: str, to: str, name: str = "", body: bytes = b"", *, seconds: float = 0.0, interval: float = 0.0
+    ) -> int:
         """One more output of the turn in hand; returns its number.
 
         Raises:
@@ -227,6 +243,15 @@ class Life:
         self.last_k = k = self.last_k + 1
         self.outs.append(Out(k, verb, to, name, body, seconds, interval))
         return k
+
+    def cancel_timer(self, key: str) -> None:
+        """Ticks that are queued here, or on their way, are dropped here and at home."""
+        self.put("cancel", key)
+        self.cancelled.add(key)
+        queue = mailbox.queue_of(self.cell)
+        for index, item in enumerate(queue):  # Not removed: the run loop has counted them.
+            if type(item) is Fed and item.feed.origin == key and item.feed.turn < 0:
+                queue[index] = mailbox.NOTHING
 
     def release(self) -> None:
         """What this turn has sent so far leaves now."""
@@ -240,12 +265,17 @@ class Life:
     def go_live(self) -> None:
         """Replay is over."""
         self.is_live = True
+        self.stash = [fed for fed in self.stash if fed.feed.id not in self.gone]
+        for key in self.gone:
+            self.returned.pop(key, None)
         if self.returned:  # Unstashed under replay, and not handled before the crash: they come first.
             queue = mailbox.queue_of(self.cell)
             queue.extendleft(reversed(self.returned.values()))
             self.returned.clear()
         self.port.to_home(Live(self._restore_seconds))
         self._arm()
+        if self.stop_wanted is not None:
+            self.cell.request_stop(self.stop_wanted)
 
     def _arm(self) -> None:
         if self.interval > 0:
@@ -263,7 +293,11 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
-        data = save_state(actor)
+        try:
+            data = save_state(actor)
+        except Exception as error:  # What the user's own `get_state` raises is no reason to lose what it has.
+            self.port.to_home(Unsaved(str(error)))
+            return
         stash = [fed.feed.id for fed in self.stash]
         pause = time.perf_counter() - begin
         parts = pieces(data)
@@ -279,16 +313,18 @@ class Life:
         for future, _ in self.asks.values():
             future.cancel()
         self.asks.clear()
+        self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.
         self.port.closed()
 
 
 class Fed(Item):
     """An input in the mailbox of its life."""
 
-    __slots__ = ("feed", "life", "message", "sender")
+    __slots__ = ("feed", "is_stashed", "life", "message", "sender")
 
     def __init__(self, life: Life, feed: Feed, message: Any, sender: Cell | None) -> None:
         self.life, self.feed, self.message, self.sender = life, feed, message, sender
+        self.is_stashed = False
 
     @property
     def chain(self) -> tuple[tuple[str, int], ...]:
@@ -298,11 +334,21 @@ class Fed(Item):
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         life: Life = item.life
-        life.open_turn(item.feed)
+        feed: Feed = item.feed
+        life.open_turn(feed)
+        if feed.deadline and feed.deadline <= life.cell.node.loop.time() and feed.turn < 0:
+            life.close_turn(DROPPED, Answer())  # Nobody waits any more.
+            return None
+        if item.message is None and feed.name:
+            try:
+                item.message = life.cell.node.codec.message_in(life.cell, feed.name, feed.body)
+            except HoldfastError as error:  # It came encoded, and is none of ours.
+                life.close_turn(DROPPED, life.answer_error(error) if feed.is_ask else Answer())
+                return None
         try:
             result = item.call(actor)
         except Refusal as no:
-            item.end(life.answer_error(no))
+            item.refuse(no)
             return None
         if type(result) is Coroutine_:
             return item.finish(result)
@@ -318,15 +364,22 @@ class Fed(Item):
                 return actor.on_start(False)
             case "exit":
                 data = node.codec.decode(dict[str, Any], feed.body)
-                return actor.on_exit(node.cell_at(data["source"]).ref, unpack_exit(data["reason"]))
+                reason, more = unpack_exit(data["reason"]), self.life.cell.more
+                if more is not None and more.trap_exits:
+                    return actor.on_exit(node.cell_at(data["source"]).ref, reason)
+                if reason != NORMAL:
+                    actor.ctx.stop(reason)
+                return None
             case "down":
                 data = node.codec.decode(dict[str, Any], feed.body)
                 return actor.on_down(
                     node.cell_at(data["source"]).ref, unpack_exit(data["reason"]), bool(data["recovering"])
                 )
+            case "pipe" if not feed.name:
+                error = node.codec.decode_error(CRASH, "", feed.body)
+                assert isinstance(error, RemoteCrash)
+                raise error
             case _:
-                if self.message is None:
-                    self.message = node.codec.message_in(self.life.cell, feed.name, feed.body)
                 return actor._table[type(self.message)](actor, self.message)
 
     async def finish(self, handler: Any) -> None:
@@ -334,9 +387,15 @@ class Fed(Item):
         try:
             result = await handler
         except Refusal as no:
-            self.end(self.life.answer_error(no))
+            self.refuse(no)
         else:
             self.end_with(result)
+
+    def refuse(self, no: Refusal) -> None:
+        """The handler said no, which is an answer; nobody has asked an actor to start."""
+        if self.feed.kind == START:
+            raise StartFailed(self.life.cell.path, str(no)) from no
+        self.end(self.life.answer_error(no) if self.feed.is_ask else Answer())
 
     def end_with(self, result: object) -> None:
         """The handler returned."""
@@ -350,7 +409,9 @@ class Fed(Item):
     def end(self, answer: Answer) -> None:
         """The turn is over; a stashed message stays open."""
         life = self.life
-        if any(fed is self for fed in life.stash):
+        if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None:
+            save_state(life.cell.actor)  # What cannot be saved is refused now, not when it is needed.
+        if self.is_stashed:
             life.close_turn(STASHED, Answer())
         else:
             life.close_turn(OK, answer if self.feed.is_ask else Answer())
@@ -372,14 +433,20 @@ class Hook(Item):
     def run(actor: Any, item: Any) -> object:
         life: Life = item.life
         life.in_hook = True
-        result = actor.on_start(True) if item.name == "on_start" else actor.on_recovered()
+        try:
+            result = actor.on_start(True) if item.name == "on_start" else actor.on_recovered()
+        except Refusal as no:  # Nobody asked: an actor that refuses to start has failed to.
+            raise StartFailed(life.cell.path, str(no)) from no
         if type(result) is Coroutine_:
             return item.finish(result)
         item.over()
         return None
 
     async def finish(self, hook: Any) -> None:
-        await hook
+        try:
+            await hook
+        except Refusal as no:
+            raise StartFailed(self.life.cell.path, str(no)) from no
         self.over()
 
     def over(self) -> None:
@@ -400,6 +467,7 @@ class GoLive(Hook):
     def run(actor: Any, item: Any) -> object:
         # Turns that failed are not replayed, but their numbers are used.
         item.life.turn = max(item.life.turn, item.go.turn)
+        item.life.gone = item.go.gone
         if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
             return Hook.run(actor, item)
         item.over()
@@ -474,8 +542,8 @@ class RecordedTimer:
     id: str
 
     def cancel(self) -> None:
-        """The message does not come any more."""
-        _life_of_turn().put("cancel", self.id)
+        """The message does not come any more, not even one that is queued already."""
+        _life_of_turn().cancel_timer(self.id)
 
 
 class RecordedContext(ActorContext):
@@ -513,7 +581,8 @@ class RecordedContext(ActorContext):
         life = self.recorded
         if self._random is None or self._drawn != life.turn:
             self._drawn = life.turn
-            self._random = random.Random(f"{self.path}|{life.turn}")
+            when = 0.0 if life.feed is None else life.feed.time
+            self._random = random.Random(f"{self.path}|{life.turn}|{when}")
         return self._random
 
     # -- sending ----------------------------------------------------------------------------------------------------
@@ -560,8 +629,8 @@ class RecordedContext(ActorContext):
         self.recorded.put("forward", to.path, feed.name, feed.body)
 
     def reply_handle(self) -> ReplyHandle[Any]:
-        feed = self.recorded.feed
-        return RecordedReplyHandle(feed.id if feed is not None and feed.is_ask else -1)
+        feed = self.recorded.feed  # Its id even if nobody waits (any more): a replay must make the same handle.
+        return RecordedReplyHandle(feed.id if feed is not None else -1)
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         if not self.in_turn():
@@ -582,7 +651,14 @@ class RecordedContext(ActorContext):
         if not self.in_turn():
             self._outside()
         body = self.cell.node.codec.encode(message, self.path)
-        k = life.put("timer", f"{life.turn}.{life.last_k + 1}", message_name(type(message)), body, seconds=delay, interval=interval)
+        k = life.put(
+            "timer",
+            f"{life.turn}.{life.last_k + 1}",
+            message_name(type(message)),
+            body,
+            seconds=delay,
+            interval=interval,
+        )
         return RecordedTimer(f"{life.turn}.{k}")
 
     def tell_after(self, delay: float, message: Message[Any]) -> Any:
@@ -608,7 +684,9 @@ class RecordedContext(ActorContext):
             return
         life.pipes += 1
         tasks = self.cell.extra().tasks
-        task = self.cell.node.loop.create_task(self._piped(life.turn, k, work, then, failed), name=f"pipe of {self.path}")
+        task = self.cell.node.loop.create_task(
+            self._piped(life.turn, k, work, then, failed), name=f"pipe of {self.path}"
+        )
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
@@ -618,14 +696,18 @@ class RecordedContext(ActorContext):
         except asyncio.CancelledError:
             raise
         except BaseException as error:
-            if failed is None:
-                self.cell.push(PipeFailed(error))
+            if failed is None:  # Nobody takes the error: the actor crashes, once.
+                self._piped_back(PipeDone(turn, k, "", self.cell.node.codec.encode_error(remote_crash(error))[2]))
                 return
             message = failed(error)
+        self._piped_back(
+            PipeDone(turn, k, message_name(type(message)), self.cell.node.codec.encode(message, self.path))
+        )
+
+    def _piped_back(self, record: PipeDone) -> None:
         if not self.closed:
             self.recorded.pipes -= 1
-            body = self.cell.node.codec.encode(message, self.path)
-            self.recorded.port.to_home(PipeDone(turn, k, message_name(type(message)), body))
+            self.recorded.port.to_home(record)
 
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 
@@ -633,8 +715,9 @@ class RecordedContext(ActorContext):
         fed, life = self.item, self.recorded
         if not isinstance(fed, Fed) or life.feed is None:
             raise StashError(f"{self.path}: only a message can be stashed")
-        if fed in life.stash:
+        if fed.is_stashed:
             raise StashError(f"{self.path}: this message is stashed already")
+        fed.is_stashed = True
         life.stash.append(fed)
 
     def unstash(self) -> None:
@@ -645,15 +728,15 @@ class RecordedContext(ActorContext):
             mailbox.queue_of(self.cell).extendleft(reversed(again))
             self.cell.schedule()
         else:
-            life.returned.update((fed.feed.id, fed) for fed in again)
+            life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
         self.recorded.put("monitor", other.path)
-        return Monitor(self.cell, other._cell, for_good=False)
+        return RecordedMonitor(self.cell, other._cell, for_good=False)
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
         self.recorded.put("watch", other.path)
-        return Monitor(self.cell, other._cell, for_good=True)
+        return RecordedMonitor(self.cell, other._cell, for_good=True)
 
     def link(self, other: ActorRef[Any]) -> None:
         self.recorded.put("link", other.path)
@@ -667,26 +750,28 @@ class RecordedContext(ActorContext):
     def unsubscribe(self, topic: str) -> None:
         self.recorded.put("unsubscribe", topic)
 
+    def stop(self, reason: ExitReason = NORMAL) -> None:
+        if self.recorded.is_live:
+            super().stop(reason)
+        else:  # A replayed turn: the life ends when it has caught up.
+            self.recorded.stop_wanted = reason
+
     def close(self) -> None:
         super().close()
         self.recorded.close()
 
 
-class PipeFailed(Item):
-    """Background work raised, and nobody takes the error: the actor crashes."""
+class RecordedMonitor(Monitor):
+    """A handle on a watch that the home keeps."""
 
-    __slots__ = ("error",)
+    __slots__ = ()
 
-    def __init__(self, error: BaseException) -> None:
-        self.error = error
-
-    @staticmethod
-    def run(actor: Any, item: Any) -> object:
-        raise item.error
+    def cancel(self) -> None:
+        """No further DOWN is admitted after the turn in hand."""
+        self.active = False
+        _life_of_turn().put("unwatch" if self.for_good else "demonitor", self.target.path)
 
 
 def once_more(feed: Feed) -> Feed:
     """The same input, to be handled in a turn of its own."""
-    return Feed(feed.id, 0, feed.kind, feed.name, feed.body, feed.time, feed.sender, feed.is_ask, feed.chain)
-
-
+    return Feed(feed.id, -1, feed.kind, feed.name, feed.body, feed.time, feed.sender, feed.is_ask, feed.chain)

@@ -50,7 +50,7 @@ def hybrid(
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
     Args:
-        interval: seconds between snapshots, > 0; only a changed actor is saved.
+        interval: seconds between snapshots, > 0 and finite; only a changed actor is saved.
         pacing: "fast" replays as quickly as the handlers run.
         max_deliveries: process deaths in the turn of one and the same message after which it is quarantined.
         journal_limit: bytes of messages kept since the last snapshot; when it is reached, sends wait or are refused.
@@ -58,12 +58,12 @@ def hybrid(
     Source:
         Zou and Bai, checkpoint and replay combined.
     """
-    if not isinstance(interval, (int, float)) or isinstance(interval, bool) or not interval > 0:
+    if not isinstance(interval, (int, float)) or isinstance(interval, bool) or not 0 < interval < float("inf"):
         raise SpecError("hybrid", f"interval must be seconds > 0, not {interval!r}")
     if pacing != "fast":
         raise SpecError("hybrid", f"pacing must be 'fast', not {pacing!r}")
-    if not isinstance(max_deliveries, int) or max_deliveries < 1:
+    if not isinstance(max_deliveries, int) or isinstance(max_deliveries, bool) or max_deliveries < 1:
         raise SpecError("hybrid", f"max_deliveries must be a whole number >= 1, not {max_deliveries!r}")
-    if not journal_limit > 0:
+    if not isinstance(journal_limit, int) or isinstance(journal_limit, bool) or journal_limit < 1:
         raise SpecError("hybrid", f"journal_limit must be bytes > 0, not {journal_limit!r}")
     return Method("hybrid", float(interval), max_deliveries, journal_limit)

@@ -47,7 +47,11 @@ class Answer(msgspec.Struct, array_like=True):
 
 
 class Feed(msgspec.Struct, array_like=True, tag=1):
-    """An input. `turn` is the number it had before the crash, 0 if it never ended; `pipes` have their result already."""
+    """An input.
+
+    `turn` is the number it had before the crash, -1 if it never ended; `pipes` have their result already; from
+    `deadline` on (on the loop's clock, 0: never) it is not begun any more; `origin` is the timer it comes from.
+    """
 
     id: int
     turn: int
@@ -59,6 +63,8 @@ class Feed(msgspec.Struct, array_like=True, tag=1):
     is_ask: bool = False
     chain: tuple[tuple[str, int], ...] = ()
     pipes: tuple[int, ...] = ()
+    deadline: float = 0.0
+    origin: str = ""
 
 
 class Outcome(msgspec.Struct, array_like=True, tag=2):
@@ -70,14 +76,20 @@ class Outcome(msgspec.Struct, array_like=True, tag=2):
 
 
 class Go(msgspec.Struct, array_like=True, tag=3):
-    """Replay is over: call `on_recovered` (if anything was recovered), report, then go on after turn `turn`."""
+    """Replay is over: call `on_recovered` (if anything was recovered), report, then go on after turn `turn`.
+
+    Inputs in `gone` were stashed under replay and have ended since, in turns that are not replayed.
+    """
 
     recovered: bool
     turn: int
+    gone: tuple[int, ...] = ()
 
 
 class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
-    """Take a snapshot after the turn in hand."""
+    """Take a snapshot after the turn in hand, or (the last one could not be kept) when the next one is due."""
+
+    at_once: bool = True
 
 
 class Restore(msgspec.Struct, array_like=True, tag=5):
@@ -127,7 +139,7 @@ class Snapshot(msgspec.Struct, array_like=True, tag=14):
 
 
 class PipeDone(msgspec.Struct, array_like=True, tag=15):
-    """Background work that was output (turn, k) has its result: a message to the actor itself, or an error."""
+    """Background work that was output (turn, k) has its result: a message to the actor itself; no name: an error."""
 
     turn: int
     k: int
@@ -135,7 +147,13 @@ class PipeDone(msgspec.Struct, array_like=True, tag=15):
     body: bytes
 
 
-ToHome = Released | TurnEnd | Live | Snapshot | PipeDone
+class Unsaved(msgspec.Struct, array_like=True, tag=16):
+    """The state could not be saved: no snapshot came of it."""
+
+    problem: str
+
+
+ToHome = Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved
 
 PIECE = 4 * 1024 * 1024
 """Bytes of state per record, so that a large state does not hold up everything else."""

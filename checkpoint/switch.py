@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
-from ..actors import links, mailbox
+from ..actors import links
 from ..actors.cell import Cell
 from ..actors.codec import Parcel
 from ..actors.errors import (
     ActorStopped,
     AskDeadlock,
     AskTimeout,
+    BadMessage,
     HoldfastError,
     MailboxFull,
     Quarantined,
@@ -28,16 +29,14 @@ from ..actors.errors import (
 )
 from ..actors.events import JournalFull, MessageQuarantined, RecoveryFailed, SnapshotFailed, SnapshotTaken
 from ..actors.exits import pack_exit
-from ..actors.mail import Ask, Envelope, Item
+from ..actors.mail import Ask, Envelope, Item, ReplyHandle
 from ..actors.message import message_name
 from ..actors.process.relay import RelayedAsk
 from .journal import Entry, Journal
 from .method import Method
 from .records import (
-    CRASH,
     DOWN,
     DROPPED,
-    ERROR,
     EXIT,
     FAILED,
     LATER,
@@ -63,12 +62,15 @@ from .records import (
     ToHome,
     ToLife,
     TurnEnd,
+    Unsaved,
     pieces,
 )
 
 if TYPE_CHECKING:
     from ..actors.node import Node
 
+EXPIRED = 1e-9
+"""A deadline that has passed. (Asks forget theirs when they expire.)"""
 OVERHEAD = 200
 """Bytes an input is counted with besides its payload."""
 
@@ -84,9 +86,22 @@ class LifePort(Protocol):
 class Input:
     """One journaled input."""
 
-    __slots__ = ("ask", "body", "chain", "deliveries", "id", "kind", "name", "origin", "positions", "sender", "time", "turn")
+    __slots__ = (
+        "ask",
+        "body",
+        "chain",
+        "deliveries",
+        "id",
+        "kind",
+        "name",
+        "origin",
+        "positions",
+        "sender",
+        "time",
+        "turn",
+    )
 
-    def __init__(self, id: int, kind: str, name: str, body: bytes, when: float, sender: str | None) -> None:  # noqa: A002
+    def __init__(self, id: int, kind: str, name: str, body: bytes, when: float, sender: str | None) -> None:
         self.id, self.kind, self.name, self.body, self.time, self.sender = id, kind, name, body, when, sender
         self.ask: Ask | None = None
         self.chain: tuple[tuple[str, int], ...] = ()
@@ -95,21 +110,24 @@ class Input:
         self.origin = ""  # the timer or pipe it comes from
         self.positions: list[int] = []
 
-    def feed(self, turn: int = 0, pipes: tuple[int, ...] = ()) -> Feed:
-        """As the life gets it."""
+    def feed(self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False) -> Feed:
+        """As the life gets it; what has begun is finished whatever its deadline."""
+        ask = self.ask
+        deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
+        origin = self.origin if self.kind == TICK else ""
         return Feed(
-            self.id, turn, self.kind, self.name, self.body, self.time, self.sender, self.ask is not None, self.chain, pipes
-        )
+            self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
+            ask is not None, self.chain, pipes, deadline, origin,
+        )  # fmt: skip
 
 
 class Turn:
     """One ended turn since the last snapshot."""
 
-    __slots__ = ("digests", "input", "positions", "status")
+    __slots__ = ("digests", "input", "status")
 
     def __init__(self, source: Input, status: str, digests: list[int]) -> None:
         self.input, self.status, self.digests = source, status, digests
-        self.positions: list[int] = []
 
 
 class TimerState:
@@ -146,29 +164,33 @@ class Batch:
             effect()
 
 
-class SwitchAsk(Ask):
-    """An ask from inside a recorded turn: its outcome is journaled before the turn hears of it."""
+class SwitchAsk(RelayedAsk, eq=False):
+    """An ask from inside a recorded turn: its outcome is journaled before the turn hears of it.
 
-    __slots__ = ("_done", "k", "switch", "turn")
+    To others it is an ask that was relayed: whoever has an encoded outcome hands that over.
+    """
 
-    def __init__(self, switch: Switch, turn: int, k: int, message: Any, chain: Any, timeout: float) -> None:
-        loop = switch.node.loop
-        super().__init__(message, switch.cell, chain, timeout, loop.time() + timeout, self)  # type: ignore[arg-type]
-        self.switch, self.turn, self.k, self._done = switch, turn, k, False
+    switch: Any = None
+    turn: int = 0
+    k: int = 0
 
-    def done(self) -> bool:
-        """As a future has it."""
-        return self._done
-
-    @property
-    def is_done(self) -> bool:
-        return self._done
+    @classmethod
+    def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell) -> SwitchAsk:
+        """The ask that was output (turn, k)."""
+        deadline = switch.node.loop.time() + out.seconds
+        ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, deadline, None, to)
+        ask.future, ask.switch, ask.turn, ask.k = ask, switch, turn, out.k
+        return ask
 
     def answer(self, reply: object) -> None:
-        from ..actors.mail import ReplyHandle
-
-        if not isinstance(reply, ReplyHandle):
-            self.give(Answer(REPLY, "", self.switch.node.codec.encode(reply, self.switch.path)))
+        if isinstance(reply, ReplyHandle):
+            return
+        try:
+            body = self.switch.node.codec.encode(reply, self.switch.path)
+        except BadMessage as error:
+            self.fail(BadMessage("reply", error.message, error.problem))
+        else:
+            self.give(Answer(REPLY, "", body))
 
     def answer_raw(self, body: bytes) -> None:
         """An encoded reply."""
@@ -183,8 +205,8 @@ class SwitchAsk(Ask):
 
     def give(self, answer: Answer, batch: Batch | None = None) -> None:
         """The outcome, once."""
-        if not self._done:
-            self._done = True
+        if not self.is_over:
+            self.is_over = True
             self.switch.outcome(self.turn, self.k, answer, batch)
 
 
@@ -218,6 +240,8 @@ class Switch:
         self._bytes = 0
         self._waiters: list[asyncio.Future[None]] = []
         self._incoming: list[bytes] = []
+        self._positions: dict[int, list[int]] = {}  # in the journal, of what belongs to a turn besides its input
+        self._dropped: list[int] = []  # the same of inputs that ended without a turn
         self._full_told = False
         self._replay_k = 0
         self._replay_turn = -1
@@ -327,10 +351,15 @@ class Switch:
         return self.turn < 0 and self.state is None
 
     def prepare(self) -> asyncio.Future[float]:
-        """A new life is about to begin: hold what comes; the future ends when it is live, with the restore's seconds."""
+        """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
         self.is_released = False
         self.replayed = 0
         self.diverged = None
+        self._incoming.clear()  # The last life may have died in the middle of a snapshot.
+        for key, timer in self.timers.items():
+            if timer.handle is None:  # It was stopped together with its actor.
+                timer.due += self.node.loop.time()
+                timer.handle = self.node.loop.call_at(timer.due, self._tick, key)
         if self.live is not None and not self.live.done():
             self.live.cancel()
         self.live = self.node.loop.create_future()
@@ -348,16 +377,17 @@ class Switch:
             if key in self.open:
                 port.to_life(self.open[key].feed())
         recovered = not self.is_new
-        if self.is_new and not self.open:
-            self.record(START, "", b"", None)
+        first = next((source for source in self.open.values() if source.kind == START), None)
+        if self.is_new and first is None:  # Messages may have come before it.
+            first = self.record(START, "", b"", None)
         for number, turn in self.turns.items():
             if turn.status in (OK, STASHED):
                 port.to_life(turn.input.feed(number, tuple(sorted(self.pipes_done.get(number, ())))))
                 self.replayed += 1
-        first = next(iter(self.open.values()), None)
-        if first is not None and first.kind == START:
+        if first is not None:
             port.to_life(first.feed())
-        port.to_life(Go(recovered, self.turn))
+        stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)
+        port.to_life(Go(recovered, self.turn, tuple(key for key in stashed if key not in self.open)))
 
     def _release(self) -> None:
         """Let new inputs at the actor: first the turn that had begun to send, then the others as they were admitted."""
@@ -369,7 +399,8 @@ class Switch:
         waiting.sort(key=lambda one: one.id != self.partial_id)
         pipes = tuple(sorted(self.pipes_done.get(self.turn + 1, ())))
         for index, source in enumerate(waiting):
-            port.to_life(source.feed(0, pipes if index == 0 else ()))
+            begun = source.id == self.partial_id
+            port.to_life(source.feed(-1, pipes if index == 0 else (), has_begun=begun))
 
     def died(self, running: int, ordered: bool) -> None:
         """The life is over. `running` is the input whose turn it died in, -1 if none; `ordered`: we killed it."""
@@ -382,33 +413,56 @@ class Switch:
         if source.deliveries >= self.method.max_deliveries:
             self.node.emit(MessageQuarantined(self.path, source.name, source.deliveries))
             error = Quarantined(self.path, source.deliveries)
-            self._end_without_turn(source, Answer(*self.node.codec.encode_error(error)))
+            # It uses up the number of its turn: what that has sent, and asks it has out, are not another's.
+            batch = Batch()
+            self._end(source, self.turn + 1, DROPPED, batch)
+            self._give(source, Answer(*self.node.codec.encode_error(error)), batch)
+            batch.commit(self.journal)
 
-    def _end_without_turn(self, source: Input, answer: Answer) -> None:
+    def _end(self, source: Input, number: int, status: str, batch: Batch) -> None:
+        """A turn is over: its end record."""
+        turn = self.turns[number] = Turn(source, status, self.partial)
+        self.partial, self.partial_id = [], -1
+        self.turn = source.turn = number
+        source.deliveries = 0
+        if status != STASHED:
+            del self.open[source.id]
+        entry = ("end", number, source.id, status, tuple(turn.digests))
+        batch.add(self.path, entry, self._positions_of(number))
+
+    def _positions_of(self, turn: int) -> list[int]:
+        return self._positions.setdefault(turn, [])
+
+    def _end_without_turn(self, source: Input, answer: Answer, batch: Batch) -> None:
         """An input that will not be handled: it gets an end record all the same."""
-        batch = Batch()
-        self.open.pop(source.id, None)
+        del self.open[source.id]
         self._bytes -= len(source.body) + OVERHEAD
-        if self.partial_id == source.id:
-            self.partial, self.partial_id = [], -1
-        batch.add(self.path, ("drop", source.id), [])
+        self._dropped.extend(source.positions)
+        batch.add(self.path, ("drop", source.id), self._dropped)
         self._give(source, answer, batch)
-        batch.commit(self.journal)
 
-    def drop_all(self, why: str) -> None:
-        """The address is gone for good: whoever waits is told, the rest goes to dead letters."""
+    def drop_all(self, why: str, *, keep_tells: bool = False) -> None:
+        """Nobody lives here any more: whoever waits is told, the rest goes to dead letters.
+
+        `keep_tells`: it is the actor's supervisor that has ended. Both may be started again, so what nobody waits for
+        stays for the next life.
+        """
+        now, batch = self.node.loop.time(), Batch()
         if self.live is not None and not self.live.done():
             self.live.cancel()
         for timer in self.timers.values():
             if timer.handle is not None:
                 timer.handle.cancel()
+                timer.handle = None
+                timer.due -= now  # what remains: it runs on with the next life
         cell = self.cell
         for source in list(self.open.values()):
-            if source.kind == START:
+            if source.kind == START or (keep_tells and source.ask is None):
                 continue
             if source.ask is None and cell is not None and source.kind == MESSAGE:
                 self._undelivered(cell, source, why)
-            self._end_without_turn(source, Answer(*self.node.codec.encode_error(ActorStopped(self.path, why))))
+            self._end_without_turn(source, Answer(*self.node.codec.encode_error(ActorStopped(self.path, why))), batch)
+        batch.commit(self.journal)
         for ask in self.later.values():
             ask.fail(ActorStopped(self.path, why))
         self.later.clear()
@@ -440,6 +494,8 @@ class Switch:
                     self._live(record)
                 case PipeDone():
                     self._pipe_done(record)
+                case Unsaved():
+                    self.node.emit(SnapshotFailed(self.path, record.problem))
         except ReplayDiverged as error:
             self.diverged = error
             self.node.emit(RecoveryFailed(self.path, str(error)))
@@ -458,7 +514,8 @@ class Switch:
         batch = Batch()
         self._take(record.turn, record.id, record.outs, batch)
         if record.turn > self.turn and self.journal.durable:
-            batch.add(self.path, ("out", record.turn, record.id, tuple(self.partial)), [])
+            entry = ("out", record.turn, record.id, tuple(self.partial))
+            batch.add(self.path, entry, self._positions_of(record.turn))
         batch.commit(self.journal)
 
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:
@@ -508,20 +565,11 @@ class Switch:
             return  # Its start failed, and will be tried again.
         batch = Batch()
         self._take(end.turn, end.id, end.outs, batch)
-        turn = Turn(source, end.status, self.partial)
-        self.partial, self.partial_id = [], -1
-        self.turn = end.turn
-        self.turns[end.turn] = turn
-        source.turn = end.turn
-        source.deliveries = 0
-        if end.status != STASHED:
-            del self.open[end.id]
-        if self.journal.durable:
-            batch.add(self.path, ("end", end.turn, end.id, end.status, tuple(turn.digests)), turn.positions)
+        self._end(source, end.turn, end.status, batch)
         if end.answer.kind == LATER:
             if source.ask is not None:
                 self.later[end.id] = source.ask
-        else:
+        elif end.status != STASHED:
             self._give(source, end.answer, batch)
         batch.commit(self.journal)
 
@@ -565,9 +613,10 @@ class Switch:
         """An ask of ours has its outcome: journal it, then tell the turn that waits."""
         own = batch if batch is not None else Batch()
         self.asks.pop((turn, k), None)
-        self.outcomes[turn, k] = answer
-        sink = self.turns[turn].positions if turn in self.turns else []
-        own.add(self.path, ("got", turn, k, answer.kind, answer.name, answer.body), sink)
+        if turn > self.state_turn:  # Else it will not be replayed.
+            self.outcomes[turn, k] = answer
+            entry = ("got", turn, k, answer.kind, answer.name, answer.body)
+            own.add(self.path, entry, self._positions_of(turn))
         own.after.append(lambda: self._tell_outcome(turn, k, answer))
         if batch is None:
             own.commit(self.journal)
@@ -592,6 +641,9 @@ class Switch:
                     self._deliver(target, out, batch)
             case "reply":
                 ask = self.later.pop(int(out.to), None)
+                source = self.open.get(int(out.to))
+                if source is not None:  # Answered before its own turn has ended.
+                    ask, source.ask = source.ask, None
                 kind, _, name = out.name.partition("|")
                 if isinstance(ask, SwitchAsk):
                     ask.give(Answer(kind, name, out.body), batch)
@@ -600,22 +652,25 @@ class Switch:
             case "forward":
                 self._forward(key, out, batch)
             case "timer" | "cancel" | "subscribe" | "unsubscribe":
-                batch.add(self.path, ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval), [])
+                entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval)
+                batch.add(self.path, entry, self._positions_of(turn))
+                if out.verb == "cancel":
+                    self._drop_ticks(out.to, key, batch)
                 batch.after.append(lambda: self._operate(out))
-            case "monitor" | "watch" | "link" | "unlink":
+            case "monitor" | "watch" | "demonitor" | "unwatch" | "link" | "unlink":
                 batch.after.append(lambda: self._connect(out))
             case "pipe":
                 pass
             case verb:
                 raise HoldfastError(f"{self.path}: unknown output {verb!r}")
 
-    def _deliver(self, target: Cell, out: Out, batch: Batch) -> None:
+    def _deliver(self, target: Cell, out: Out, batch: Batch, sender: str | None = None) -> None:
         """A message to another actor; to a recorded one it is journaled in the same append."""
         switch = switch_of(target)
-        cell = self.cell
+        cell = self.cell if sender is None else self.node.cell_at(sender)
         assert cell is not None
         if switch is not None:
-            source = switch.record(MESSAGE, out.name, out.body, self.path, batch)
+            source = switch.record(MESSAGE, out.name, out.body, cell.path, batch)
             batch.after.append(lambda: switch.forward(source))
             return
 
@@ -631,9 +686,9 @@ class Switch:
         target = self.node.cell_at(out.to)
         source = self.open.get(key)
         chain = ((self.path, key), *(source.chain if source is not None else ()))
-        ask = SwitchAsk(self, turn, out.k, Parcel(out.name, out.body), chain, out.seconds)
+        ask = SwitchAsk.made(self, turn, out, chain, target)
         self.asks[turn, out.k] = ask
-        self.node.deadlines.add(ask, target)
+        self.node.deadlines.add(ask)
         switch = switch_of(target)
         if switch is None:
             batch.after.append(lambda: self._send_ask(target, ask))
@@ -661,12 +716,15 @@ class Switch:
         ask = source.ask if source is not None else None
         target = self.node.cell_at(out.to)
         if source is None or ask is None:
-            self._deliver(target, out, batch)
+            self._deliver(target, out, batch, None if source is None else source.sender)
             return
         source.ask = None  # From now on it is the receiver's to answer.
 
         def send() -> None:
             try:
+                message: Any = ask.message
+                if type(message) is Parcel:
+                    ask.message = self.node.codec.message_in(target, out.name, out.body)
                 target.admit(target, ask)
             except HoldfastError as error:
                 ask.fail(error)
@@ -679,6 +737,8 @@ class Switch:
         match out.verb:
             case "monitor" | "watch":
                 links.monitor(cell, target, for_good=out.verb == "watch")
+            case "demonitor" | "unwatch":
+                links.demonitor(cell, target, for_good=out.verb == "unwatch")
             case "link":
                 links.link(cell, target)
             case _:
@@ -710,9 +770,12 @@ class Switch:
         timer = self.timers.pop(key, None)
         if timer is not None and timer.handle is not None:
             timer.handle.cancel()
-        for source in list(self.open.values()):  # A tick that waits does not come any more.
-            if source.kind == TICK and source.origin == key and not self.is_released:
-                self._end_without_turn(source, Answer())
+
+    def _drop_ticks(self, timer: str, running: int, batch: Batch) -> None:
+        """Ticks of a cancelled timer that wait do not come any more; the life forgets them by itself."""
+        for source in list(self.open.values()):
+            if source.kind == TICK and source.origin == timer and source.id != running:
+                self._end_without_turn(source, Answer(), batch)
 
     def _tick(self, key: str) -> None:
         timer = self.timers.get(key)
@@ -742,17 +805,25 @@ class Switch:
             return
         state = b"".join(self._incoming)
         self._incoming.clear()
-        kept = [turn for number, turn in self.turns.items() if number <= record.turn]
-        drop = [position for turn in kept for position in (*turn.positions, *turn.input.positions)]
+        covered = [number for number in self.turns if number <= record.turn]
+        drop = [*self._dropped, *(position for number in covered for position in self._positions.get(number, ()))]
+        for number in covered:
+            source = self.turns[number].input
+            if source.id not in self.open:  # Else it is stashed, and not handled yet.
+                drop.extend(source.positions)
         try:
             if self.journal.durable:
                 self.journal.cut(self.path, self._meta(state, record), drop, turn=record.turn)
         except HoldfastError as error:  # The older snapshot and the whole journal are still there.
             self.node.emit(SnapshotFailed(self.path, str(error)))
+            if self.port is not None:
+                self.port.to_life(SnapshotNow(at_once=False))
             return
+        self._dropped.clear()
         self.state, self.state_turn, self.stash = state, record.turn, record.stash
-        for number in [number for number in self.turns if number <= record.turn]:
+        for number in covered:
             turn = self.turns.pop(number)
+            self._positions.pop(number, None)
             if turn.status != STASHED:
                 self._bytes -= len(turn.input.body) + OVERHEAD
             self.pipes_done.pop(number, None)
@@ -789,7 +860,8 @@ class Switch:
         for source in self.open.values():
             self._bytes += len(source.body) + OVERHEAD
         for turn in self.turns.values():
-            self._bytes += len(turn.input.body) + OVERHEAD
+            if turn.status != STASHED:
+                self._bytes += len(turn.input.body) + OVERHEAD
         now = self.node.loop.time()
         for key, (name, body, left, interval) in timers.items():
             self._start_timer(key, TimerState(name, body, now + max(0.0, left), interval))
@@ -812,26 +884,32 @@ class Switch:
                 if key not in self.open:
                     return
                 past = self.turns[turn] = Turn(self.open[key], status, list(digests))
-                past.positions.append(position)
+                self._positions_of(turn).append(position)
                 past.input.turn = self.turn = turn
                 self.partial, self.partial_id = [], -1
                 if status != STASHED:
                     del self.open[key]
             case ("out", turn, key, digests):
+                self._positions_of(turn).append(position)
                 if turn > self.turn:
                     self.partial, self.partial_id = list(digests), key
             case ("got", turn, k, kind, name, body):
+                self._positions_of(turn).append(position)
                 self.outcomes[turn, k] = Answer(kind, name, body)
             case ("drop", key):
-                self.open.pop(key, None)
-            case ("op", _, "timer", key, name, body, seconds, interval):
-                timers[key] = (name, body, seconds, interval)
-            case ("op", _, "cancel", key, *_):
-                timers.pop(key, None)
-            case ("op", _, "subscribe", topic, *_):
-                self.topics[topic] = None
-            case ("op", _, "unsubscribe", topic, *_):
-                self.topics.pop(topic, None)
+                dropped = self.open.pop(key, None)
+                self._dropped.extend((*(dropped.positions if dropped is not None else ()), position))
+            case ("op", turn, verb, key, name, body, seconds, interval):
+                self._positions_of(turn).append(position)
+                match verb:
+                    case "timer":
+                        timers[key] = (name, body, seconds, interval)
+                    case "cancel":
+                        timers.pop(key, None)
+                    case "subscribe":
+                        self.topics[key] = None
+                    case _:
+                        self.topics.pop(key, None)
             case _:
                 raise HoldfastError(f"{self.path}: journal entry {position} is of an unknown kind {entry[0]!r}")
 
@@ -839,5 +917,3 @@ class Switch:
 def switch_of(cell: Cell) -> Switch | None:
     """The switch of a recorded actor's cell."""
     return getattr(cell.host, "switch", None)
-
-

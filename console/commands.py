@@ -30,8 +30,6 @@ class Method(StrEnum):
     """How a killed mapper comes back."""
 
     HYBRID = "hybrid"
-    REPLAY = "replay"
-    CHECKPOINT = "checkpoint"
     FRESH = "fresh"
 
 

@@ -170,6 +170,7 @@ class Supervisor(Actor):
         cell = one.cell
         if cell is None or cell.state is GONE:
             cell = one.cell = self._new_cell(one.spec)
+            one.ignored_life = 0  # A new address counts its lives anew.
         try:
             up = cell.host.start(cell)
         except StartFailed:
@@ -219,7 +220,8 @@ class Supervisor(Actor):
             self._give_up_address(one, reason)
             return None
         if one.spec.backoff is not None:
-            return self._later(one, reason)
+            self._later(one, reason)
+            return None
         return self._restart(one, reason)
 
     def _give_up_address(self, one: Child, reason: object) -> None:
@@ -292,16 +294,23 @@ class Supervisor(Actor):
         one.up = up
         up.add_done_callback(lambda done: self._post(StartOver(one, done)))
 
-    def start_over(self, one: Child, up: asyncio.Future[None]) -> None:
+    def start_over(self, one: Child, up: asyncio.Future[None]) -> Coroutine[Any, Any, None] | None:
         """A restart has come to its end, unless the child was stopped meanwhile or has ended again."""
-        if one.up is not up or one.cell is None:
-            return
+        cell = one.cell
+        if one.up is not up or cell is None:
+            return None
         one.up = None
         if has_succeeded(up):
             self._is_up(one)
-            return
-        one.ignored_life = one.cell.life
-        self._try_again(one, one.cell.extra().reason)
+            if cell.state is not DOWN:
+                return None
+            life = cell.life  # It ended before we heard that it was up, and so its end was not heard.
+            more = self.child_exited(cell, life, cell.extra().reason)
+            one.ignored_life = life
+            return more
+        one.ignored_life = cell.life
+        self._try_again(one, cell.extra().reason)
+        return None
 
     def _try_again(self, one: Child, reason: ExitReason) -> None:
         """A start attempt failed: the next goes through our own mailbox, so that we answer in between."""
@@ -428,6 +437,13 @@ def has_succeeded(up: asyncio.Future[None]) -> bool:
     return up.done() and not up.cancelled() and up.exception() is None
 
 
+def holds_processes(specs: Iterable[ChildSpec]) -> bool:
+    """Whether one of the children, or of theirs, has a process of its own."""
+    return any(
+        spec.isolation == "process" or (spec.is_supervisor and holds_processes(spec.start.args[1])) for spec in specs
+    )
+
+
 def supervisor(
     name: str,
     *,
@@ -461,7 +477,7 @@ def supervisor(
     except SpecError as error:
         raise SpecError(f"supervisor {name!r}", error.problem) from None
     start = Start(Supervisor, (flags, specs))
-    if isolation == "process" and any(spec.isolation == "process" for spec in specs):
+    if isolation == "process" and holds_processes(specs):
         raise SpecError(
             f"supervisor {name!r}", "a subtree in a process cannot hold process children: its own is theirs"
         )

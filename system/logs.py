@@ -40,7 +40,7 @@ class LogSink:
 
     def __call__(self, event: Event) -> None:
         level = LEVELS.get(type(event))
-        if level is None:
+        if level is None or (isinstance(event, ProcessDied) and event.reason.is_clean):
             return
         left_out = 0 if type(event) is LogLine else self._admit(type(event))
         if left_out is None:

@@ -17,10 +17,11 @@ from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.lives import LOCAL
 from ..actors.mailbox import Bounded
 from ..actors.message import Message
-from ..actors.node import Node
+from ..actors.node import Node, cell_kind
 from ..actors.process.remote import ProcessHost, on_frame
 from ..actors.process.workers import Workers
 from ..actors.ref import ActorRef
+from ..actors.topics import NOT_TAKEN
 from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
 from ..checkpoint.stores import open_journal
 from ..supervision.spec import ChildSpec, Flags
@@ -34,6 +35,9 @@ BASE = (f"{__package__}.guest_main",)
 
 ADMIN_TIMEOUT = 60.0
 """Seconds an admin call of the system may take: starting a child can mean restoring a large state."""
+
+STOP_TIMEOUT = 365 * 86_400.0
+"""Seconds `stop` waits: no limit of its own, the child specs say how long an end may take."""
 
 
 class ActorSystem:
@@ -76,6 +80,7 @@ class ActorSystem:
         self._node: Node | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
+        self._closing: asyncio.Task[None] | None = None
         self._failure: TreeFailed | None = None
 
     # -- life -------------------------------------------------------------------------------------------------------
@@ -114,7 +119,19 @@ class ActorSystem:
         if root is None or node is None:
             return
         self._body = None
-        await asyncio.shield(self._close(root, node))
+        if self._closing is None:
+            self._closing = node.loop.create_task(self._close(root, node), name=f"shutdown of {self.name}")
+        cancelled: asyncio.CancelledError | None = None
+        while (
+            not self._closing.done()
+        ):  # A second SIGTERM must not leave actors behind: first the end, then the cancel.
+            try:
+                await asyncio.shield(self._closing)
+            except asyncio.CancelledError as error:
+                cancelled = error
+        self._closing.result()
+        if cancelled is not None:
+            raise cancelled
 
     async def _close(self, root: Cell, node: Node) -> None:
         await lives.stop_and_wait(root)
@@ -177,15 +194,15 @@ class ActorSystem:
         """Stop an actor for good and wait until its hook has run; one that has stopped already is no error."""
         cell = ref._cell
         parent = cell.parent
-        if cell.spec is not None and parent is not None and isinstance(parent.actor, Supervisor):
+        if parent is not None and is_supervised(cell, parent):
             supervisor = ActorRef[Supervisor](parent)
             try:
-                await supervisor.ask(TerminateChild(cell.name), ADMIN_TIMEOUT)
+                await supervisor.ask(TerminateChild(cell.name), STOP_TIMEOUT)
                 await supervisor.ask(DeleteChild(cell.name), ADMIN_TIMEOUT)
             except NoSuchChild:  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:
-            await lives.stop_and_wait(cell, reason)
+            await lives.stop_in_time(cell, reason)
 
     def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
         """A ref to the actor at an address.
@@ -221,7 +238,10 @@ class ActorSystem:
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Send to every subscriber of a topic; waits for room at bounded ones."""
         for cell in self.node.topics.subscribers(topic):
-            await cell.ref.send(message)
+            try:
+                await cell.ref.send(message)
+            except NOT_TAKEN as error:
+                self.node.not_taken(cell, message, error)
 
     def bind(self, ref: ActorRef[Any], port: str, target: ActorRef[Any]) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError."""
@@ -264,3 +284,10 @@ class ActorSystem:
             waiting.extend(reversed(list((cell.children or {}).values())))
         return found
 
+
+def is_supervised(cell: Cell, parent: Cell) -> bool:
+    """Whether a supervisor looks after the actor; in another process that is known by the supervisor's class only."""
+    if parent.actor is not None:
+        return cell.spec is not None and isinstance(parent.actor, Supervisor)
+    kind = cell_kind(parent)
+    return kind is not None and issubclass(kind, Supervisor)

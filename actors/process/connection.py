@@ -186,7 +186,7 @@ class Connection(asyncio.BufferedProtocol):
         self._end += count
         try:
             self._take_frames()
-        except (BadFrame, msgspec.DecodeError) as error:
+        except (BadFrame, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.close(error if isinstance(error, BadFrame) else BadFrame(str(error)))
 
     def _take_frames(self) -> None:

@@ -15,6 +15,7 @@ import importlib
 import json
 import mmap
 import os
+import select
 import signal
 import socket
 import subprocess
@@ -76,6 +77,13 @@ class Forked:
                 os.close(fd)
         self.pidfd = self.stdout_fd = self.stderr_fd = -1
         self.page.close()
+
+
+def has_ended(pidfd: int) -> bool:
+    """Whether the process behind a pidfd is dead, now."""
+    poll = select.poll()
+    poll.register(pidfd, select.POLLIN)
+    return bool(poll.poll(0))
 
 
 class _Request:
@@ -191,6 +199,10 @@ class ForkServer:
         if self._process is None:
             raise ProcessUnavailable("the fork server has not been started")
         return self._process.pid
+
+    def has_ended(self) -> bool:
+        """Whether the server is dead, even if the loop has not come to see it yet."""
+        return self._pidfd < 0 or has_ended(self._pidfd)
 
     # --- starting and stopping
 

@@ -134,18 +134,5 @@ class Moved(Frame, tag=14):
 
 
 AnyFrame = (
-    Tell
-    | Ask
-    | Reply
-    | Failure
-    | Launch
-    | Launched
-    | Ended
-    | Command
-    | Publish
-    | Beat
-    | Note
-    | Record
-    | Offer
-    | Moved
+    Tell | Ask | Reply | Failure | Launch | Launched | Ended | Command | Publish | Beat | Note | Record | Offer | Moved
 )

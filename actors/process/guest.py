@@ -12,17 +12,18 @@ from typing import Any
 
 import uvloop
 
-from .. import lives
+from .. import exits, lives
 from ..cell import RUNNING, Cell
 from ..errors import HoldfastError, StartFailed
-from ..events import Event, event_data
-from ..exits import ExitReason, pack_exit, unpack_exit
-from ..links import Down, Exit, Monitor
+from ..events import ActorStarted, Event, event_data
+from ..exits import ExitReason, pack_exit
+from ..message import message_name
 from ..node import Node
+from ..topics import Topics
 from . import frames
-from .connection import Connection
+from .connection import BadFrame, Connection
 from .recipe import unpack_recipe
-from .relay import OutsideHost, Peer
+from .relay import OutsideHost, Peer, named, obey, text
 
 Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
 """Begins the life a launch frame asks for; the composition root gives one that knows recovery and supervision."""
@@ -36,9 +37,7 @@ def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callabl
         return runner.run(_serve(sock, page, launcher, prepare))
 
 
-async def _serve(
-    sock: socket.socket, page: memoryview, launcher: Launcher, prepare: Callable[[Guest], None]
-) -> int:
+async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
     guest = Guest(asyncio.get_running_loop(), page, launcher)
     prepare(guest)
     guest.connection = Connection(guest.on_frame, guest.on_lost)
@@ -63,28 +62,78 @@ class GuestHost(lives.LocalHost):
         self._guest.report_end(cell, more.reason if more is not None else None)
 
 
+class InnerHost(lives.LocalHost):
+    """The host of all other actors of the process: the root knows their addresses, so that they can be reached."""
+
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+
+    def retired(self, cell: Cell) -> None:
+        self._guest.tell_gone(cell)
+
+
+class GuestTopics(Topics):
+    """Topics in an actor process: the root knows all subscribers, so it is told of ours."""
+
+    def __init__(self, guest: Guest) -> None:
+        super().__init__()
+        self._guest = guest
+
+    def subscribe(self, topic: str, cell: Cell) -> None:
+        super().subscribe(topic, cell)
+        self._guest.command(cell, "subscribe", {"topic": topic})
+
+    def unsubscribe(self, topic: str, cell: Cell) -> None:
+        super().unsubscribe(topic, cell)
+        self._guest.command(cell, "unsubscribe", {"topic": topic})
+
+
+class NudgingPage:
+    """The page of an actor with a bounded mailbox: the home is told, once per loop tick, when it has changed."""
+
+    __slots__ = ("_guest", "_is_told", "_page")
+
+    def __init__(self, guest: Guest, page: memoryview) -> None:
+        self._guest, self._page = guest, page
+        self._is_told = False
+
+    def __setitem__(self, index: int, number: int) -> None:
+        self._page[index] = number
+        if not self._is_told:
+            self._is_told = True
+            self._guest.node.loop.call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._is_told = False
+        self._guest.connection.send(frames.Moved())
+
+
 class Guest(Peer):
     """The child's end of the connection, and its node."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, page: memoryview, launcher: Launcher) -> None:
         super().__init__(Node("guest", loop))
-        self.page = page
+        self.page: Any = page
         self.ended: asyncio.Future[int] = loop.create_future()
         self.on_record: Callable[[frames.Record], None] | None = None
         self.recovery: Any = None  # the recovery method's side in this process, if it has one
         self._launcher = launcher
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}
-        self._monitors: dict[str, list[Monitor]] = {}
         self._host = OutsideHost(self)
         self.node.outside = self.outside
         self.node.uplink = self
+        self.node.here = InnerHost(self)
+        self.node.topics = GuestTopics(self)
         self.node.events.add_sink(self._on_event)
 
     # -- the world outside ------------------------------------------------------------------------------------------
 
-    def outside(self, path: str) -> Cell:
-        """The stand-in for an address that is not in this process."""
+    def outside(self, path: str) -> Cell | None:
+        """The stand-in for an address that is not in this process; None for one that would be."""
+        root = self.node.root
+        if root is not None and (path == root.path or path.startswith(root.path + "/")):
+            return None
         cell = self._outside.get(path)
         if cell is None:
             cell = self._outside[path] = Cell(self.node, None, path, self._host)
@@ -92,22 +141,37 @@ class Guest(Peer):
             cell.admit = self._host.admit
         return cell
 
-    def publish(self, topic: str, message: Any, sender: Cell | None) -> None:
-        """Publish through the root."""
+    def publish(self, topic: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
+        """Publish through the root; the future ends when every subscriber has accepted."""
+        connection = self.connection
         name, body = self._payload(message)
-        source = None if sender is None else self.connection.name_out(sender.path)
-        self.connection.send(frames.Publish(topic, name, body, source), topic)
+        source = None if sender is None else connection.name_out(sender.path)
+        key, accepted = self.acceptance()
+        connection.send(frames.Publish(key, topic, name, body, source), topic)
+        return accepted
 
-    def command(self, cell: Cell, verb: str, **data: Any) -> None:
-        """Ask the root to do something to an address."""
+    def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """Tell the root something about an address."""
         self.connection.send(frames.Command(self.connection.name_out(cell.path), verb, data))
 
-    def monitor(self, watch: Monitor) -> None:
-        """Watch an address outside."""
-        self._monitors.setdefault(watch.target.path, []).append(watch)
-        self.command(watch.target, "monitor", watcher=watch.watcher.path, for_good=watch.for_good)
+    def tell_gone(self, cell: Cell) -> None:
+        """An address of this process is free."""
+        root = self.node.root
+        reason = cell.more.reason if cell.more is not None else lives.SHUTDOWN
+        if root is not None:
+            self.command(root, "gone", {"path": cell.path, "reason": pack_exit(reason)})
+
+    def _tell_born(self, path: str) -> None:
+        """A life has begun at an address below ours."""
+        root, cell = self.node.root, self.node.find(path)
+        if root is not None and cell is not None and cell.actor is not None:
+            self.command(root, "born", {"path": path, "kind": message_name(type(cell.actor)), "life": cell.life})
 
     def _on_event(self, event: Event) -> None:
+        if type(event) is ActorStarted:
+            if self.node.root is not None and event.address == self.node.root.path:
+                return  # The root tells of this one when it is up.
+            self._tell_born(event.address)
         self.connection.send(frames.Note(type(event).__name__, event_data(event)))
 
     # -- frames from the root ---------------------------------------------------------------------------------------
@@ -121,6 +185,8 @@ class Guest(Peer):
             case frames.Ask():
                 cell = self._target(frame.to)
                 self.on_ask(cell, frame, self.page if frame.number else None)
+            case frames.Offer():
+                self.on_offer([self._target(frame.to)], frame)
             case frames.Reply():
                 self.on_reply(frame)
             case frames.Failure():
@@ -133,33 +199,36 @@ class Guest(Peer):
                 if self.on_record is not None:
                     self.on_record(frame)
             case _:
-                raise HoldfastError(f"the root sent a {type(frame).__name__}")
+                raise BadFrame(f"the root sent a {type(frame).__name__}")
 
     def _target(self, to: frames.Name) -> Cell:
         """The cell at an address of this process."""
         if type(to) is int and (cell := self._targets.get(to)) is not None:
             return cell
         path = self.connection.name_in(to)
-        cell = self.node.find(path)
-        assert cell is not None
+        cell = self.node.cell_at(path)
         if cell is self.node.root:  # Cells of a subtree come and go; ours stays.
-            self._targets[self.connection.number_in(path)] = cell
+            self._targets[self.connection.number_in(to)] = cell
         return cell
 
     def _launch(self, frame: frames.Launch) -> None:
         path = self.connection.name_in(frame.to)
         limits = frame.options.get("limits") or {}
-        _apply(limits)
-        if limits.get("beat"):
-            self._beat(float(limits["beat"]))
+        if frame.options.get("bounded"):
+            self.page = NudgingPage(self, self.page)
         node = self.node
         cell = node.root = Cell(node, None, path, GuestHost(self))
         cell.life = frame.life - 1
         try:
+            _apply(limits)
+            for port, target in frame.options.get("bindings", {}).items():
+                cell.extra().bindings[port] = node.cell_at(target)
             cell.extra().start = unpack_recipe(frame.recipe)
+            if limits.get("beat"):
+                self._beat(float(limits["beat"]))
             up = self._launcher(self, cell, frame)
-        except (HoldfastError, ImportError) as error:
-            self._launched(frame.id, error.reason if isinstance(error, StartFailed) else str(error))
+        except Exception as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
+            self._launched(frame.id, error.reason if isinstance(error, StartFailed) else str(exits.crash(error)))
             return
         if up is None:
             self._launched(frame.id, "")
@@ -177,27 +246,10 @@ class Guest(Peer):
         self.connection.send(frames.Launched(key, problem))
 
     def _command(self, cell: Cell, frame: frames.Command) -> None:
-        data = frame.data
-        match frame.verb:
-            case "stop":
-                cell.request_stop(unpack_exit(data["reason"]))
-            case "kill":
-                cell.kill()
-            case "exit":
-                cell.push(Exit(self.node.cell_at(data["source"]), unpack_exit(data["reason"])))
-            case "down":
-                self._down(cell, data)
-            case "bind":
-                cell.extra().bindings[data["port"]] = self.node.cell_at(data["target"])
-            case verb:
-                raise HoldfastError(f"unknown command {verb!r}")
-
-    def _down(self, cell: Cell, data: dict[str, Any]) -> None:
-        watches = self._monitors.get(data["source"], [])
-        for watch in [watch for watch in watches if watch.watcher is cell]:
-            watches.remove(watch)
-            cell.push(Down(watch, unpack_exit(data["reason"]), recovering=bool(data["recovering"])))
-            break
+        if frame.verb == "bind":
+            cell.extra().bindings[text(frame, "port")] = named(self.node, frame, "target")
+        else:
+            obey(self.node, cell, frame)
 
     # -- the end ----------------------------------------------------------------------------------------------------
 
@@ -232,5 +284,3 @@ def _apply(limits: dict[str, Any]) -> None:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     if limits.get("niceness"):
         os.nice(int(limits["niceness"]))
-
-

@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 LONGEST = 16 * 1024
 """Bytes after which a line without an end is passed on in pieces."""
+LAST_READS = 16
+"""How often a pipe is read at the end: a descendant that writes without end must not hold us up."""
 
 
 class OutputReader:
@@ -30,8 +32,9 @@ class OutputReader:
             return
         *lines, self._rest = (self._rest + data).split(b"\n")
         if len(self._rest) > LONGEST:
-            lines.append(self._rest)
-            self._rest = b""
+            end = _whole_characters(self._rest)
+            lines.append(self._rest[:end])
+            self._rest = self._rest[end:]
         for line in lines:
             self._on_line(line.decode("utf-8", "replace"))
 
@@ -42,8 +45,8 @@ class OutputReader:
         fd, self._fd = self._fd, -1
         self._loop.remove_reader(fd)
         try:
-            while data := os.read(fd, 64 * 1024):
-                self._rest += data
+            for _ in range(LAST_READS):
+                self._rest += os.read(fd, 64 * 1024)
         except OSError:
             pass  # Nothing more is there, or a descendant holds the other end open.
         os.close(fd)
@@ -51,3 +54,13 @@ class OutputReader:
             if line:
                 self._on_line(line.decode("utf-8", "replace"))
         self._rest = b""
+
+
+def _whole_characters(data: bytes) -> int:
+    """Where to cut so that no UTF-8 character is cut: before the last one, if it may be one of several bytes."""
+    for back in (1, 2, 3):
+        if data[-back] >= 0xC0:
+            return len(data) - back
+        if data[-back] < 0x80:
+            break
+    return len(data)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import sys
-from typing import Any
+from typing import Any, TypeVar
 
 from ..actor import Actor, Start
 from ..errors import SpecError, type_name
 from ..message import message_name
 from ..values import decode_value, encode_value
+
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -37,10 +39,7 @@ def pack_recipe(start: Start[Any], where: str) -> bytes:
         UnsavableValue: naming the argument that cannot be encoded.
         SpecError: the class cannot be found by name.
     """
-    kind = start.kind
-    if "<locals>" in kind.__qualname__:
-        raise SpecError(where, f"{type_name(kind)} is defined in a function, so another process cannot import it")
-    return encode_value(_lower(start), where=f"{where}: start({kind.__name__}, ...)")
+    return encode_value(_lower(start, where), where=f"{where}: start({start.kind.__name__}, ...)")
 
 
 def unpack_recipe(data: bytes) -> Start[Any]:
@@ -55,18 +54,23 @@ def unpack_recipe(data: bytes) -> Start[Any]:
     return start
 
 
-def _lower(value: Any) -> Any:
+def _lower(value: Any, where: str) -> Any:
     """`value` with every Start replaced by plain data."""
     if isinstance(value, Start):
-        return _Packed(message_name(value.kind), _lower(value.args), _lower(value.kwargs))
+        kind = value.kind
+        if "<locals>" in kind.__qualname__:
+            raise SpecError(where, f"{type_name(kind)} is defined in a function, so another process cannot import it")
+        return _Packed(message_name(kind), _lower(value.args, where), _lower(value.kwargs, where))
     if type(value) in (list, tuple):
-        return type(value)(_lower(inner) for inner in value)
+        return type(value)(_lower(inner, where) for inner in value)
     if type(value) is dict:
-        return {key: _lower(inner) for key, inner in value.items()}
+        return {key: _lower(inner, where) for key, inner in value.items()}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         if any(isinstance(inner, Start) for inner in fields.values()):
-            return _PackedData(message_name(type(value)), {name: _lower(inner) for name, inner in fields.items()})
+            return _PackedData(
+                message_name(type(value)), {name: _lower(inner, where) for name, inner in fields.items()}
+            )
     return value
 
 
@@ -82,6 +86,15 @@ def _raise_up(value: Any) -> Any:
     return value
 
 
+def loaded(name: str, base: type[T]) -> type[T] | None:
+    """The class with this name, if it is loaded here; nothing is imported."""
+    module_name, _, path = name.partition(":")
+    found: Any = sys.modules.get(module_name)
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    return found if isinstance(found, type) and issubclass(found, base) else None
+
+
 def _find(name: str, base: type) -> type[Any]:
     """The class with this name, if it is of the expected kind."""
     module_name, _, path = name.partition(":")
@@ -89,7 +102,7 @@ def _find(name: str, base: type) -> type[Any]:
         found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)
         for part in path.split("."):
             found = getattr(found, part)
-    except (ImportError, AttributeError) as error:
+    except Exception as error:  # Importing a module runs it: it may raise anything.
         raise SpecError("recipe", f"{name} cannot be imported: {error}") from error
     if not (isinstance(found, type) and issubclass(found, base)):
         raise SpecError("recipe", f"{name} is no {base.__name__}")

@@ -12,7 +12,7 @@ import msgspec
 
 from .. import links
 from ..codec import Codec, Parcel, Raw
-from ..errors import BadMessage, HoldfastError
+from ..errors import BadMessage, HoldfastError, type_name
 from ..exits import ExitReason, pack_exit, unpack_exit
 from ..mail import Ask, Chain, Envelope, Item
 from ..message import Message, message_name
@@ -170,7 +170,7 @@ class Peer:
         connection = self.connection
         name = connection.name_in(frame.name)
         sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
-        ask = RelayedAsk(self, frame, sender, page)
+        ask = RelayedAsk.taken(self, frame, cell, sender, page)
         try:
             ask.message = self.codec.message_in(cell, name, frame.body)
             if ask.chain and (ctx := cell.ctx) is not None and ctx.turn_in(ask.chain):
@@ -233,13 +233,11 @@ class Offered:
         cell.admit(cell, message if self._sender is None else Envelope(message, self._sender))
 
 
-class Arrived(Envelope):
+class Arrived(Envelope, eq=False):
     """A message from the home of this process's actor: the page says which one is being handled."""
 
-    __slots__ = ("number", "page")
-
-    def __init__(self, message: Message[Any], sender: Cell | None, number: int, page: memoryview) -> None:
-        self.message, self.sender, self.number, self.page = message, cast("Any", sender), number, page
+    number: int
+    page: Any
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -260,16 +258,27 @@ async def _until_done(turn: Any, item: Any) -> None:
     item.page[1] = item.number
 
 
-class RelayedAsk(Ask):
+class RelayedAsk(Ask, eq=False):
     """An ask from the other side of a connection: its outcome becomes a frame."""
 
-    __slots__ = ("_done", "_id", "_peer", "number", "page")
+    peer: Any = None
+    id: int = 0
+    number: int = 0
+    page: Any = None
+    is_over: bool = False
 
-    def __init__(self, peer: Peer, frame: frames.Ask, sender: Cell | None, page: memoryview | None) -> None:
-        deadline = peer.node.loop.time() + frame.left
-        super().__init__(cast("Any", None), sender, cast("Chain", frame.chain), frame.left, deadline, cast("Any", None))
-        self._peer, self._id, self._done = peer, frame.id, False
-        self.number, self.page = frame.number, page
+    @classmethod
+    def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, sender: Cell | None, page: memoryview | None) -> RelayedAsk:
+        """The ask that a frame carries; its message is decoded behind it."""
+        left = frame.left
+        deadline = peer.node.loop.time() + left
+        ask = cls(None, sender, frame.chain, left, deadline, None, cell, False, peer, frame.id, frame.number, page)
+        ask.future = ask
+        return ask
+
+    def done(self) -> bool:
+        """As a future has it."""
+        return self.is_over
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -285,36 +294,40 @@ class RelayedAsk(Ask):
 
     @property
     def is_done(self) -> bool:
-        return self._done
+        return self.is_over
 
     def answer(self, reply: object) -> None:
         from ..mail import ReplyHandle
 
-        if type(reply) is ReplyHandle or self._done:
+        if type(reply) is ReplyHandle or self.is_over:
             return
-        self._done = True
-        connection = self._peer.connection
+        self.is_over = True
+        connection = self.peer.connection
         try:
-            connection.send(frames.Reply(self._id, cast("Any", reply)))
+            connection.send(frames.Reply(self.id, cast("Any", reply)))
         except BadMessage as error:
-            self._done = False
+            self.is_over = False
             self.fail(BadMessage("reply", error.message, error.problem))
 
     def answer_raw(self, body: bytes) -> None:
         """Pass an encoded reply on."""
-        if not self._done:
-            self._done = True
-            self._peer.connection.send(frames.Reply(self._id, Raw(body)))
+        if not self.is_over:
+            self.is_over = True
+            self.peer.connection.send(frames.Reply(self.id, Raw(body)))
 
     def fail(self, error: BaseException) -> None:
-        kind, name, body = self._peer.codec.encode_error(error)
+        codec = self.peer.codec
+        try:
+            kind, name, body = codec.encode_error(error)
+        except BadMessage as bad:  # A Refusal with a field that cannot be sent is a reply that cannot.
+            kind, name, body = codec.encode_error(BadMessage("reply", type_name(type(error)), bad.problem))
         self.fail_raw(kind, name, body)
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:
         """Pass an encoded error on."""
-        if not self._done:
-            self._done = True
-            self._peer.connection.send(frames.Failure(self._id, kind, name, Raw(body)))
+        if not self.is_over:
+            self.is_over = True
+            self.peer.connection.send(frames.Failure(self.id, kind, name, Raw(body)))
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         if self.page is None:
@@ -383,32 +396,42 @@ def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
     """Do what the other side wants of an actor on this one: stop and kill, and all about links and monitors.
 
     Raises:
-        BadFrame: it is no such command.
+        BadFrame, DecodeError: it is no such command.
     """
     data = frame.data
-    try:
-        match frame.verb:
-            case "stop":
-                cell.request_stop(unpack_exit(data["reason"]))
-            case "kill":
-                cell.kill()
-            case "exit":
-                source, reason = node.cell_at(data["source"]), unpack_exit(data["reason"])
-                if links.sever(cell, source):  # Else it was unlinked while this was on its way.
-                    cell.push(links.Exit(source, reason))
-            case "down":
-                source, reason = node.cell_at(data["source"]), unpack_exit(data["reason"])
-                recovering, for_good = bool(data["recovering"]), bool(data["for_good"])
-                links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good)
-            case "monitor":
-                links.monitor(node.cell_at(data["watcher"]), cell, for_good=bool(data["for_good"]))
-            case "demonitor":
-                links.demonitor(node.cell_at(data["watcher"]), cell, for_good=bool(data["for_good"]))
-            case "link":
-                links.link(node.cell_at(data["peer"]), cell)
-            case "unlink":
-                links.sever(node.cell_at(data["peer"]), cell)
-            case verb:
-                raise BadFrame(f"unknown command {verb!r}")
-    except (KeyError, TypeError, AttributeError) as error:
-        raise BadFrame(f"command {frame.verb!r} with {data!r}") from error
+    match frame.verb:
+        case "stop":
+            cell.request_stop(unpack_exit(data.get("reason")))
+        case "kill":
+            cell.kill()
+        case "exit":
+            source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
+            if links.sever(cell, source):  # Else it was unlinked while this was on its way.
+                cell.push(links.Exit(source, reason))
+        case "down":
+            source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
+            recovering, for_good = bool(data.get("recovering")), bool(data.get("for_good"))
+            links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good)
+        case "monitor":
+            links.monitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
+        case "demonitor":
+            links.demonitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
+        case "link":
+            links.link(named(node, frame, "peer"), cell)
+        case "unlink":
+            links.sever(named(node, frame, "peer"), cell)
+        case verb:
+            raise BadFrame(f"unknown command {verb!r}")
+
+
+def named(node: Node, frame: frames.Command, key: str) -> Cell:
+    """The cell whose address a command gives."""
+    return node.cell_at(text(frame, key))
+
+
+def text(frame: frames.Command, key: str) -> str:
+    """A text that a command gives."""
+    value = frame.data.get(key)
+    if not isinstance(value, str):
+        raise BadFrame(f"command {frame.verb!r} has {key} {value!r}")
+    return value

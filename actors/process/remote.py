@@ -8,39 +8,46 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from .. import links, lives, mailbox
-from ..cell import DOWN, ENDING, GONE, RUNNING, Cell
+from ..cell import DOWN, GONE, RUNNING, Cell
 from ..codec import Parcel
-from ..errors import AskFailed, BadMessage, ProcessUnavailable, StartFailed
+from ..errors import AskFailed, BadMessage, HoldfastError, ProcessUnavailable, StartFailed
 from ..events import ActorStarted
-from ..exits import KILLED, ExitReason, pack_exit
+from ..exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..mail import Ask, Envelope, Item
 from . import frames
+from .connection import BadFrame
 from .limits import Limits
 from .recipe import pack_recipe
-from .relay import RelayedAsk, send_signal
+from .relay import obey, send_signal, text
 from .workers import Worker, Workers
 
 if TYPE_CHECKING:
     from ..node import Node
 
-TRIM = 256
-"""How many messages may be in flight before the page is asked which of them are done."""
-
 
 class Outlet:
     """The way from an address to the process its actor lives in, and what is on the way."""
 
-    __slots__ = ("_asked", "acknowledged", "flight", "path", "sent", "worker")
+    __slots__ = ("begun", "flight", "path", "sent", "worker")
 
     def __init__(self, path: str) -> None:
         self.path = path
+        self.begun = 0  # the newest that has been begun, as far as it was looked at
         self.worker: Worker | None = None
         self.flight: deque[tuple[int, Any]] = deque()  # (number, item), oldest first, until the page says done
         self.sent = 0
+
+    def hand_over(self, cell: Cell, item: Any) -> None:
+        """Send what was queued, the runtime's own signals among it."""
+        worker = self.worker
+        assert worker is not None
+        if isinstance(item, (links.Exit, links.Down)):
+            send_signal(worker, self.path, item)
+        else:
+            self.send(cell, item)
 
     def send(self, cell: Cell, item: Any) -> None:
         """Send to the process; raises BadMessage if the item cannot be coded."""
@@ -50,8 +57,10 @@ class Outlet:
         worker.send_item(cell, self.path, item, number)
         self.sent = number
         self.flight.append((number, item))
-        if len(self.flight) >= TRIM and number % TRIM == 0:
-            self.trim()
+        done = worker.page[1]
+        flight = self.flight
+        while flight[0][0] <= done:  # What has been handled is let go soon: a large message is large memory.
+            flight.popleft()
 
     def trim(self) -> None:
         """Forget what has been handled."""
@@ -68,7 +77,7 @@ class Outlet:
         """The process is gone. Returns what was being handled and what was not begun, in order."""
         worker, self.worker = self.worker, None
         running, done = (worker.page[0], worker.page[1]) if worker is not None else (0, 0)
-        flight, self.flight, self.sent = self.flight, deque(), 0
+        flight, self.flight, self.sent, self.begun = self.flight, deque(), 0, 0
         begun = [item for number, item in flight if number == running > done]
         queued = [item for number, item in flight if number > max(running, done)]
         return begun, queued
@@ -84,6 +93,72 @@ def admit_remote(cell: Cell, item: Any) -> None:
         mailbox.queue_of(cell).append(item)
     else:
         outlet.send(cell, item)
+
+
+def admit_remote_bounded(cell: Cell, item: Any) -> None:
+    """As `admit_remote`, with a capacity: what is queued here counts, and what is sent and not begun."""
+    if type(item) not in cell.table and type(item) is not Parcel:
+        _require(cell, item)
+    more = cell.extra()
+    _check_codable(cell, item)
+    assert more.bound is not None
+    more.bound.admit(cell, item)
+
+
+class RemoteBound(mailbox.Bound):
+    """The bound of a mailbox whose actor lives in another process.
+
+    What is sent cannot be dropped any more. So a policy that drops queued messages sends one at a time.
+    """
+
+    __slots__ = ("_at_once",)
+
+    def __init__(self, bound: mailbox.Bound) -> None:
+        super().__init__(bound.capacity, bound.overflow)
+        self._at_once = 1 if bound.overflow in ("drop_oldest", "latest") else bound.capacity + 1
+
+    def put(self, cell: Cell, item: Any) -> None:
+        self.count += 1
+        mailbox.queue_of(cell).append(item)
+        self.send(cell)
+
+    def send(self, cell: Cell) -> None:
+        """Send what is queued, as far as it may go."""
+        outlet: Outlet = cell.extra().outlet
+        queue = mailbox.queue_of(cell)
+        if outlet.worker is None:
+            return
+        outlet.trim()
+        while queue and len(outlet.flight) < self._at_once:
+            item = deque.popleft(queue)  # It still counts.
+            try:
+                outlet.hand_over(cell, item)
+            except BadMessage as error:
+                self.count -= mailbox.counts(item)
+                undelivered(cell, item, error)
+
+    def moved(self, cell: Cell) -> None:
+        """The actor has begun or ended turns."""
+        outlet: Outlet = cell.extra().outlet
+        if outlet.worker is None:
+            return
+        begun = max(outlet.begun, outlet.worker.page[0])
+        freed, outlet.begun = begun - outlet.begun, begun
+        for _ in range(freed):
+            self.taken(cell)
+        self.send(cell)
+
+    def recount(self, cell: Cell) -> None:
+        """The process is gone: what counts is what is queued."""
+        self.count = sum(map(mailbox.counts, cell.queue or ()))
+
+
+def undelivered(cell: Cell, item: Any, error: HoldfastError) -> None:
+    """A queued item turned out not to be sendable."""
+    if isinstance(item, Ask):
+        item.fail(error)
+    else:
+        cell.node.dead_letter(cell, item, str(error))
 
 
 def _require(cell: Cell, item: Any) -> None:
@@ -123,28 +198,37 @@ class ProcessHost:
         if more.outlet is None:
             more.outlet = Outlet(cell.path)
             cell.admit = admit_remote
+            if more.bound is not None:
+                more.bound = RemoteBound(more.bound)
+                cell.admit = admit_remote_bounded
         self._stop_wanted = None
         self._starting = cell.node.loop.create_task(self._start(cell), name=f"start of {cell.path}")
         return self._starting
 
     async def _start(self, cell: Cell) -> None:
-        start = cell.extra().start
+        more = cell.extra()
+        start = more.start
         assert start is not None
         try:
             recipe = pack_recipe(start, cell.path)
             worker = await self._workers.take()
         except ProcessUnavailable as error:
             raise StartFailed(cell.path, str(error)) from error
+        if cell.state is not DOWN:
+            worker.kill(KILLED)
+            raise StartFailed(cell.path, "it was stopped while it started")
         cell.life += 1
         cell.state = RUNNING
         worker.adopt(cell, self._limits, self.died)
         for topic in start.kind._topics:
             cell.node.topics.subscribe(topic, cell)
         try:
-            await worker.launch(cell, recipe, self._options)
+            await worker.launch(cell, recipe, dict(self._options, bounded=more.bound is not None))
         except StartFailed:
             await worker.gone()
             raise
+        if self._workers.of(cell) is not worker:
+            raise StartFailed(cell.path, str(more.reason))  # It was up, and has died before we came to it.
         self.up(cell, worker)
 
     def up(self, cell: Cell, worker: Worker) -> None:
@@ -154,19 +238,16 @@ class ProcessHost:
             node.emit(ActorStarted(cell.path, cell.life))
         outlet: Outlet = cell.extra().outlet
         outlet.worker = worker
-        queue = cell.queue
-        while queue and outlet.worker is not None:
-            item = queue.popleft()
-            try:
-                if isinstance(item, (Exit_, Down_)):
-                    send_signal(worker, cell.path, item)
-                else:
-                    outlet.send(cell, item)
-            except BadMessage as error:
-                if isinstance(item, Ask):
-                    item.fail(error)
-                else:
-                    node.dead_letter(cell, item, str(error))
+        bound, queue = cell.extra().bound, cell.queue
+        if isinstance(bound, RemoteBound):
+            bound.send(cell)
+        else:
+            while queue:
+                item = queue.popleft()
+                try:
+                    outlet.hand_over(cell, item)
+                except BadMessage as error:
+                    undelivered(cell, item, error)
         if self._stop_wanted is not None:
             self.stop(cell, self._stop_wanted)
 
@@ -204,6 +285,9 @@ class ProcessHost:
         begun, queued = outlet.close()
         if queued:
             mailbox.queue_of(cell).extendleft(reversed(queued))
+        bound = cell.extra().bound
+        if isinstance(bound, RemoteBound):
+            bound.recount(cell)
         for item in begun:
             if isinstance(item, Ask):
                 item.fail(AskFailed(cell.path, str(reason)))
@@ -221,13 +305,18 @@ class ProcessHost:
 
     def push(self, cell: Cell, item: Item) -> None:
         outlet: Outlet | None = cell.extra().outlet
-        if outlet is None or outlet.worker is None:
+        if outlet is None or outlet.worker is None or cell.queue:
             mailbox.queue_of(cell).append(item)
         else:
             send_signal(outlet.worker, cell.path, item)
 
+    def offer(self, cell: Cell, item: Any) -> None:
+        cell.admit(cell, item)
 
-Exit_, Down_ = links.Exit, links.Down
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        worker = self._workers.of(cell)
+        if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
+            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
 
 
 def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
@@ -241,8 +330,12 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_ask(_target(node, worker, frame.to), frame, None)
         case frames.Failure():
             worker.on_failure(frame)
+        case frames.Moved():
+            worker.on_moved()
+        case frames.Offer():
+            worker.on_offer([_target(node, worker, frame.to)], frame)
         case frames.Publish():
-            _publish(node, worker, frame)
+            worker.on_offer(node.topics.subscribers(frame.topic), frame)
         case frames.Command():
             _command(node, worker, frame)
         case frames.Launched():
@@ -256,7 +349,7 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
         case frames.Record():
             worker.on_record(frame)
         case frames.Launch():
-            raise TypeError("an actor process cannot launch actors here")
+            raise BadFrame("an actor process cannot launch actors here")
 
 
 def _target(node: Node, worker: Worker, to: frames.Name) -> Cell:
@@ -264,43 +357,21 @@ def _target(node: Node, worker: Worker, to: frames.Name) -> Cell:
         return cell
     path = worker.connection.name_in(to)
     cell = node.cell_at(path)
-    worker.targets[worker.connection.number_in(path)] = cell
+    worker.targets[worker.connection.number_in(to)] = cell
     return cell
 
 
-def _publish(node: Node, worker: Worker, frame: frames.Publish) -> None:
-    """A message for every subscriber; each decodes it for itself."""
-    name = worker.connection.name_in(frame.name)
-    sender = None if frame.sender is None else node.cell_at(worker.connection.name_in(frame.sender))
-    for cell in node.topics.subscribers(frame.topic):
-        try:
-            message = node.codec.message_in(cell, name, frame.body)
-            cell.admit(cell, message if sender is None else Envelope(message, sender))
-        except Exception as error:  # One subscriber's trouble is not another's.
-            node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error))
-
-
 def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
-    """A command from an actor process to an address: links and monitors, stop and kill."""
-    from ..exits import unpack_exit
-
-    target = node.cell_at(worker.connection.name_in(frame.to))
+    """What an actor process wants done to an address, or tells of its own."""
+    cell = node.cell_at(worker.connection.name_in(frame.to))
     match frame.verb:
-        case "stop":
-            target.request_stop(unpack_exit(frame.data["reason"]))
-        case "kill":
-            target.kill()
-        case "monitor":
-            links.monitor(node.cell_at(frame.data["watcher"]), target, for_good=bool(frame.data["for_good"]))
-        case "link":
-            links.link(node.cell_at(frame.data["peer"]), target)
-        case "unlink":
-            links.unlink(node.cell_at(frame.data["peer"]), target)
         case "subscribe":
-            node.topics.subscribe(frame.data["topic"], target)
+            node.topics.subscribe(text(frame, "topic"), cell)
         case "unsubscribe":
-            node.topics.unsubscribe(frame.data["topic"], target)
-        case verb:
-            raise TypeError(f"unknown command {verb!r}")
-
-
+            node.topics.unsubscribe(text(frame, "topic"), cell)
+        case "born":
+            worker.inner.born(cell, text(frame, "path"), text(frame, "kind"), int(frame.data.get("life", 0)))
+        case "gone":
+            worker.inner.gone(text(frame, "path"), unpack_exit(frame.data.get("reason")))
+        case _:
+            obey(node, cell, frame)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import ctypes
 import os
 import signal
 import time
@@ -17,7 +18,8 @@ from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpac
 from ..mail import Ask
 from . import frames
 from .connection import Connection
-from .forkserver import Forked, ForkServer
+from .forkserver import Forked, ForkServer, has_ended
+from .inner import Inner
 from .limits import Limits
 from .output import OutputReader
 from .relay import Peer
@@ -28,18 +30,19 @@ if TYPE_CHECKING:
 
 REAPED_WITHIN = 2.0
 """Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
-LAUNCH_SECONDS = 60.0
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # as in malloc.h
 
 
 class Worker(Peer):
     """One OS process: its connection, the actor it was given, and how it ends."""
 
-    def __init__(self, workers: Workers, forked: Forked) -> None:
+    def __init__(self, workers: Workers, forked: Forked, server: ForkServer) -> None:
         super().__init__(workers.node)
-        self.forked = forked
+        self.forked, self.server = forked, server
         self.pid = forked.pid
         self.page = memoryview(forked.page).cast("Q")
         self.targets: dict[int, Cell] = {}
+        self.inner = Inner(self.node, self)
         self.cell: Cell | None = None
         self.on_record: Callable[[frames.Record], None] = _no_records
         self._workers = workers
@@ -49,6 +52,7 @@ class Worker(Peer):
         self._killed_for: ExitReason | None = None
         self._status: int | None = None
         self._lost = False
+        self._is_orphaned = False
         self._buried = False
         self._grave: asyncio.Future[None] = self.node.loop.create_future()
         self.noticed_at = 0.0  # when the first sign of its end came, on the monotonic clock
@@ -67,6 +71,10 @@ class Worker(Peer):
             fd = getattr(forked, name)
             setattr(forked, name, -1)
             self._outputs.append(OutputReader(loop, fd, lambda text, stream=stream: self._on_line(stream, text)))
+
+    def is_alive(self) -> bool:
+        """Whether it can be given an actor: a process ends with its fork server, but not in the same instant."""
+        return self.connection.is_open and not self.server.has_ended() and not has_ended(self.forked.pidfd)
 
     def adopt(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
         """This process is now that of the actor at `cell`."""
@@ -89,7 +97,8 @@ class Worker(Peer):
             raise StartFailed(cell.path, "its process has ended")
         connection = self.connection
         limits = self._watch.limits if self._watch is not None else None
-        options = dict(options, limits=_limit_options(limits))
+        bindings = {port: target.path for port, target in cell.extra().bindings.items()}
+        options = dict(options, limits=_limit_options(limits), bindings=bindings)
         connection.send(frames.Launch(key, connection.name_out(cell.path), cell.life, recipe, options), cell.path)
         try:
             await up
@@ -137,6 +146,13 @@ class Worker(Peer):
         self._told = unpack_exit(frame.reason)
         self.forked.kill(signal.SIGKILL)
 
+    def on_moved(self) -> None:
+        """Its actor, whose mailbox is bounded, has begun or ended turns."""
+        cell = self.cell
+        bound = cell.more.bound if cell is not None and cell.more is not None else None
+        if cell is not None and bound is not None:
+            bound.moved(cell)
+
     def on_note(self, frame: frames.Note) -> None:
         """An event of the process."""
         self._workers.on_note(self, frame)
@@ -157,7 +173,8 @@ class Worker(Peer):
         self._noticed()
         if isinstance(error, HoldfastError):
             self.kill(Exited(70))  # It spoke nonsense: EX_SOFTWARE.
-        if self._status is not None:
+        if self._status is not None or self._is_orphaned:
+            self.forked.kill(signal.SIGKILL)
             self._bury()
         else:
             self.forked.kill(signal.SIGKILL)  # Whoever closes its socket has to end.
@@ -172,6 +189,12 @@ class Worker(Peer):
         else:
             # What it wrote before its end may still be in the socket: the end of the socket comes behind it.
             self.node.loop.call_later(REAPED_WITHIN, self._bury)
+
+    def on_orphaned(self) -> None:
+        """The fork server has died, and it with it: nobody will tell its exit status."""
+        self._is_orphaned = True
+        if self._lost:
+            self._bury()
 
     def _bury(self) -> None:
         if self._buried:
@@ -189,6 +212,7 @@ class Worker(Peer):
         for up in self._launches.values():
             if not up.done():
                 up.set_exception(StartFailed(cell.path if cell is not None else "", str(reason)))
+        self.inner.close(reason)
         if cell is not None and self._died is not None:
             self._died(cell, reason)
             if self._workers.by_cell.get(cell) is self:
@@ -238,6 +262,22 @@ def _limit_options(limits: Limits | None) -> dict[str, Any]:
     }
 
 
+def keep_large_memory() -> None:
+    """Have malloc keep the memory of large messages instead of handing it back and faulting it in again each time.
+
+    The same settings as actor processes get through their environment; whoever set those variables has chosen already.
+    A message of 1 MiB otherwise costs four times as much.
+    """
+    if any(name.startswith("MALLOC_") for name in os.environ):
+        return
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError):
+        return  # Not glibc.
+    for parameter, value in ((M_MMAP_THRESHOLD, 64 << 20), (M_TRIM_THRESHOLD, 128 << 20), (M_TOP_PAD, 16 << 20)):
+        mallopt(parameter, value)
+
+
 class Workers:
     """The pool: one fork server, its children, and a warm one in reserve."""
 
@@ -281,7 +321,7 @@ class Workers:
         """
         while self._ready:
             worker = self._ready.pop()
-            if worker.connection.is_open:
+            if worker.is_alive():
                 self._refill()
                 return worker
         worker = await self._fork()
@@ -299,9 +339,13 @@ class Workers:
                     raise
                 if self._server is server:  # It died under us: start another one, once.
                     self._server = None
-        worker = Worker(self, forked)
+        worker = Worker(self, forked, server)
         self._alive[forked.pid] = worker
-        await worker.connect()
+        try:
+            await worker.connect()
+        except BaseException:  # Whoever asked for it does not want it any more.
+            worker.kill(KILLED)
+            raise
         return worker
 
     async def _open(self) -> ForkServer:
@@ -309,8 +353,11 @@ class Workers:
             if self._closed:
                 raise ProcessUnavailable("the system is shutting down")
             if self._server is None:
-                server = ForkServer(self._entry, self._preload, on_exit=self._on_exit, on_lost=self._on_lost)
+                server = ForkServer(
+                    self._entry, self._preload, on_exit=self._on_exit, on_lost=lambda: self._on_lost(server)
+                )
                 await server.start()
+                keep_large_memory()
                 self._server = server
             return self._server
 
@@ -332,9 +379,13 @@ class Workers:
         if worker is not None:
             worker.on_exit(status)
 
-    def _on_lost(self) -> None:
-        """The fork server died: its children die with it, each is seen by its socket; the next fork starts another."""
-        self._server = None
+    def _on_lost(self, server: ForkServer) -> None:
+        """A fork server died: its children die with it, each is seen by its socket; the next fork starts another."""
+        if self._server is server:
+            self._server = None
+        for worker in list(self._alive.values()):
+            if worker.server is server:
+                worker.on_orphaned()
 
     def buried(self, worker: Worker) -> None:
         """A process is gone for good."""

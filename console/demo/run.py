@@ -17,11 +17,9 @@ from ... import (
     NoSuchActor,
     Recovered,
     bounded,
-    checkpoint_only,
     child,
     fresh,
     hybrid,
-    replay_only,
     start,
     supervisor,
 )
@@ -34,7 +32,7 @@ from .questions import PATIENCE, Questions
 from .report import Kill, Outcome, Recovery, Report, judge_asks
 from .show import Progress, Watcher
 
-Method = Literal["hybrid", "replay", "checkpoint", "fresh"]
+Method = Literal["hybrid", "fresh"]
 
 MAPPER, PLANNER, READER = "/demo/robot/mapper", "/demo/robot/planner", "/demo/robot/reader"
 MAILBOX = 64  # scans and questions that may wait for the mapper; then the reader waits
@@ -69,10 +67,6 @@ def recovery_of(plan: Plan) -> object:
     match plan.method:
         case "hybrid":
             return hybrid(interval=plan.interval)
-        case "replay":
-            return replay_only()
-        case "checkpoint":
-            return checkpoint_only(plan.interval)
         case "fresh":
             return fresh()
 

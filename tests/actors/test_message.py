@@ -126,7 +126,7 @@ def test_a_wrong_type_is_refused_on_decode(codec: Codec, fields: list[Any]) -> N
 @given(body=st.binary(max_size=40))
 def test_bytes_decode_to_the_type_or_are_refused(body: bytes) -> None:
     try:
-        assert type(Codec(lambda path: lost(path) if False else None).decode(Add, body)) is Add  # type: ignore[arg-type,return-value]
+        assert type(Codec(lost).decode(Add, body)) is Add
     except msgspec.DecodeError:
         pass
 

@@ -32,8 +32,12 @@ async def test_the_clock_stands_still_while_anything_runs() -> None:
 async def test_timers_fire_in_order_each_at_its_own_time() -> None:
     loop = asyncio.get_running_loop()
     fired: list[tuple[str, float]] = []
+
+    def note(name: str) -> None:
+        fired.append((name, loop.time()))
+
     for name, delay in (("c", 30.0), ("a", 0.1), ("b", 7.25)):
-        loop.call_later(delay, lambda name=name: fired.append((name, loop.time())))
+        loop.call_later(delay, note, name)
     await asyncio.sleep(60)
     assert fired == [("a", 0.1), ("b", 7.25), ("c", 30.0)]
 

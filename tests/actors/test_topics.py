@@ -1,0 +1,164 @@
+"""Topics: many-to-many, in a name space of their own; a subscription ends with its life."""
+
+import asyncio
+from typing import Any
+
+import holdfast as hf
+import pytest
+
+
+class News(hf.Message[None]):
+    n: int
+
+
+class Seen(hf.Message[list[int]]): ...
+
+
+class Do(hf.Message[Any]):
+    work: Any
+
+
+class Reader(hf.Actor):
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        self.seen.append(message.n)
+
+    @hf.on(Seen)
+    def look(self, message: Seen) -> list[int]:
+        return self.seen
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> Any:
+        result = message.work(self)
+        return await result if asyncio.iscoroutine(result) else result
+
+
+class Subscriber(Reader):
+    @hf.subscribe("/news")
+    @hf.subscribe("/more")
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        super().news(message)
+
+
+async def test_every_subscriber_gets_what_is_published_once(system: hf.ActorSystem) -> None:
+    readers = [system.spawn(hf.start(Subscriber)) for _ in range(3)]
+    await readers[0].ask(Do(lambda actor: actor.ctx.subscribe("/news")))  # twice is once
+    for number in range(3):
+        await system.publish("/news", News(number))
+    await system.publish("/more", News(3))
+    await system.publish("/else", News(9))
+    assert [await reader.ask(Seen()) for reader in readers] == [[0, 1, 2, 3]] * 3
+    assert system.dead_letters == 0
+
+
+async def test_subscriptions_at_run_time(system: hf.ActorSystem) -> None:
+    reader = system.spawn(hf.start(Reader))
+    await system.publish("/news", News(0))
+    await reader.ask(Do(lambda actor: actor.ctx.subscribe("/news")))
+    await system.publish("/news", News(1))
+    await reader.ask(Do(lambda actor: actor.ctx.unsubscribe("/news")))
+    await reader.ask(Do(lambda actor: actor.ctx.unsubscribe("/never")))
+    await system.publish("/news", News(2))
+    assert await reader.ask(Seen()) == [1]
+    assert system.node.topics.names() == []
+
+
+async def test_an_actor_publishes_with_itself_as_sender(system: hf.ActorSystem) -> None:
+    class Curious(Subscriber):
+        @hf.subscribe("/news")
+        @hf.on(News)
+        def news(self, message: News) -> None:
+            assert self.ctx.sender is not None
+            told.set_result(self.ctx.sender.path)
+
+    told: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    system.spawn(hf.start(Curious))
+    await system.spawn(hf.start(Reader), "editor").ask(Do(lambda actor: actor.ctx.publish("/news", News(1))))
+    assert await told == "/t/editor"
+
+
+async def test_a_restarted_actor_is_subscribed_as_its_class_says_and_no_more(system: hf.ActorSystem) -> None:
+    reader = await system.start(hf.child("r", hf.start(Subscriber)))
+    await reader.ask(Do(lambda actor: actor.ctx.subscribe("/run-time")))
+    with pytest.raises(hf.RemoteCrash):
+        await reader.ask(Do(lambda _: 1 / 0))
+    await reader.ask(Seen())
+    assert system.node.topics.names() == ["/more", "/news"]
+
+
+async def test_a_stopped_subscriber_is_forgotten(system: hf.ActorSystem) -> None:
+    reader = system.spawn(hf.start(Subscriber))
+    await system.stop(reader)
+    await system.publish("/news", News(1))
+    assert system.node.topics.names() == []
+    assert system.dead_letters == 0
+
+
+@pytest.mark.parametrize("inside", [False, True])
+async def test_a_subscriber_that_cannot_take_it_does_not_keep_it_from_the_others(
+    system: hf.ActorSystem, inside: bool
+) -> None:
+    """One ends while the publisher waits at another, one is full and fails, one has no handler."""
+
+    class Deaf(hf.Actor):
+        def __init__(self) -> None:
+            self.ctx.subscribe("/news")
+
+    gate = asyncio.Event()
+    slow = system.spawn(hf.start(Subscriber), "slow", mailbox=hf.bounded(1))
+    full = system.spawn(hf.start(Subscriber), "full", mailbox=hf.bounded(1, overflow="fail"))
+    for busy in (slow, full):
+        busy.tell(Do(lambda _: gate.wait()))
+    await asyncio.sleep(0)
+    for busy in (slow, full):
+        busy.tell(News(0))
+    ending = system.spawn(hf.start(Subscriber))
+    system.spawn(hf.start(Deaf))
+    last = system.spawn(hf.start(Subscriber))
+    if inside:
+        editor = system.spawn(hf.start(Reader))
+        published: Any = editor.ask(Do(lambda actor: actor.ctx.publish("/news", News(1))))
+    else:
+        published = asyncio.create_task(system.publish("/news", News(1)))
+    await asyncio.sleep(0)
+    await asyncio.sleep(0)
+    await system.stop(ending)
+    gate.set()
+    await published
+    assert await last.ask(Seen()) == [1]
+    assert await slow.ask(Seen()) == [0, 1]
+    assert await full.ask(Seen()) in ([0], [0, 1])
+
+
+async def test_a_slow_subscriber_holds_the_publisher_back(system: hf.ActorSystem) -> None:
+    gate = asyncio.Event()
+    slow = system.spawn(hf.start(Subscriber), mailbox=hf.bounded(1))
+    slow.tell(Do(lambda _: gate.wait()))
+    await asyncio.sleep(0)
+    await system.publish("/news", News(0))
+    waiting = asyncio.create_task(system.publish("/news", News(1)))
+    await asyncio.sleep(0)
+    assert not waiting.done()
+    gate.set()
+    await waiting
+    await system.node.settled()
+    assert await slow.ask(Seen()) == [0, 1]
+
+
+@pytest.mark.parametrize("topic", ["news", ""])
+async def test_a_topic_begins_with_a_slash(system: hf.ActorSystem, topic: str) -> None:
+    with pytest.raises(ValueError, match="must start with '/'"):
+        hf.subscribe(topic)
+    with pytest.raises(hf.RemoteCrash, match="must start with '/'"):
+        await system.spawn(hf.start(Reader)).ask(Do(lambda actor: actor.ctx.subscribe(topic)))
+
+
+async def test_topics_and_addresses_are_different_name_spaces(system: hf.ActorSystem) -> None:
+    one, other = system.spawn(hf.start(Reader), "news"), system.spawn(hf.start(Reader))
+    await other.ask(Do(lambda actor: actor.ctx.subscribe("/t/news")))
+    await system.publish("/t/news", News(1))
+    assert (await one.ask(Seen()), await other.ask(Seen())) == ([], [1])
