@@ -55,7 +55,8 @@ class Codec:
         self._cell_at = cell_at
         self.encoder = msgspec.msgpack.Encoder(enc_hook=encode_special)
         self._kinds: dict[tuple[int, str], type[Message[Any]]] = {}
-        self._decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
+        self._decoders: dict[Any, Callable[[Any], Any]] = {}
+        self._reply_decoders: dict[type[Message[Any]], Callable[[Any], Any]] = {}
 
     def encode(self, value: object, actor: str) -> bytes:
         """The payload's bytes.
@@ -81,17 +82,21 @@ class Codec:
         Raises:
             msgspec.DecodeError: the bytes are no such value; the text names the field.
         """
-        decoder = self._decoders.get(kind)
-        if decoder is None:
-            decoder = self._decoders[kind] = msgspec.msgpack.Decoder(
-                kind, dec_hook=check_special, ext_hook=self._decode_special
-            )
         try:
-            return decoder.decode(body)
+            return self.decoder(kind)(body)
         except msgspec.MsgspecError:
             raise
         except Exception as error:  # Text that is no UTF-8, nesting without end, an array of no known type.
             raise msgspec.DecodeError(f"{type_name(type(error))}: {error}") from error
+
+    def decoder(self, kind: Any) -> Callable[[Any], Any]:
+        """What decodes one kind, made once; it may raise more than `decode` does."""
+        decode = self._decoders.get(kind)
+        if decode is None:
+            decode = self._decoders[kind] = msgspec.msgpack.Decoder(
+                kind, dec_hook=check_special, ext_hook=self._decode_special
+            ).decode
+        return decode
 
     def message_in(self, cell: Cell, name: str, body: Any) -> Any:
         """A message that came encoded, for a cell: decoded if its actor is here, else as it came.
@@ -112,6 +117,13 @@ class Codec:
             return self.decode(kind, body)
         except msgspec.DecodeError as error:
             raise BadMessage(cell.path, name.replace(":", "."), str(error)) from error
+
+    def reply_decoder(self, message: type[Message[Any]]) -> Callable[[Any], Any]:
+        """What decodes the reply to one message type, made once; it may raise more than `decode_reply` does."""
+        decode = self._reply_decoders.get(message)
+        if decode is None:
+            decode = self._reply_decoders[message] = self.decoder(reply_type(message))
+        return decode
 
     def decode_reply(self, message: type[Message[Any]], body: Any) -> Any:
         """A reply, as the type that the message declares."""
@@ -164,17 +176,13 @@ def encode_special(value: Any) -> Any:
     raise TypeError(f"a value of type {type_name(type(value))} cannot be sent")
 
 
-def encode_array(array: Any) -> bytearray:
+def encode_array(array: Any) -> bytes:
     """dtype, shape and the elements in C order, in one copy."""
     if array.dtype.hasobject:
         raise TypeError("a numpy array of objects cannot be sent")
     head = msgspec.msgpack.encode((array.dtype.str if array.dtype.names is None else array.dtype.descr, array.shape))
-    data = bytearray(4 + len(head) + array.nbytes)
-    data[0:4] = len(head).to_bytes(4, "little")
-    data[4 : 4 + len(head)] = head
-    target = sys.modules["numpy"].frombuffer(data, dtype=array.dtype, offset=4 + len(head), count=array.size)
-    target.reshape(array.shape)[...] = array
-    return data
+    elements = array.reshape(-1).view("u1") if array.flags.c_contiguous else array.tobytes()
+    return b"".join((len(head).to_bytes(4, "little"), head, elements))
 
 
 def decode_array(data: memoryview) -> Any:

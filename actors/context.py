@@ -241,6 +241,8 @@ class ActorContext:
         if more.stash is None:
             more.stash = deque()
         more.stash.append(item)
+        if isinstance(item, Item):
+            item.stashed()
         self.item = Stashed.of(item)
 
     def unstash(self) -> None:

@@ -107,6 +107,11 @@ class RunLoop:
             if self._idlers and not self.turns_held:
                 self._tell_idlers()
 
+    def run_now(self) -> None:
+        """Run what is ready at once instead of in the next tick: for callbacks of the loop that bring messages."""
+        if self.awake:
+            self._drain()
+
     def _shorten(self) -> None:
         """Handlers are slow: look at the clock more often, so that the host's own callbacks wait for few of them."""
         if self.stride > 1:

@@ -44,6 +44,9 @@ class Item:
     def undelivered(self, cell: Cell, reason: str) -> None:
         """The address is gone before the item's turn came."""
 
+    def stashed(self) -> None:
+        """Its turn puts it aside: it will come again, out of its order."""
+
 
 Handler = Callable[[Any, Any], object]
 

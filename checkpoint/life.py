@@ -89,6 +89,7 @@ class Life:
         self.cancelled: set[str] = set()  # timers whose ticks may still be on their way
         self.stop_wanted: ExitReason | None = None
         self.is_live = False
+        self.has_replayed = False
         self.in_hook = False
         self._snapshot_turn = -1
         self._state: list[bytes] = []
@@ -193,7 +194,10 @@ class Life:
 
     def open_turn(self, feed: Feed) -> None:
         """A turn begins; a replayed one gets the number it had."""
-        self.turn = feed.turn if feed.turn >= 0 else self.turn + 1
+        if feed.turn >= 0:
+            self.turn, self.has_replayed = feed.turn, True
+        else:
+            self.turn += 1
         self.feed, self.outs, self.last_k = feed, [], 0
         if self.page is not None:
             self.page[0] = feed.id + 1
@@ -273,6 +277,8 @@ class Life:
             queue.extendleft(reversed(self.returned.values()))
             self.returned.clear()
         self.port.to_home(Live(self._restore_seconds))
+        if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
+            self.cell.urge(TakeSnapshot(self))
         self._arm()
         if self.stop_wanted is not None:
             self.cell.request_stop(self.stop_wanted)

@@ -164,6 +164,17 @@ class Batch:
             effect()
 
 
+class Over:
+    """Stands for the future of an ask that is over."""
+
+    def done(self) -> bool:
+        """It is."""
+        return True
+
+
+OVER = Over()
+
+
 class SwitchAsk(RelayedAsk, eq=False):
     """An ask from inside a recorded turn: its outcome is journaled before the turn hears of it.
 
@@ -181,6 +192,10 @@ class SwitchAsk(RelayedAsk, eq=False):
         ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, deadline, None, to)
         ask.future, ask.switch, ask.turn, ask.k = ask, switch, turn, out.k
         return ask
+
+    def done(self) -> bool:
+        """As a future has it."""
+        return self.is_over
 
     def answer(self, reply: object) -> None:
         if isinstance(reply, ReplyHandle):
@@ -207,6 +222,7 @@ class SwitchAsk(RelayedAsk, eq=False):
         """The outcome, once."""
         if not self.is_over:
             self.is_over = True
+            self.future = OVER  # Not itself any more: a cycle would keep the message until the next collection.
             self.switch.outcome(self.turn, self.k, answer, batch)
 
 

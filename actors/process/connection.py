@@ -38,10 +38,18 @@ class BadFrame(HoldfastError):
 
 
 class Connection(asyncio.BufferedProtocol):
-    """One end. `on_frame` gets each frame in the order it was sent; `on_lost` is called once, at the end."""
+    """One end. `on_frame` gets each frame in the order it was sent; `on_lost` is called once, at the end.
 
-    def __init__(self, on_frame: Callable[[AnyFrame], None], on_lost: Callable[[Exception | None], None]) -> None:
-        self._on_frame, self._on_lost = on_frame, on_lost
+    A frame's `body` lies in the buffer: it is decoded or copied before `on_frame` returns.
+    """
+
+    def __init__(
+        self,
+        on_frame: Callable[[AnyFrame], None],
+        on_lost: Callable[[Exception | None], None],
+        on_batch: Callable[[], None] | None = None,
+    ) -> None:
+        self._on_frame, self._on_lost, self._on_batch = on_frame, on_lost, on_batch
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._encoder = msgspec.msgpack.Encoder(enc_hook=encode_special)
@@ -111,7 +119,7 @@ class Connection(asyncio.BufferedProtocol):
         self._out_bytes += size
         if not self._flushing:
             self._flushing = True
-            self._loop.call_soon(self._flush)
+            self._loop.call_soon(self.flush)
 
     def _forget_names(self, frame: Frame) -> None:
         """Names that this frame would have introduced are still unknown to the peer."""
@@ -120,7 +128,8 @@ class Connection(asyncio.BufferedProtocol):
             if field in ("to", "name", "sender") and type(value) is str:
                 self._names_out.pop(value, None)
 
-    def _flush(self) -> None:
+    def flush(self) -> None:
+        """Write what is queued, now; otherwise that happens at the end of the loop tick."""
         self._flushing = False
         transport, out = self._transport, self._out
         if transport is None or not self.is_open or self._paused or not out:
@@ -148,14 +157,14 @@ class Connection(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._transport = cast("asyncio.Transport", transport)
         self._transport.set_write_buffer_limits(HIGH_BYTES)
-        self._flush()
+        self.flush()
 
     def pause_writing(self) -> None:
         self._paused = True
 
     def resume_writing(self) -> None:
         self._paused = False
-        self._flush()
+        self.flush()
         waiters, self._waiters = self._waiters, []
         for future in waiters:
             if not future.done():
@@ -176,10 +185,9 @@ class Connection(asyncio.BufferedProtocol):
         while size < need:
             size *= 2
         old = self._view
-        if size > len(self._buffer) or left:
-            self._buffer = bytearray(size)
-            self._view = memoryview(self._buffer)
-            self._view[:left] = old[self._begin : self._end]
+        self._buffer = bytearray(size)
+        self._view = memoryview(self._buffer)
+        self._view[:left] = old[self._begin : self._end]
         self._begin, self._end = 0, left
 
     def buffer_updated(self, count: int) -> None:
@@ -188,6 +196,9 @@ class Connection(asyncio.BufferedProtocol):
             self._take_frames()
         except (BadFrame, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             self.close(error if isinstance(error, BadFrame) else BadFrame(str(error)))
+            return
+        if self._on_batch is not None:
+            self._on_batch()
 
     def _take_frames(self) -> None:
         begin, end, view, buffer = self._begin, self._end, self._view, self._buffer
@@ -205,7 +216,7 @@ class Connection(asyncio.BufferedProtocol):
                 return
         if begin == end:
             begin = end = 0
-            if len(buffer) > READ_BYTES * 8:
+            if len(buffer) > READ_BYTES * 8:  # One huge frame shall not hold its memory for ever.
                 self._buffer = bytearray(READ_BYTES)
                 self._view = memoryview(self._buffer)
         self._begin, self._end = begin, end
@@ -220,7 +231,7 @@ class Connection(asyncio.BufferedProtocol):
         """Send what is queued, then close; a second call changes nothing."""
         if self._transport is not None:
             if error is None:
-                self._flush()
+                self.flush()
                 self._transport.close()
             else:
                 self._transport.abort()

@@ -40,7 +40,7 @@ def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callabl
 async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
     guest = Guest(asyncio.get_running_loop(), page, launcher)
     prepare(guest)
-    guest.connection = Connection(guest.on_frame, guest.on_lost)
+    guest.connection = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
     await guest.connection.open(sock)
     code = await guest.ended
     # Handlers may hold threads or swallow cancellation: the process ends here, not when they are ready.
@@ -126,6 +126,16 @@ class Guest(Peer):
         self.node.here = InnerHost(self)
         self.node.topics = GuestTopics(self)
         self.node.events.add_sink(self._on_event)
+        self._takers: dict[type, Callable[[Any], None]] = {
+            frames.Tell: self._tell,
+            frames.Ask: self._ask,
+            frames.Offer: lambda frame: self.on_offer([self._target(frame.to)], frame),
+            frames.Reply: self.on_reply,
+            frames.Failure: self.on_failure,
+            frames.Launch: self._launch,
+            frames.Command: lambda frame: self._command(self._target(frame.to), frame),
+            frames.Record: self._record,
+        }
 
     # -- the world outside ------------------------------------------------------------------------------------------
 
@@ -157,7 +167,7 @@ class Guest(Peer):
     def tell_gone(self, cell: Cell) -> None:
         """An address of this process is free."""
         root = self.node.root
-        reason = cell.more.reason if cell.more is not None else lives.SHUTDOWN
+        reason = cell.more.reason if cell.more is not None else exits.SHUTDOWN
         if root is not None:
             self.command(root, "gone", {"path": cell.path, "reason": pack_exit(reason)})
 
@@ -178,28 +188,25 @@ class Guest(Peer):
 
     def on_frame(self, frame: frames.AnyFrame) -> None:
         """Whatever the root sends."""
-        match frame:
-            case frames.Tell():
-                cell = self._target(frame.to)
-                self.on_tell(cell, frame, self.page if frame.number else None)
-            case frames.Ask():
-                cell = self._target(frame.to)
-                self.on_ask(cell, frame, self.page if frame.number else None)
-            case frames.Offer():
-                self.on_offer([self._target(frame.to)], frame)
-            case frames.Reply():
-                self.on_reply(frame)
-            case frames.Failure():
-                self.on_failure(frame)
-            case frames.Launch():
-                self._launch(frame)
-            case frames.Command():
-                self._command(self._target(frame.to), frame)
-            case frames.Record():
-                if self.on_record is not None:
-                    self.on_record(frame)
-            case _:
-                raise BadFrame(f"the root sent a {type(frame).__name__}")
+        take = self._takers.get(type(frame))
+        if take is None:
+            raise BadFrame(f"the root sent a {type(frame).__name__}")
+        take(frame)
+
+    def on_batch(self) -> None:
+        """All frames that have come are taken in: run the turns, and answer, in the same tick."""
+        self.node.run_now()
+        self.connection.flush()
+
+    def _tell(self, frame: frames.Tell) -> None:
+        self.on_tell(self._target(frame.to), frame, self.page if frame.number else None)
+
+    def _ask(self, frame: frames.Ask) -> None:
+        self.on_ask(self._target(frame.to), frame, self.page if frame.number else None)
+
+    def _record(self, frame: frames.Record) -> None:
+        if self.on_record is not None:
+            self.on_record(frame)
 
     def _target(self, to: frames.Name) -> Cell:
         """The cell at an address of this process."""
@@ -255,7 +262,7 @@ class Guest(Peer):
 
     def report_end(self, cell: Cell, reason: ExitReason | None) -> None:
         """The process's own actor has ended: tell why, and end with it."""
-        told = pack_exit(reason if reason is not None else lives.SHUTDOWN)
+        told = pack_exit(reason if reason is not None else exits.SHUTDOWN)
         self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
         self.connection.close()
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import asyncio
 import math
 import types
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
 from .. import links
 from ..codec import Codec, Parcel, Raw
-from ..errors import BadMessage, HoldfastError, type_name
+from ..errors import AskDeadlock, BadMessage, HoldfastError, type_name
 from ..exits import ExitReason, pack_exit, unpack_exit
 from ..mail import Ask, Chain, Envelope, Item
 from ..message import Message, message_name
@@ -33,13 +33,11 @@ class Peer:
     def __init__(self, node: Node, connection: Connection | None = None) -> None:
         self.node = node
         self.connection = cast("Connection", connection)
+        self.codec: Codec = node.codec
         self.pending: dict[int, Ask] = {}
         self._last_id = 0
-
-    @property
-    def codec(self) -> Codec:
-        """The node's codec."""
-        return self.node.codec
+        self._routes: dict[tuple[Cell, frames.Name], Callable[[Any], Any]] = {}
+        self._kinds_out: dict[type, int] = {}
 
     # -- out --------------------------------------------------------------------------------------------------------
 
@@ -50,10 +48,12 @@ class Peer:
             BadMessage: it cannot be coded.
         """
         connection = self.connection
-        if isinstance(item, Ask):
-            self._send_ask(cell, path, item, number)
-            return
-        source, message = (item.sender, item.message) if isinstance(item, Envelope) else (None, item)
+        source, message = None, item
+        if isinstance(item, Item):
+            if isinstance(item, Ask):
+                self._send_ask(cell, path, item, number)
+                return
+            source, message = item.sender, item.message
         # Names are numbered by first use: here in the order in which the other side reads them.
         to = connection.name_out(path)
         name, body = self._payload(message)
@@ -97,9 +97,16 @@ class Peer:
 
     def _payload(self, message: Any) -> tuple[frames.Name, Any]:
         """Type name and body; a parcel is passed on as it is."""
-        if type(message) is Parcel:
+        kind = type(message)
+        known = self._kinds_out.get(kind)
+        if known is not None:
+            return known, message
+        if kind is Parcel:
             return self.connection.name_out(message.name), Raw(message.body)
-        return self.connection.name_out(message_name(type(message))), message
+        name = self.connection.name_out(message_name(kind))
+        if type(name) is int:  # Text introduces the name with this frame: known from the next one on.
+            self._kinds_out[kind] = name
+        return name, message
 
     def _forget_done(self) -> None:
         """Drop asks that expired: their replies, if any come, are late."""
@@ -122,8 +129,8 @@ class Peer:
             ask.answer_raw(bytes(frame.body))
             return
         try:
-            reply = self.codec.decode_reply(type(ask.message), frame.body)
-        except msgspec.DecodeError as error:
+            reply = self.codec.reply_decoder(type(ask.message))(frame.body)
+        except Exception as error:  # msgspec's own, or what a hook raised: all say that it does not fit.
             ask.fail(BadMessage("reply", message_name(type(ask.message)), str(error)))
         else:
             ask.answer(reply)
@@ -136,18 +143,35 @@ class Peer:
         elif ask is not None:
             ask.fail(self.codec.decode_error(frame.kind, frame.name, frame.body))
 
+    def _message_in(self, cell: Cell, name: frames.Name, body: Any) -> Any:
+        """The message in a frame. Raises UnknownMessage or BadMessage."""
+        decode = self._routes.get((cell, name))
+        if decode is not None and cell.actor is not None:
+            try:
+                return decode(body)
+            except Exception:
+                decode = None  # What is wrong is found out below, and said with the actor's and the message's names.
+        text = self.connection.name_in(name)
+        message = self.codec.message_in(cell, text, body)
+        if type(name) is int and cell is self.node.root:  # Its class stays: how to decode what it gets, too.
+            self._routes[cell, name] = self.codec.decoder(type(message))
+        return message
+
+    def _sender(self, name: frames.Name | None) -> Cell | None:
+        return None if name is None else self.node.cell_at(self.connection.name_in(name))
+
     def on_tell(self, cell: Cell, frame: frames.Tell, page: memoryview | None) -> None:
         """Take in a message."""
-        connection = self.connection
-        name = connection.name_in(frame.name)
-        sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
         try:
-            message = self.codec.message_in(cell, name, frame.body)
+            message = self._message_in(cell, frame.name, frame.body)
         except HoldfastError as error:
+            name = self.connection.name_in(frame.name) if type(frame.name) is int else str(frame.name)
+            self._sender(frame.sender)
             self.node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error))
             if page is not None:
                 page[1] = frame.number
             return
+        sender = self._sender(frame.sender)
         if page is not None:
             cell.admit(cell, Arrived(message, sender, frame.number, page))
         else:
@@ -167,15 +191,14 @@ class Peer:
 
     def on_ask(self, cell: Cell, frame: frames.Ask, page: memoryview | None) -> None:
         """Take in an ask; its outcome goes back over this connection."""
-        connection = self.connection
-        name = connection.name_in(frame.name)
-        sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
-        ask = RelayedAsk.taken(self, frame, cell, sender, page)
+        ask = RelayedAsk.taken(self, frame, cell, page)
         try:
-            ask.message = self.codec.message_in(cell, name, frame.body)
+            try:
+                ask.message = self._message_in(cell, frame.name, frame.body)
+            finally:
+                if frame.sender is not None:
+                    ask.sender = self._sender(frame.sender)
             if ask.chain and (ctx := cell.ctx) is not None and ctx.turn_in(ask.chain):
-                from ..errors import AskDeadlock
-
                 raise AskDeadlock(cell.path, tuple(path for path, _ in ask.chain))
             cell.admit(cell, ask)
         except HoldfastError as error:
@@ -252,6 +275,9 @@ class Arrived(Envelope, eq=False):
     def undelivered(self, cell: Cell, reason: str) -> None:
         """Nothing is lost: the home still has it."""
 
+    def stashed(self) -> None:
+        self.page = [0, 0]  # The real one counts in the order of arrival: a late number would undo later ones.
+
 
 async def _until_done(turn: Any, item: Any) -> None:
     await turn
@@ -268,17 +294,11 @@ class RelayedAsk(Ask, eq=False):
     is_over: bool = False
 
     @classmethod
-    def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, sender: Cell | None, page: memoryview | None) -> RelayedAsk:
+    def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
         """The ask that a frame carries; its message is decoded behind it."""
         left = frame.left
         deadline = peer.node.loop.time() + left
-        ask = cls(None, sender, frame.chain, left, deadline, None, cell, False, peer, frame.id, frame.number, page)
-        ask.future = ask
-        return ask
-
-    def done(self) -> bool:
-        """As a future has it."""
-        return self.is_over
+        return cls(None, None, frame.chain, left, deadline, None, cell, False, peer, frame.id, frame.number, page)
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -332,6 +352,10 @@ class RelayedAsk(Ask, eq=False):
     def undelivered(self, cell: Cell, reason: str) -> None:
         if self.page is None:
             super().undelivered(cell, reason)
+
+    def stashed(self) -> None:
+        if self.page is not None:
+            self.page = [0, 0]  # The real one counts in the order of arrival: a late number would undo later ones.
 
 
 class OutsideHost:

@@ -203,6 +203,7 @@ class ProcessHost:
                 cell.admit = admit_remote_bounded
         self._stop_wanted = None
         self._starting = cell.node.loop.create_task(self._start(cell), name=f"start of {cell.path}")
+        self._starting.add_done_callback(_seen)
         return self._starting
 
     async def _start(self, cell: Cell) -> None:
@@ -317,6 +318,12 @@ class ProcessHost:
         worker = self._workers.of(cell)
         if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
             worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
+
+
+def _seen(start: asyncio.Task[None]) -> None:
+    """If nobody waits for a start any more, asyncio need not complain of its failure."""
+    if not start.cancelled():
+        start.exception()
 
 
 def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:

@@ -2,8 +2,9 @@
 
 from collections.abc import AsyncIterator
 
-import holdfast as hf
 import pytest
+
+import holdfast as hf
 
 
 @pytest.fixture

@@ -2,8 +2,9 @@
 
 from typing import Any
 
-import holdfast as hf
 import pytest
+
+import holdfast as hf
 
 
 class Add(hf.Message[int]):
@@ -121,7 +122,7 @@ def test_a_handler_whose_annotation_contradicts_is_refused_when_the_class_is_mad
     with pytest.raises(TypeError, match=r"@on\(Add\) but takes a Read"):
 
         class Bad(hf.Actor):
-            @hf.on(Add)  # type: ignore[arg-type]
+            @hf.on(Add)
             def add(self, message: Read) -> int:
                 return 1
 
@@ -135,16 +136,18 @@ def test_a_handler_annotated_with_a_base_of_the_message_is_fine() -> None:
     assert AddTwice in Good._table
 
 
-@pytest.mark.parametrize("parameters", [0, 2])
-def test_a_handler_takes_self_and_the_message_and_nothing_else(parameters: int) -> None:
-    def too_few(self: Any) -> int:
-        return 1
+def too_few(self: Any) -> int:
+    return 1
 
-    def too_many(self: Any, message: Add, more: int) -> int:
-        return 1
 
+def too_many(self: Any, message: Add, more: int) -> int:
+    return 1
+
+
+@pytest.mark.parametrize("handler", [too_few, too_many])
+def test_a_handler_takes_self_and_the_message_and_nothing_else(handler: Any) -> None:
     with pytest.raises(TypeError, match="self and the message"):
-        type("Bad", (hf.Actor,), {"add": hf.on(Add)(too_many if parameters else too_few)})  # type: ignore[call-overload]
+        type("Bad", (hf.Actor,), {"add": hf.on(Add)(handler)})
 
 
 @pytest.mark.parametrize("kind", [int, hf.Actor, Add(1), None, "Add"])
@@ -198,7 +201,7 @@ class Asker(hf.Actor):
 
     @hf.on(Read)
     def read(self, message: Read) -> int:
-        self.counter = None  # type: ignore[assignment]
+        setattr(self, "counter", None)  # noqa: B010 - the checkers refuse the plain form
         return 0
 
 

@@ -5,8 +5,9 @@ import gc
 import weakref
 from typing import Any
 
-import holdfast as hf
 import pytest
+
+import holdfast as hf
 
 
 class Work(hf.Message[str]):
@@ -144,9 +145,14 @@ async def test_deadlines_of_different_lengths_each_end_at_their_time(system: hf.
     gate = asyncio.Event()
     worker = system.spawn(hf.start(Worker, gate))
     ended: dict[float, float] = {}
+
+    def note(done: asyncio.Future[str]) -> None:
+        error = done.exception()
+        assert isinstance(error, hf.AskTimeout)
+        ended[error.seconds] = loop.time()
+
     for seconds in (3.0, 1.0, 2.0, 1.0):
-        asked = worker.ask(Work(), timeout=seconds)
-        asked.add_done_callback(lambda done, s=seconds: (done.exception(), ended.update({s: loop.time()})))
+        worker.ask(Work(), timeout=seconds).add_done_callback(note)
     begin = loop.time()
     await asyncio.sleep(4.0)
     assert {s: pytest.approx(t - begin, abs=0.01) for s, t in ended.items()} == {1.0: 1.0, 2.0: 2.0, 3.0: 3.0}
@@ -213,7 +219,7 @@ async def test_a_circle_of_asks_is_refused_at_once(system: hf.ActorSystem, lengt
         @hf.on(Ring)
         async def ring(self, message: Ring) -> str:
             try:
-                return await super().ring(message)
+                return await message.way[0].ask(Ring(message.way[1:]))
             except hf.AskDeadlock as error:
                 return f"{error.actor} {error.chain}"
 
@@ -224,10 +230,8 @@ async def test_a_circle_of_asks_is_refused_at_once(system: hf.ActorSystem, lengt
 
 async def test_asks_that_meet_without_a_circle_are_not_refused(system: hf.ActorSystem) -> None:
     one, two, three = (system.spawn(hf.start(Worker), name) for name in ("one", "two", "three"))
-    assert (
-        await asyncio.gather(one.ask(Ring([three])), two.ask(Ring([three])), one.ask(Ring([two, three])))
-        == ["/t/three"] * 3
-    )
+    ways = [(one, [three]), (two, [three]), (one, [two, three])]
+    assert await asyncio.gather(*(asked.ask(Ring(list(way))) for asked, way in ways)) == ["/t/three"] * 3
 
 
 async def test_an_actor_whose_turn_has_ended_can_be_asked_by_whom_it_asked(system: hf.ActorSystem) -> None:

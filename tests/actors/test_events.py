@@ -3,9 +3,9 @@
 import asyncio
 from typing import Any
 
-import holdfast as hf
 import pytest
 
+import holdfast as hf
 from holdfast.actors.events import ActorCrashed, ActorStarted, ChildRestarted, DeadLetter, event_data, event_from
 
 

@@ -4,8 +4,9 @@ import asyncio
 from collections.abc import Callable
 from typing import Any
 
-import holdfast as hf
 import pytest
+
+import holdfast as hf
 
 
 class Do(hf.Message[Any]):
@@ -62,7 +63,7 @@ def link(one: Ref, other: Ref) -> Any:
     return one.ask(Do(lambda actor: actor.ctx.link(other)))
 
 
-# -- links --------------------------------------------------------------------------------------------------------------
+# -- links -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("first_to_die", [0, 1])
@@ -183,7 +184,7 @@ async def test_a_link_ends_with_the_lives_it_links(spawn: Spawn, system: hf.Acto
     assert len(await heard(one)) == 1
 
 
-# -- monitors -----------------------------------------------------------------------------------------------------------
+# -- monitors --------------------------------------------------------------------------------------------------------
 
 
 async def test_a_monitor_only_informs_and_only_one_side(spawn: Spawn) -> None:
@@ -259,7 +260,7 @@ async def test_a_clean_end_is_told_with_its_reason(spawn: Spawn) -> None:
     assert await heard(watcher) == [("DOWN", "/t/target", hf.Shutdown("done"))]
 
 
-# -- signal order -------------------------------------------------------------------------------------------------------
+# -- signal order ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("how", ["link", "monitor"])
@@ -279,7 +280,7 @@ async def test_signals_come_after_what_their_sender_sent_before(spawn: Spawn, ho
     assert signal[0] == {"link": "EXIT", "monitor": "DOWN"}[how]
 
 
-# -- names --------------------------------------------------------------------------------------------------------------
+# -- names -----------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("how", ["link", "monitor", "watch"])

@@ -8,9 +8,9 @@ from collections.abc import Callable
 from typing import Any
 
 import anyio
-import holdfast as hf
 import pytest
 
+import holdfast as hf
 from holdfast.actors import lives
 from holdfast.actors.events import LifeAbandoned
 from holdfast.actors.loop import MOST, RUNNERS
@@ -52,7 +52,7 @@ async def pause(turns: int = 1) -> None:
         await asyncio.sleep(0)
 
 
-# -- a turn is a task ---------------------------------------------------------------------------------------------------
+# -- a turn is a task ------------------------------------------------------------------------------------------------
 
 
 async def test_a_turn_has_one_current_task_from_first_to_last_step(doer: Doers) -> None:
@@ -122,7 +122,7 @@ async def test_anyio_scopes_work_in_a_handler(doer: Doers) -> None:
 
     one, other = doer(), doer()
     expected = ["cancelled True", "failed", "group"]
-    assert await asyncio.gather(one.ask(Do(work)), other.ask(Do(work))) == [expected, expected]
+    assert await asyncio.gather(*(actor.ask(Do(work)) for actor in (one, other))) == [expected, expected]
 
 
 async def test_a_task_group_of_the_standard_library_works_in_a_handler(doer: Doers) -> None:
@@ -144,14 +144,14 @@ async def test_context_variables_stay_with_their_actor(doer: Doers) -> None:
         return f"{before} {var.get()}"
 
     one, other = doer(), doer()
-    told = await asyncio.gather(one.ask(Do(lambda _: put("one"))), other.ask(Do(lambda _: put("other"))))
-    assert told == ["unset one", "unset other"]
+    first, second = await asyncio.gather(one.ask(Do(lambda _: put("one"))), other.ask(Do(lambda _: put("other"))))
+    assert (first, second) == ("unset one", "unset other")
     assert await one.ask(DoNow(lambda _: var.get())) == "one"
     assert await other.ask(Do(lambda _: put("x"))) == "other x"
     assert var.get() == "unset"
 
 
-# -- handlers that misbehave --------------------------------------------------------------------------------------------
+# -- handlers that misbehave -----------------------------------------------------------------------------------------
 
 
 class Odd(BaseException): ...
@@ -347,7 +347,7 @@ async def test_a_cancel_between_first_wait_and_takeover_keeps_its_text(doer: Doe
         await pause(3)
 
 
-# -- kill ---------------------------------------------------------------------------------------------------------------
+# -- kill ------------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("steps", [0, 1, 2, 5])
@@ -496,7 +496,7 @@ async def test_a_kill_while_children_are_stopped_leaves_no_child_behind(system: 
     assert system.tree() == ["/t"]
 
 
-# -- order and fairness -------------------------------------------------------------------------------------------------
+# -- order and fairness ----------------------------------------------------------------------------------------------
 
 
 async def test_order_is_kept_over_suspension(doer: Doers) -> None:

@@ -8,11 +8,12 @@ import asyncio
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-import holdfast as hf
 import uvloop
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+
+import holdfast as hf
 
 T = TypeVar("T")
 
@@ -110,7 +111,7 @@ class Mailbox(RuleBasedStateMachine):
             assert ask.done()
             ask.exception()
 
-    # -- what the model says happens ------------------------------------------------------------------------------------
+    # -- what the model says happens ---------------------------------------------------------------------------------
 
     def work_off(self) -> None:
         """Handle what is queued until it is empty or a turn is held."""
@@ -148,7 +149,7 @@ class Mailbox(RuleBasedStateMachine):
             self.is_asked.add(message.n)
         return message
 
-    # -- rules ----------------------------------------------------------------------------------------------------------
+    # -- rules -------------------------------------------------------------------------------------------------------
 
     @rule(
         whats=st.lists(st.sampled_from(["do", "do", "steps", "stash", "unstash", "crash", "hold"]), max_size=6),

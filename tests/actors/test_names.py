@@ -2,8 +2,9 @@
 
 from typing import Any
 
-import holdfast as hf
 import pytest
+
+import holdfast as hf
 
 
 class Do(hf.Message[Any]):

@@ -2,8 +2,9 @@
 
 import asyncio
 
-import holdfast as hf
 import pytest
+
+import holdfast as hf
 
 
 class Item(hf.Message[int]):

@@ -3,9 +3,9 @@
 import asyncio
 from typing import Any
 
-import holdfast as hf
 import pytest
 
+import holdfast as hf
 from holdfast.actors.events import HookFailed
 from holdfast.supervision.supervisor import AlreadyStarted
 
@@ -45,7 +45,7 @@ class Hooked(Plain):
             await self._parting.wait()
 
 
-# -- beginning ----------------------------------------------------------------------------------------------------------
+# -- beginning -------------------------------------------------------------------------------------------------------
 
 
 async def test_on_start_is_the_first_turn(system: hf.ActorSystem) -> None:
@@ -78,17 +78,15 @@ async def test_an_actor_that_cannot_start_says_why_and_leaves_nothing(
             if where == "__init__":
                 raise error
 
-        if where == "on_start":
-
-            def on_start(self, restored: bool) -> None:
+        def on_start(self, restored: bool) -> Any:
+            if where == "on_start":
                 raise error
+            return self.fail()
 
-        else:
-
-            async def on_start(self, restored: bool) -> None:
-                if where == "suspended on_start":
-                    await asyncio.sleep(0)
-                raise error
+        async def fail(self) -> None:
+            if where == "suspended on_start":
+                await asyncio.sleep(0)
+            raise error
 
     async with asyncio.timeout(5):
         with pytest.raises(hf.StartFailed) as failed:
@@ -135,7 +133,7 @@ async def test_a_name_clash_of_children_is_refused(system: hf.ActorSystem) -> No
     assert system.tree() == ["/t", "/t/one", "/t/two"]
 
 
-# -- stopping -----------------------------------------------------------------------------------------------------------
+# -- stopping --------------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("reason", [hf.SHUTDOWN, hf.NORMAL, hf.Shutdown("enough"), hf.Hung(1.0)], ids=str)
@@ -276,7 +274,7 @@ async def test_children_are_stopped_first_newest_first_and_grandchildren_before_
         return Do(lambda actor: [actor.ctx.spawn(hf.start(Node), name) for name in names])
 
     top = system.spawn(hf.start(Node), "top")
-    [a, b] = await top.ask(below("a", "b"))
+    [a, _] = await top.ask(below("a", "b"))
     await a.ask(below("1", "2"))
     await system.stop(top)
     assert told == ["top/b", "top/a/2", "top/a/1", "top/a", "top"]

@@ -3,8 +3,9 @@
 import asyncio
 from typing import Any
 
-import holdfast as hf
 import pytest
+
+import holdfast as hf
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 

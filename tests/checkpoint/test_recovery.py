@@ -259,10 +259,11 @@ async def test_timers_survive(system: hf.ActorSystem, isolation: str) -> None:
     assert await ref.ask(Seen()) == ["tick"]
 
 
+@pytest.mark.parametrize("interval", [0.01, NEVER])
 async def test_a_cancelled_timer_ticks_no_more_not_even_from_the_queue(
-    system: hf.ActorSystem, isolation: str, gate: Path
+    system: hf.ActorSystem, isolation: str, gate: Path, interval: float
 ) -> None:
-    ref = await doer(system, isolation)
+    ref = await doer(system, isolation, interval=interval)
     await ref.ask(Do(["after 0.01"]))
     busy = ref.ask(Do([f"gate {gate}", "cancel"]), timeout=8.0)
     switch = ref._cell.host.switch  # type: ignore[attr-defined]
@@ -270,6 +271,8 @@ async def test_a_cancelled_timer_ticks_no_more_not_even_from_the_queue(
     let_through(gate)
     await busy
     assert await ref.ask(Seen()) == []
+    if interval < 1:
+        await snapshot_after(system, ref, switch.turn)
     await struck(system, ref)
     assert await ref.ask(Seen()) == []
 
@@ -351,12 +354,35 @@ async def test_background_work_that_fails_crashes_the_actor_once(
 async def test_what_is_published_during_recovery_is_not_lost(system: hf.ActorSystem, isolation: str) -> None:
     ref = await doer(system, isolation)
     await ref.ask(Do(["subscribe /news"]))
-    for n in range(3):
-        strike(system, ref)
-        await until(lambda life=n + 1: ref._cell.state == "down" or ref._cell.life > life)
-        await system.publish("/news", Note(str(n)))
-        await ref.ask(Seen(), timeout=8.0)
-    assert await ref.ask(Seen()) == ["0", "1", "2"]
+    published: list[str] = []
+
+    def publish(event: hf.Event) -> None:
+        if isinstance(event, hf.ChildRestarted):  # The old life is over, the new one has not begun.
+            published.append(str(len(published)))
+            for cell in system.node.topics.subscribers("/news"):
+                cell.ref.tell(Note(published[-1]))
+
+    system.node.events.add_sink(publish)
+    for _ in range(3):
+        await struck(system, ref)
+    assert await ref.ask(Seen()) == published == ["0", "1", "2"]
+
+
+async def test_the_stash_is_in_the_store(tmp_path: Path) -> None:
+    """A snapshot covers the turn that stashed, not the message: that must stay in the journal."""
+    store = f"sqlite:{tmp_path}/app.db"
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        ref = await doer(system, "task", interval=0.01)
+        for n in range(3):
+            ref.tell(Do([f"stash {n}"]))
+        await ref.ask(Note("x"))
+        await snapshot_after(system, ref, 4)
+        ref.tell(Note("y"))
+        await snapshot_after(system, ref, 5)
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        ref = await doer(system, "task")
+        await ref.ask(Do(["unstash"]))
+        assert await ref.ask(Seen()) == ["x", "y", "open", "0", "1", "2"]
 
 
 # -- others hear of it ------------------------------------------------------------------------------------------------

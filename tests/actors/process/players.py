@@ -511,3 +511,43 @@ class Slow(Notebook):
         while not os.path.exists(message.path):
             await asyncio.sleep(0.005)
         return 0
+
+
+class PutAside(hf.Message):
+    """Put aside until `Resume`; then noted."""
+
+    text: str
+
+
+class Resume(hf.Message):
+    pass
+
+
+class Patient(Notebook):
+    """Puts messages aside, and writes down in a file what it has handled, in whichever life."""
+
+    def __init__(self, log: str) -> None:
+        super().__init__()
+        self._log = log
+        self._is_ready = False
+
+    @hf.on(PutAside)
+    def put_aside(self, message: PutAside) -> None:
+        if self._is_ready:
+            self._write(message.text)
+        else:
+            self.ctx.stash()
+
+    @hf.on(Resume)
+    def resume(self, message: Resume) -> None:
+        self._is_ready = True
+        self._write("resume")
+        self.ctx.unstash()
+
+    @hf.on(Note)
+    def note(self, message: Note) -> None:
+        self._write(message.text)
+
+    def _write(self, text: str) -> None:
+        with open(self._log, "a") as file:
+            file.write(text + "\n")

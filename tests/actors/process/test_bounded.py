@@ -16,6 +16,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import DeadLetter
+from holdfast.actors.mailbox import Bound
 from tests.actors.process.players import Add, Block, Note, Notes, Observer, Publish, Send, Slow, Total, Worker
 from tests.actors.process.waiting import until
 
@@ -35,10 +36,16 @@ def busy(system: hf.ActorSystem, isolation: str, gate: Path) -> Busy:
         mailbox = hf.bounded(capacity, overflow=overflow)
         ref = await system.start(hf.child("busy", hf.start(kind), isolation=isolation, mailbox=mailbox))  # type: ignore[arg-type]
         ref.tell(Block(str(gate)))
-        await until(lambda: ref._cell.more.bound.count == 0)
+        await until(lambda: bound_of(ref).count == 0)
         return ref
 
     return busy
+
+
+def bound_of(ref: hf.ActorRef[Any]) -> Bound:
+    bound = ref._cell.extra().bound
+    assert bound is not None
+    return bound
 
 
 async def test_tell_is_refused_when_it_is_full(busy: Busy, gate: Path) -> None:
@@ -82,11 +89,11 @@ async def test_send_waits_for_room(busy: Busy, gate: Path) -> None:
             await ref.send(Add(1))
 
     sending = asyncio.ensure_future(send_all())
-    await until(lambda: ref._cell.more.bound.count == 2)
+    await until(lambda: bound_of(ref).count == 2)
     assert not sending.done()
     gate.touch()
     await sending
-    assert ref._cell.more.bound.count <= 2
+    assert bound_of(ref).count <= 2
     assert await ref.ask(Total()) == 101
 
 
@@ -101,7 +108,7 @@ async def test_what_is_dropped(system: hf.ActorSystem, busy: Busy, gate: Path, o
         lost = [event.message.text for event in events.take() if isinstance(event, DeadLetter)]
     assert sorted([*lost, *kept]) == ["0", "1", "2", "3", "4"]
     gate.touch()
-    await until(lambda: ref._cell.more.bound.count == 0)
+    await until(lambda: bound_of(ref).count == 0)
     assert await ref.ask(Notes()) == kept
 
 
@@ -110,7 +117,7 @@ async def test_many_messages_flow_through_a_small_mailbox(busy: Busy, gate: Path
     gate.touch()
     for number in range(300):
         await ref.send(Add(1))
-        assert ref._cell.more.bound.count <= 1, number
+        assert bound_of(ref).count <= 1, number
     assert await ref.ask(Total()) == 301
 
 
@@ -119,8 +126,8 @@ async def test_a_sender_in_a_process_waits_too(system: hf.ActorSystem, busy: Bus
     ref = await busy(2, kind=Slow)
     sender = await system.start(hf.child("sender", hf.start(Observer), isolation="process"))
     sending = sender.ask(Send(ref, 20), timeout=20)
-    await until(lambda: bool(ref._cell.more.bound.senders))  # the third waits at the receiver's home
-    assert ref._cell.more.bound.count == 2
+    await until(lambda: bool(bound_of(ref).senders))  # the third waits at the receiver's home
+    assert bound_of(ref).count == 2
     assert not sending.done()
     gate.touch()
     assert await sending == "20 sent"
@@ -144,7 +151,7 @@ async def test_publish_from_a_process_waits_for_bounded_subscribers(
     ref = await busy(1, kind=Slow)
     publisher = await system.start(hf.child("publisher", hf.start(Observer), isolation="process"))
     publishing = publisher.ask(Publish("/news", ["a", "b", "c"]), timeout=20)
-    await until(lambda: bool(ref._cell.more.bound.senders))
+    await until(lambda: bool(bound_of(ref).senders))
     assert not publishing.done()
     gate.touch()
     await publishing
@@ -154,7 +161,7 @@ async def test_publish_from_a_process_waits_for_bounded_subscribers(
 async def test_the_bound_holds_over_a_death(system: hf.ActorSystem, gate: Path) -> None:
     spec = hf.child("busy", hf.start(Worker), isolation="process", mailbox=hf.bounded(3))
     ref = await system.start(spec)
-    bound = ref._cell.more.bound
+    bound = bound_of(ref)
     running = ref.ask(Block(str(gate)))
     await until(lambda: bound.count == 0)
     asks = [ref.ask(Add(1)) for _ in range(10)]  # three are in, seven wait for room
@@ -172,7 +179,7 @@ async def test_senders_are_released_when_the_actor_is_gone(system: hf.ActorSyste
     ref.tell(Add(1))
     sending = asyncio.ensure_future(ref.send(Add(1)))
     waiting = ref.ask(Add(1))
-    await until(lambda: bool(ref._cell.more.bound.senders))
+    await until(lambda: bool(bound_of(ref).senders))
     stopping = asyncio.ensure_future(system.stop(ref))
     gate.touch()
     await stopping

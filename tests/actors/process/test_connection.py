@@ -42,6 +42,8 @@ class End:
     def _on_frame(self, frame: frames.AnyFrame) -> None:
         if isinstance(frame, frames.Tell | frames.Command):  # as both sides do
             self.connection.name_in(frame.to)
+        if isinstance(frame, frames.Tell):
+            frame.body = msgspec.Raw(bytes(frame.body))  # it lies in the buffer, which is used again
         self.frames.append(frame)
         self.changed.set()
 

@@ -111,6 +111,24 @@ async def test_the_fork_server_killed_and_all_come_back(system: hf.ActorSystem) 
     assert not zombies()
 
 
+@pytest.mark.parametrize("victim", ["server", "spare"])
+async def test_no_actor_is_given_a_process_that_is_about_to_end(system: hf.ActorSystem, victim: str) -> None:
+    """A start attempt lost that way would count as a restart. Nothing runs here between the death and the taking."""
+    await system.start(hf.child("account", hf.start(Account), isolation="process"))
+    workers = system._workers
+    await until(lambda: len(workers._ready) == 1)
+    spare = workers._ready[0]
+    pid = spare.pid if victim == "spare" else spare.server.pid
+    pidfd = os.pidfd_open(pid)
+    os.kill(pid, signal.SIGKILL)
+    assert ended(pidfd)
+    os.close(pidfd)
+    taken = await workers.take()
+    assert taken is not spare
+    assert taken.is_alive()
+    taken.kill(hf.KILLED)
+
+
 async def test_a_stopped_system_leaves_no_process_that_an_actor_started() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process"))

@@ -29,7 +29,10 @@ from tests.actors.process.players import (
     Notes,
     Overdrawn,
     Pass,
+    Patient,
     Picky,
+    PutAside,
+    Resume,
     Run,
     Ticks,
     Total,
@@ -192,6 +195,18 @@ async def test_tells_behind_the_turn_survive_in_order(system: hf.ActorSystem, tm
     await in_turn(system, worker, 1)
     worker.kill()
     assert await worker.ask(Total()) == 100, "the turn that was cut off is not run again"
+
+
+async def test_what_was_handled_after_a_stash_is_not_handled_again(system: hf.ActorSystem, tmp_path: Path) -> None:
+    """A stashed message comes late; that must not look as if all behind it were still to be done."""
+    log = tmp_path / "log"
+    patient = await start(system, hf.start(Patient, str(log)))
+    for message in (PutAside("aside"), Note("a"), Note("b"), Resume()):
+        patient.tell(message)
+    await until(lambda: log.exists() and log.read_text().split() == ["a", "b", "resume", "aside"])
+    patient.kill()
+    assert await patient.ask(Notes()) == []
+    assert log.read_text().split() == ["a", "b", "resume", "aside"]
 
 
 async def test_messages_to_an_actor_that_restarts_wait_for_it(system: hf.ActorSystem) -> None:
