@@ -15,8 +15,9 @@ from .mail import Table
 from .message import Message
 
 if TYPE_CHECKING:
-    from .context import ActorContext, ReplyHandle
+    from .context import ActorContext
     from .exits import ExitReason
+    from .mail import ReplyHandle
     from .ref import ActorRef
 
 R = TypeVar("R")
@@ -29,9 +30,9 @@ class _On(Protocol[R]):
     """What `@on(M)` accepts: a method that takes the message and gives its reply, now, later, or by a handle."""
 
     @overload
-    def __call__(self, handler: Callable[[S, M], Coroutine[Any, Any, R | ReplyHandle[R]]]) -> Callable[
-        [S, M], Coroutine[Any, Any, R | ReplyHandle[R]]
-    ]: ...
+    def __call__(
+        self, handler: Callable[[S, M], Coroutine[Any, Any, R | ReplyHandle[R]]]
+    ) -> Callable[[S, M], Coroutine[Any, Any, R | ReplyHandle[R]]]: ...
     @overload
     def __call__(self, handler: Callable[[S, M], R | ReplyHandle[R]]) -> Callable[[S, M], R | ReplyHandle[R]]: ...
 

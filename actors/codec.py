@@ -139,7 +139,7 @@ class Codec:
     # -- errors -----------------------------------------------------------------------------------------------------
 
     def encode_error(self, error: BaseException) -> tuple[str, str, bytes]:
-        """An error as (kind, class name, payload): a Refusal or a HoldfastError stays its class, all else is a crash."""
+        """An error as (kind, class name, payload): a Refusal or HoldfastError stays its class, all else is a crash."""
         if isinstance(error, Refusal):
             schema = type(error).schema()
             fields = schema(*(getattr(error, name) for name in schema.__struct_fields__))

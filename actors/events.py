@@ -81,7 +81,7 @@ class ProcessDied(Event, frozen=True, eq=False):
 
 
 class Recovered(Event, frozen=True, eq=False):
-    """An actor came back with state and messages; seconds by phase: detect, isolate, restart, restore, replay, release."""
+    """An actor came back with state and messages. Phases: detect, isolate, restart, restore, replay, release."""
 
     life: int
     replayed: int

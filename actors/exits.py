@@ -62,7 +62,7 @@ class NoProc(ExitReason, frozen=True):
 class Crash(ExitReason, frozen=True, eq=False):
     """A handler or hook raised.
 
-    The exception stays as it is: text and traceback are made when somebody looks, or when the reason leaves the process.
+    The exception stays as it is: text and traceback are made when somebody looks, or when it leaves the process.
     """
 
     type_name: str

@@ -49,7 +49,8 @@ class LocalHost:
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         if cell.state is not RUNNING:
             return
-        if cell.scheduled or cell.children or type(cell.actor).on_stop is not Actor.on_stop:
+        actor: Any = cell.actor
+        if cell.scheduled or cell.children or type(actor).on_stop is not Actor.on_stop:
             queue = cell.queue
             if queue and type(queue[0]) is FirstTurn:  # `on_start` comes first, or `on_stop` would find nothing done.
                 first = queue.popleft()
@@ -117,7 +118,7 @@ def begin(
 
 def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorContext]) -> None:
     """Construct the actor with its `ctx`."""
-    kind = start.kind
+    kind: Any = start.kind
     ctx = context_type(cell)
     actor = kind.__new__(kind)
     actor.ctx = ctx
@@ -148,7 +149,7 @@ def up(cell: Cell) -> None:
 def open_context(cell: Cell) -> contextvars.Context:
     """The life's own context, in which `current` names it for good: sends find their sender there."""
     context = cell.node.base_context.copy()
-    context.run(current.set, cell.ctx)
+    context.run(current.set, cell.ctx)  # type: ignore[arg-type]  # a life that runs has its context
     cell.context = context
     return context
 
@@ -246,7 +247,7 @@ def cut_off(cell: Cell, item: Any) -> None:
 
 def finish(cell: Cell, reason: ExitReason) -> None:
     """End a life in good order: children, `on_stop`, then `ended`. Called in the actor's own context."""
-    actor = cell.actor
+    actor: Any = cell.actor
     if cell.children or type(actor).on_stop is not Actor.on_stop:
         _wind_down(cell, reason, _farewell(cell, reason))
     else:

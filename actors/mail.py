@@ -6,7 +6,6 @@ for a message, `run` for everything else.
 
 from __future__ import annotations
 
-import asyncio
 import types
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
@@ -160,7 +159,7 @@ class Ask(Item, msgspec.Struct, eq=False):
     @property
     def is_done(self) -> bool:
         """Whether the outcome is known, or nobody waits for it."""
-        return self.future.done()
+        return self.future.done()  # type: ignore[no-any-return]  # a bool, of whatever future it is
 
     def answer(self, reply: object) -> None:
         """Hand the reply to the asker; a late one is dropped and counted."""

@@ -12,7 +12,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from .errors import MailboxFull, SpecError
-from .mail import Ask, Item
+from .mail import Ask, Envelope, Item
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -32,7 +32,7 @@ def admit_queue(cell: Cell, item: Any) -> None:
     """The unbounded mailbox: the hot path."""
     if type(item) not in cell.table:
         cell.require(item)
-    cell.queue.append(item)  # type: ignore[union-attr] - this function stands there only when the queue is made
+    cell.queue.append(item)  # type: ignore[union-attr]  # this function stands there only when the queue is made
     if not cell.scheduled:
         cell.scheduled = True
         node = cell.node
@@ -89,7 +89,8 @@ class Bound:
     __slots__ = ("capacity", "count", "overflow", "senders", "waiting")
 
     def __init__(self, capacity: int, overflow: Overflow) -> None:
-        self.capacity, self.overflow = capacity, overflow
+        self.capacity = capacity
+        self.overflow: Overflow = overflow
         self.count = 0
         self.waiting: deque[Ask] = deque()  # asks that wait for room, first in, first served
         self.senders: deque[asyncio.Future[None]] = deque()  # `send`s that wait for room
@@ -162,7 +163,7 @@ class Bound:
         raise error
 
     def _lose(self, cell: Cell, item: Any) -> None:
-        message = item.message if isinstance(item, Item) else item
+        message = item.message if isinstance(item, (Envelope, Ask)) else item
         if isinstance(item, Ask):
             item.fail(MailboxFull(cell.path, self.capacity))
         cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})")

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import sys
 import typing
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Generic, get_args, get_origin
 
 import msgspec
@@ -17,7 +17,7 @@ from typing_extensions import TypeVar, dataclass_transform
 
 from .errors import HoldfastError, type_name
 
-R = TypeVar("R", default=None)
+R = TypeVar("R", default=None, covariant=True)
 
 
 @dataclass_transform(frozen_default=True, field_specifiers=(msgspec.field,))
@@ -33,12 +33,14 @@ class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
     """
 
 
-@functools.cache
-def message_name(kind: type) -> str:
-    """The name a message type has on the wire and in journals: `module:Class`."""
+def _message_name(kind: type) -> str:
     module = kind.__module__
     # A process that was forked for an actor knows the classes of the user's script by another module name.
     return f"{'__main__' if module == '__mp_main__' else module}:{kind.__qualname__}"
+
+
+message_name: Callable[[type], str] = functools.cache(_message_name)
+"""The name a message type has on the wire and in journals: `module:Class`."""
 
 
 @functools.cache
@@ -69,7 +71,7 @@ def _resolve(declared: Any, kind: type) -> Any:
         text = declared if isinstance(declared, str) else declared.__forward_arg__
         scope = vars(sys.modules[kind.__module__]) | {kind.__name__: kind}
         try:
-            return eval(text, scope)  # noqa: S307 - the text is an annotation of the user's own source, not data.
+            return eval(text, scope)  # The text is an annotation of the user's own source, not data.
         except NameError as error:
             raise TypeError(f"reply type {text!r} of {type_name(kind)} is not known in its module: {error}") from error
     if isinstance(declared, typing.TypeVar):

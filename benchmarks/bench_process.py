@@ -15,7 +15,7 @@ import os
 import signal
 import statistics
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 import limits
 from harness import Run, ask_all, main, tell_one
@@ -37,7 +37,7 @@ PAUSE = 0.03  # seconds for the process before to end, so that it does not compe
 
 
 @contextlib.asynccontextmanager
-async def _echoes() -> AsyncIterator[tuple[hf.ActorSystem, hf.ActorRef[Echo], limits.Client]]:
+async def _echoes() -> AsyncGenerator[tuple[hf.ActorSystem, hf.ActorRef[Echo], limits.Client], None]:
     """An echo in a process, and the limit's."""
     async with hf.ActorSystem("bench") as system, limits.echo_process() as client:
         ref = await start_process(system, "echo", hf.start(Echo))

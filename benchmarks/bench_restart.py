@@ -43,6 +43,7 @@ async def restart(run: Run) -> None:
         restarted = limits.Restarted()
 
         async def ours() -> float:
+            handled = 0
             began = time.perf_counter()
             for _ in range(count):
                 ref.tell(BOOM)

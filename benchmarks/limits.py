@@ -19,7 +19,7 @@ import struct
 import subprocess
 import sys
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncGenerator, Callable, Generator
 from types import TracebackType
 from typing import Any, Final, Self, cast
 
@@ -192,7 +192,7 @@ class Frames(asyncio.BufferedProtocol):
         self.transport = cast(asyncio.Transport, transport)
         self.transport.set_write_buffer_limits(1 << 24)
 
-    def connection_lost(self, error: Exception | None) -> None:
+    def connection_lost(self, exc: Exception | None) -> None:
         if not self.closed.done():
             self.closed.set_result(None)
 
@@ -296,7 +296,7 @@ def serve(theirs: socket.socket) -> None:
 
 
 @contextlib.contextmanager
-def limit_process(role: str) -> Iterator[socket.socket]:
+def limit_process(role: str) -> Generator[socket.socket, None, None]:
     """Start this file in a new process; it ends at the end of the socket given here, and is reaped."""
     ours, theirs = socket.socketpair()
     for end in (ours, theirs):
@@ -315,7 +315,7 @@ def limit_process(role: str) -> Iterator[socket.socket]:
 
 
 @contextlib.asynccontextmanager
-async def echo_process() -> AsyncIterator[Client]:
+async def echo_process() -> AsyncGenerator[Client, None]:
     """A client of an echo server in a process of its own."""
     with limit_process("echo") as ours:
         client = await connect(ours)

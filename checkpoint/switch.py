@@ -498,6 +498,8 @@ class Switch:
 
     def from_life(self, record: ToHome) -> None:
         """Take what the life says, in order."""
+        if self.diverged is not None:
+            return  # What it became is not what it was: above all, its snapshots must not be kept.
         try:
             match record:
                 case TurnEnd():

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Mapping
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeGuard, get_args
 
-from ..actors import lives
 from ..actors.actor import Actor, Start
 from ..actors.cell import Cell
 from ..actors.errors import SpecError, type_name
-from ..actors.exits import ExitReason
+from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.mailbox import Bounded
 from ..actors.process.limits import Limits
 from ..actors.process.recipe import pack_recipe
@@ -52,7 +51,7 @@ class ChildSpec:
     mailbox: Bounded | None = None
     backoff: Backoff | None = None
     limits: Limits | None = None
-    bindings: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    bindings: Mapping[str, str] = dataclasses.field(default_factory=dict[str, str])
     is_supervisor: bool = False
 
     def __post_init__(self) -> None:
@@ -91,7 +90,7 @@ class ChildSpec:
             except UnsavableValue as error:
                 raise SpecError(error.where, f"{error.problem} cannot be sent to another process") from error
 
-    async def stop(self, cell: Cell, reason: ExitReason = lives.SHUTDOWN) -> ExitReason:
+    async def stop(self, cell: Cell, reason: ExitReason = SHUTDOWN) -> ExitReason:
         """Stop the child as its spec says: ask, wait, kill. Returns the reason it ended with."""
         gone = cell.ended()
         if self.shutdown == "brutal_kill":
@@ -169,7 +168,7 @@ def _of_kind(where: str, name: str, value: object, kind: type, form: str) -> Non
         raise SpecError(where, f"{name} must be {form} or left out, not {value!r}")
 
 
-def _number(value: object) -> bool:
+def _number(value: object) -> TypeGuard[float]:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 

@@ -9,7 +9,11 @@ from __future__ import annotations
 import asyncio
 import selectors
 from collections.abc import Callable
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, TypeVar, TypeVarTuple
+
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
 
 WAKE_UP_SOCKETS = 1  # the loop's own, through which threads and signals wake it
 PATIENCE = 1.0
@@ -80,7 +84,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         """Seconds on the virtual clock."""
         return self._virtual.now
 
-    def run_in_executor(self, executor: Any, func: Callable[..., Any], *args: Any) -> asyncio.Future[Any]:
+    def run_in_executor(self, executor: Executor | None, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
         """Run in a thread; the clock stands still until it is done."""
         future = super().run_in_executor(executor, func, *args)
         self._virtual.jobs += 1

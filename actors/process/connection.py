@@ -190,8 +190,8 @@ class Connection(asyncio.BufferedProtocol):
         self._view[:left] = old[self._begin : self._end]
         self._begin, self._end = 0, left
 
-    def buffer_updated(self, count: int) -> None:
-        self._end += count
+    def buffer_updated(self, nbytes: int) -> None:
+        self._end += nbytes
         try:
             self._take_frames()
         except (BadFrame, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -224,8 +224,8 @@ class Connection(asyncio.BufferedProtocol):
     def eof_received(self) -> bool:
         return False
 
-    def connection_lost(self, error: Exception | None) -> None:
-        self._lose(error)
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._lose(exc)
 
     def close(self, error: Exception | None = None) -> None:
         """Send what is queued, then close; a second call changes nothing."""

@@ -14,7 +14,7 @@ from .. import links
 from ..codec import Codec, Parcel, Raw
 from ..errors import AskDeadlock, BadMessage, HoldfastError, type_name
 from ..exits import ExitReason, pack_exit, unpack_exit
-from ..mail import Ask, Chain, Envelope, Item
+from ..mail import Ask, Envelope, Item
 from ..message import Message, message_name
 from . import frames
 from .connection import BadFrame, Connection
@@ -53,7 +53,7 @@ class Peer:
             if isinstance(item, Ask):
                 self._send_ask(cell, path, item, number)
                 return
-            source, message = item.sender, item.message
+            source, message = item.sender, item.message  # type: ignore[attr-defined]  # an envelope, or as one
         # Names are numbered by first use: here in the order in which the other side reads them.
         to = connection.name_out(path)
         name, body = self._payload(message)

@@ -117,6 +117,16 @@ class RemoteBound(mailbox.Bound):
         super().__init__(bound.capacity, bound.overflow)
         self._at_once = 1 if bound.overflow in ("drop_oldest", "latest") else bound.capacity + 1
 
+    def admit(self, cell: Cell, item: Any) -> None:
+        if self.count >= self.capacity:
+            self.moved(cell)  # The page may be ahead of what we were told.
+        super().admit(cell, item)
+
+    def room(self, cell: Cell) -> asyncio.Future[None] | None:
+        if self.count >= self.capacity:
+            self.moved(cell)
+        return super().room(cell)
+
     def put(self, cell: Cell, item: Any) -> None:
         self.count += 1
         mailbox.queue_of(cell).append(item)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ctypes
+import functools
 import os
 import signal
 import time
@@ -70,7 +71,7 @@ class Worker(Peer):
         for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
             fd = getattr(forked, name)
             setattr(forked, name, -1)
-            self._outputs.append(OutputReader(loop, fd, lambda text, stream=stream: self._on_line(stream, text)))
+            self._outputs.append(OutputReader(loop, fd, functools.partial(self._on_line, stream)))
 
     def is_alive(self) -> bool:
         """Whether it can be given an actor: a process ends with its fork server, but not in the same instant."""
@@ -329,16 +330,18 @@ class Workers:
         return worker
 
     async def _fork(self) -> Worker:
-        for attempt in (1, 2):
+        is_second = False
+        while True:
             server = await self._open()
             try:
                 forked = await server.fork()
                 break
             except ProcessUnavailable:
-                if attempt == 2 or self._closed:
+                if is_second or self._closed:
                     raise
                 if self._server is server:  # It died under us: start another one, once.
                     self._server = None
+                is_second = True
         worker = Worker(self, forked, server)
         self._alive[forked.pid] = worker
         try:

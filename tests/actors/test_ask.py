@@ -400,12 +400,13 @@ async def test_many_asks_behind_one_slow_one_do_not_accumulate(system: hf.ActorS
     gate = asyncio.Event()
     slow, quick = system.spawn(hf.start(Worker, gate)), system.spawn(hf.start(Worker))
     waiting = slow.ask(Work("slow"), timeout=1000.0)
-    replies = []
+    asked: asyncio.Future[str] | None = None
+    replies: list[weakref.ref[asyncio.Future[str]]] = []
     for number in range(3000):
         asked = quick.ask(Quick(str(number)), timeout=1000.0)
         replies.append(weakref.ref(asked))
         await asked
-    del asked
+    asked = None
     gc.collect()
     assert sum(reply() is not None for reply in replies) <= 1024 + 1
     gate.set()

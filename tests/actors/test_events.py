@@ -122,6 +122,7 @@ async def test_a_sink_sees_events_at_once(system: hf.ActorSystem) -> None:
 )
 def test_events_cross_a_process_border_with_their_fields(event: hf.Event) -> None:
     back = event_from(type(event).__name__, event_data(event))
+    assert back is not None
     assert type(back) is type(event)
     assert event_data(back) == event_data(event)
 

@@ -188,7 +188,8 @@ async def test_an_ask_between_two_recorded_actors_survives_both(
         for victim in victims:
             strike(system, victim)
         for victim, life in lives.items():
-            await until(lambda v=victim, n=life: v._cell.life > n and v._cell.host.switch.is_released)
+            cell: Any = victim._cell
+            await until(lambda c=cell, n=life: c.life > n and c.host.switch.is_released)
     let_through(gate)
     await busy
     assert await answer == "2"

@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import pytest
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -19,9 +18,8 @@ def run(log: Path, *options: str) -> tuple[int, dict[str, object]]:
     return result.exit_code, json.loads(result.stdout)
 
 
-@pytest.mark.parametrize("method", ["hybrid", "replay"])
-def test_nothing_is_lost_and_the_maps_are_equal(small_log: Path, method: str) -> None:
-    status, found = run(small_log, "--kills", "2", "--method", method)
+def test_nothing_is_lost_and_the_maps_are_equal(small_log: Path) -> None:
+    status, found = run(small_log, "--kills", "2")
     assert status == 0
     assert found["identical"] is True
     assert (found["kills"], found["scans"], found["differing_cells"]) == (2, 60, 0)

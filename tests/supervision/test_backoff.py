@@ -110,6 +110,7 @@ async def test_a_healthy_life_starts_the_count_anew() -> None:
     async with hf.ActorSystem(log=False) as system:
         await system.start(clinic())
         fragile = system.ref("/app/clinic/fragile", Fragile)
+        born = math.inf
         for _ in range(3):
             fragile.tell(Boom())
             born = await fragile.ask(Born(), timeout=30.0)

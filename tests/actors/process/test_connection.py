@@ -6,7 +6,7 @@ import asyncio
 import contextlib
 import socket
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Any
 
 import msgspec
@@ -68,7 +68,7 @@ class End:
 
 
 @contextlib.asynccontextmanager
-async def pair() -> AsyncIterator[tuple[End, End]]:
+async def pair() -> AsyncGenerator[tuple[End, End], None]:
     one, other = socket.socketpair()
     ends = End(), End()
     for end, sock in zip(ends, (one, other), strict=True):
@@ -84,7 +84,7 @@ async def pair() -> AsyncIterator[tuple[End, End]]:
 
 
 @contextlib.asynccontextmanager
-async def against_raw() -> AsyncIterator[tuple[End, socket.socket]]:
+async def against_raw() -> AsyncGenerator[tuple[End, socket.socket], None]:
     """An end, and a bare socket on the other side."""
     ours, raw = socket.socketpair()
     ours.setblocking(False)

@@ -14,7 +14,7 @@ import signal
 import subprocess
 import sys
 import textwrap
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from pathlib import Path
 
 import psutil
@@ -105,7 +105,7 @@ class Fixture:
 
 
 @contextlib.asynccontextmanager
-async def running(preload: tuple[str, ...] = (), seconds: float = 10.0) -> AsyncIterator[Fixture]:
+async def running(preload: tuple[str, ...] = (), seconds: float = 10.0) -> AsyncGenerator[Fixture, None]:
     fixture = Fixture(preload, seconds=seconds)
     async with asyncio.timeout(SECONDS):
         await fixture.server.start()

@@ -41,9 +41,8 @@ Make = Callable[..., Awaitable[hf.ActorRef[Observer]]]
 @pytest.fixture
 def make(system: hf.ActorSystem, isolation: str) -> Make:
     async def make(name: str, **options: Any) -> hf.ActorRef[Observer]:
-        return await system.start(
-            hf.child(name, hf.start(Observer), **{"isolation": isolation, "restart": "temporary", **options})
-        )
+        spec: dict[str, Any] = {"isolation": isolation, "restart": "temporary", **options}
+        return await system.start(hf.child(name, hf.start(Observer), **spec))
 
     return make
 

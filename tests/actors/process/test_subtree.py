@@ -35,20 +35,17 @@ from tests.actors.process.waiting import next_event, until
 
 
 def subtree(**options: Any) -> hf.ChildSpec:
-    return hf.supervisor(
-        "team",
-        isolation="process",
-        **{
-            "intensity": 3,
-            "children": [
-                hf.child("alice", hf.start(Account, 100)),
-                hf.child("bob", hf.start(Account, 10)),
-                hf.child("book", hf.start(Observer)),
-                hf.supervisor("inner", children=[hf.child("carol", hf.start(Account, 1))], intensity=2),
-            ],
-            **options,
-        },
-    )
+    team: dict[str, Any] = {
+        "intensity": 3,
+        "children": [
+            hf.child("alice", hf.start(Account, 100)),
+            hf.child("bob", hf.start(Account, 10)),
+            hf.child("book", hf.start(Observer)),
+            hf.supervisor("inner", children=[hf.child("carol", hf.start(Account, 1))], intensity=2),
+        ],
+        **options,
+    }
+    return hf.supervisor("team", isolation="process", **team)
 
 
 async def test_children_are_reached_by_address_from_the_root(system: hf.ActorSystem) -> None:
