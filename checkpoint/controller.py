@@ -279,6 +279,9 @@ class RecordedProcessHost(ProcessHost):
             worker = await self._workers.take()
         except HoldfastError as error:
             raise StartFailed(cell.path, str(error)) from error
+        if cell.state is not DOWN:
+            worker.kill(KILLED)
+            raise StartFailed(cell.path, "it was stopped while it started")
         cell.life += 1
         cell.state = RUNNING
         worker.adopt(cell, self._limits, self.died)

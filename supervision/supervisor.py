@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import random
-from collections.abc import Coroutine, Iterable
+from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
 from ..actors import lives
@@ -437,11 +437,9 @@ def has_succeeded(up: asyncio.Future[None]) -> bool:
     return up.done() and not up.cancelled() and up.exception() is None
 
 
-def holds_processes(specs: Iterable[ChildSpec]) -> bool:
-    """Whether one of the children, or of theirs, has a process of its own."""
-    return any(
-        spec.isolation == "process" or (spec.is_supervisor and holds_processes(spec.start.args[1])) for spec in specs
-    )
+def holds(specs: Iterable[ChildSpec], wanted: Callable[[ChildSpec], bool]) -> bool:
+    """Whether one of the children, or of theirs, is as wanted."""
+    return any(wanted(spec) or (spec.is_supervisor and holds(spec.start.args[1], wanted)) for spec in specs)
 
 
 def supervisor(
@@ -477,8 +475,10 @@ def supervisor(
     except SpecError as error:
         raise SpecError(f"supervisor {name!r}", error.problem) from None
     start = Start(Supervisor, (flags, specs))
-    if isolation == "process" and holds_processes(specs):
-        raise SpecError(
-            f"supervisor {name!r}", "a subtree in a process cannot hold process children: its own is theirs"
-        )
+    if isolation == "process":
+        where = f"supervisor {name!r}"
+        if holds(specs, lambda spec: spec.isolation == "process"):
+            raise SpecError(where, "a subtree in a process cannot hold process children: its own is theirs")
+        if holds(specs, lambda spec: spec.recovery is not None and spec.recovery.records):
+            raise SpecError(where, "a subtree in a process cannot hold recorded children yet: give them their own")
     return ChildSpec(name, start, restart, shutdown, isolation, limits=limits, is_supervisor=True)

@@ -114,7 +114,7 @@ class Connection(asyncio.BufferedProtocol):
             payload = getattr(frame, "body", None)
             self._forget_names(frame)
             raise BadMessage(actor, type_name(type(payload)), too_large(payload, size))
-        self._out.append(LENGTH.pack(size))
+        self._out.append(size.to_bytes(4, "little"))
         self._out.append(data)
         self._out_bytes += size
         if not self._flushing:

@@ -23,7 +23,7 @@ from ..topics import Topics
 from . import frames
 from .connection import BadFrame, Connection
 from .recipe import unpack_recipe
-from .relay import OutsideHost, Peer, named, obey, text
+from .relay import Arrived, OutsideHost, Peer, RelayedAsk, named, obey, text
 
 Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
 """Begins the life a launch frame asks for; the composition root gives one that knows recovery and supervision."""
@@ -199,9 +199,33 @@ class Guest(Peer):
         self.connection.flush()
 
     def _tell(self, frame: frames.Tell) -> None:
+        """The hot path in: a plain message to our own actor, of a type it has had before."""
+        route = self.routes.get((frame.to, frame.name))
+        if route is not None and frame.sender is None:
+            cell, decode = route
+            try:
+                message = decode(frame.body)
+            except Exception:
+                route = None  # Said below, with all names.
+            else:
+                cell.admit(cell, Arrived(message, None, frame.number, self.page))
+                return
         self.on_tell(self._target(frame.to), frame, self.page if frame.number else None)
 
     def _ask(self, frame: frames.Ask) -> None:
+        """The same for an ask that no turn waits for."""
+        route = self.routes.get((frame.to, frame.name))
+        if route is not None and frame.sender is None and not frame.chain:
+            cell, decode = route
+            try:
+                message = decode(frame.body)
+            except Exception:
+                route = None
+            else:
+                ask = RelayedAsk.taken(self, frame, cell, self.page)
+                ask.message = message
+                cell.admit(cell, ask)
+                return
         self.on_ask(self._target(frame.to), frame, self.page if frame.number else None)
 
     def _record(self, frame: frames.Record) -> None:

@@ -36,8 +36,8 @@ class Peer:
         self.codec: Codec = node.codec
         self.pending: dict[int, Ask] = {}
         self._last_id = 0
-        self._routes: dict[tuple[Cell, frames.Name], Callable[[Any], Any]] = {}
-        self._kinds_out: dict[type, int] = {}
+        self.routes: dict[tuple[frames.Name, frames.Name], tuple[Cell, Callable[[Any], Any]]] = {}
+        self.kinds_out: dict[type, int] = {}
 
     # -- out --------------------------------------------------------------------------------------------------------
 
@@ -98,14 +98,14 @@ class Peer:
     def _payload(self, message: Any) -> tuple[frames.Name, Any]:
         """Type name and body; a parcel is passed on as it is."""
         kind = type(message)
-        known = self._kinds_out.get(kind)
+        known = self.kinds_out.get(kind)
         if known is not None:
             return known, message
         if kind is Parcel:
             return self.connection.name_out(message.name), Raw(message.body)
         name = self.connection.name_out(message_name(kind))
         if type(name) is int:  # Text introduces the name with this frame: known from the next one on.
-            self._kinds_out[kind] = name
+            self.kinds_out[kind] = name
         return name, message
 
     def _forget_done(self) -> None:
@@ -143,18 +143,12 @@ class Peer:
         elif ask is not None:
             ask.fail(self.codec.decode_error(frame.kind, frame.name, frame.body))
 
-    def _message_in(self, cell: Cell, name: frames.Name, body: Any) -> Any:
+    def _message_in(self, cell: Cell, frame: frames.Tell | frames.Ask) -> Any:
         """The message in a frame. Raises UnknownMessage or BadMessage."""
-        decode = self._routes.get((cell, name))
-        if decode is not None and cell.actor is not None:
-            try:
-                return decode(body)
-            except Exception:
-                decode = None  # What is wrong is found out below, and said with the actor's and the message's names.
-        text = self.connection.name_in(name)
-        message = self.codec.message_in(cell, text, body)
-        if type(name) is int and cell is self.node.root:  # Its class stays: how to decode what it gets, too.
-            self._routes[cell, name] = self.codec.decoder(type(message))
+        message = self.codec.message_in(cell, self.connection.name_in(frame.name), frame.body)
+        if type(frame.name) is int and cell is self.node.root and not cell.host.takes_parcels:
+            # Our own actor's class stays: so does the way in for this type.
+            self.routes[frame.to, frame.name] = cell, self.codec.decoder(type(message))
         return message
 
     def _sender(self, name: frames.Name | None) -> Cell | None:
@@ -163,7 +157,7 @@ class Peer:
     def on_tell(self, cell: Cell, frame: frames.Tell, page: memoryview | None) -> None:
         """Take in a message."""
         try:
-            message = self._message_in(cell, frame.name, frame.body)
+            message = self._message_in(cell, frame)
         except HoldfastError as error:
             name = self.connection.name_in(frame.name) if type(frame.name) is int else str(frame.name)
             self._sender(frame.sender)
@@ -194,7 +188,7 @@ class Peer:
         ask = RelayedAsk.taken(self, frame, cell, page)
         try:
             try:
-                ask.message = self._message_in(cell, frame.name, frame.body)
+                ask.message = self._message_in(cell, frame)
             finally:
                 if frame.sender is not None:
                     ask.sender = self._sender(frame.sender)

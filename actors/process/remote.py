@@ -54,11 +54,16 @@ class Outlet:
         worker = self.worker
         assert worker is not None
         number = self.sent + 1
-        worker.send_item(cell, self.path, item, number)
+        name = worker.kinds_out.get(type(item))
+        if name is None:
+            worker.send_item(cell, self.path, item, number)
+        else:  # A plain message of a type that was sent before: all names are numbers.
+            connection = worker.connection
+            connection.send(frames.Tell(connection.name_out(self.path), name, item, number), self.path)
         self.sent = number
-        self.flight.append((number, item))
-        done = worker.page[1]
         flight = self.flight
+        flight.append((number, item))
+        done = worker.page[1]
         while flight[0][0] <= done:  # What has been handled is let go soon: a large message is large memory.
             flight.popleft()
 
@@ -87,7 +92,7 @@ def admit_remote(cell: Cell, item: Any) -> None:
     """The mailbox of an actor in another process: sent at once, or kept until the process is up."""
     if type(item) not in cell.table and type(item) is not Parcel:
         _require(cell, item)
-    outlet: Outlet = cell.extra().outlet
+    outlet: Outlet = cell.more.outlet  # type: ignore[union-attr]  # made before this function stands there
     if outlet.worker is None:
         _check_codable(cell, item)
         mailbox.queue_of(cell).append(item)
