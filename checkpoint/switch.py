@@ -443,8 +443,9 @@ class Switch:
         source.deliveries = 0
         if status != STASHED:
             del self.open[source.id]
-        entry = ("end", number, source.id, status, tuple(turn.digests))
-        batch.add(self.path, entry, self._positions_of(number))
+        if self.journal.durable:
+            entry = ("end", number, source.id, status, tuple(turn.digests))
+            batch.add(self.path, entry, self._positions_of(number))
 
     def _positions_of(self, turn: int) -> list[int]:
         return self._positions.setdefault(turn, [])

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import structlog
-
 from ..actors.errors import type_name
 from ..actors.events import (
     ActorCrashed,
@@ -34,6 +32,8 @@ class LogSink:
     """Writes what an operator wants to see; formats only what is written."""
 
     def __init__(self, system: str, clock: Callable[[], float]) -> None:
+        import structlog  # only now: it is a third of the time that importing holdfast would take
+
         self._log = structlog.get_logger("holdfast", system=system)
         self._clock = clock  # the loop's
         self._second: dict[type, tuple[int, int]] = {}

@@ -6,7 +6,7 @@ import asyncio
 import socket
 import struct
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 
@@ -50,6 +50,7 @@ class Connection(asyncio.BufferedProtocol):
         on_batch: Callable[[], None] | None = None,
     ) -> None:
         self._on_frame, self._on_lost, self._on_batch = on_frame, on_lost, on_batch
+        self.takers: dict[type[Frame], Callable[[Any], None]] = {}  # frames of these types do not go to `on_frame`
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._encoder = msgspec.msgpack.Encoder(enc_hook=encode_special)
@@ -202,7 +203,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def _take_frames(self) -> None:
         begin, end, view, buffer = self._begin, self._end, self._view, self._buffer
-        unpack, decode, on_frame = LENGTH.unpack_from, _DECODER.decode, self._on_frame
+        unpack, decode, on_frame, taker = LENGTH.unpack_from, _DECODER.decode, self._on_frame, self.takers.get
         while end - begin >= 4:
             (size,) = unpack(buffer, begin)
             if size > MAX_FRAME:
@@ -211,7 +212,8 @@ class Connection(asyncio.BufferedProtocol):
                 break
             start = begin + 4
             begin = start + size
-            on_frame(decode(view[start:begin]))
+            frame = decode(view[start:begin])
+            taker(type(frame), on_frame)(frame)
             if not self.is_open:
                 return
         if begin == end:

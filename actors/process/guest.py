@@ -41,6 +41,7 @@ async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prep
     guest = Guest(asyncio.get_running_loop(), page, launcher)
     prepare(guest)
     guest.connection = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
+    guest.connection.takers = guest.takers
     await guest.connection.open(sock)
     code = await guest.ended
     # Handlers may hold threads or swallow cancellation: the process ends here, not when they are ready.
@@ -126,7 +127,7 @@ class Guest(Peer):
         self.node.here = InnerHost(self)
         self.node.topics = GuestTopics(self)
         self.node.events.add_sink(self._on_event)
-        self._takers: dict[type, Callable[[Any], None]] = {
+        self.takers: dict[type[frames.Frame], Callable[[Any], None]] = {
             frames.Tell: self._tell,
             frames.Ask: self._ask,
             frames.Offer: lambda frame: self.on_offer([self._target(frame.to)], frame),
@@ -187,11 +188,8 @@ class Guest(Peer):
     # -- frames from the root ---------------------------------------------------------------------------------------
 
     def on_frame(self, frame: frames.AnyFrame) -> None:
-        """Whatever the root sends."""
-        take = self._takers.get(type(frame))
-        if take is None:
-            raise BadFrame(f"the root sent a {type(frame).__name__}")
-        take(frame)
+        """A frame that nobody here takes."""
+        raise BadFrame(f"the root sent a {type(frame).__name__}")
 
     def on_batch(self) -> None:
         """All frames that have come are taken in: run the turns, and answer, in the same tick."""

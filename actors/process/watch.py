@@ -7,8 +7,6 @@ import signal
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import psutil
-
 from ..exits import OutOfMemory, Signal
 from .limits import Limits
 
@@ -20,8 +18,11 @@ class Watch:
     """Ends a process that hangs or takes more than its limits allow."""
 
     def __init__(self, worker: Worker, limits: Limits) -> None:
+        import psutil  # only where something is watched
+
         self.limits = limits
         self._worker = worker
+        self._ended = psutil.Error
         self._loop = worker.node.loop
         self._last_beat = self._loop.time()
         self._process = psutil.Process(worker.pid)
@@ -55,7 +56,7 @@ class Watch:
         try:
             resident = self._process.memory_info().rss
             cpu = self._cpu()
-        except psutil.Error:
+        except self._ended:
             return  # It has ended: its socket tells.
         share = (cpu - self._cpu_before) / limits.watch_interval
         self._cpu_before = cpu

@@ -67,6 +67,11 @@ class Worker(Peer):
         """Take over the socket and the output pipes."""
         loop, forked = self.node.loop, self.forked
         self.connection = Connection(self._on_frame, self._on_lost)
+        self.connection.takers = {
+            frames.Reply: self.on_reply,
+            frames.Failure: self.on_failure,
+            frames.Record: lambda frame: self.on_record(frame),
+        }
         await self.connection.open(forked.sock)
         for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
             fd = getattr(forked, name)

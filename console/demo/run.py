@@ -16,7 +16,6 @@ from ... import (
     HoldfastError,
     NoSuchActor,
     Recovered,
-    bounded,
     child,
     fresh,
     hybrid,
@@ -35,7 +34,6 @@ from .show import Progress, Watcher
 Method = Literal["hybrid", "fresh"]
 
 MAPPER, PLANNER, READER = "/demo/robot/mapper", "/demo/robot/planner", "/demo/robot/reader"
-MAILBOX = 64  # scans and questions that may wait for the mapper; then the reader waits
 LONGEST_READING = 3600.0  # seconds
 LAST_EVENTS = 2.0  # seconds to wait for the report of a recovery that is already over
 
@@ -54,7 +52,7 @@ class Plan:
 
 def tree(geometry: Geometry, recovery: object, kills: int) -> ChildSpec:
     """The supervision tree. Only the mapper's child spec knows that it has a process, and how it comes back."""
-    mapper = child("mapper", start(Mapper, geometry), isolation="process", recovery=recovery, mailbox=bounded(MAILBOX))
+    mapper = child("mapper", start(Mapper, geometry), isolation="process", recovery=recovery)
     planner = child("planner", start(Planner), bindings={"mapper": MAPPER})
     reader = child("reader", start(Reader))
     return supervisor(
