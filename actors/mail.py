@@ -167,6 +167,8 @@ class Ask(Item, msgspec.Struct, eq=False):
             return  # The handler keeps the handle and answers later.
         if not self.future.done():
             self.future.set_result(reply)
+        elif self.to is not None:
+            self.to.node.late_replies += 1
 
     def fail(self, error: BaseException) -> None:
         """End the wait with a typed failure."""

@@ -46,6 +46,7 @@ class Node(RunLoop):
         self.topics = Topics()
         self.names: dict[str, Cell] = {}
         self.dead_letters = 0
+        self.late_replies = 0
         self.wall: Callable[[], float] = time.time
         self.outside: Callable[[str], Cell | None] | None = None  # finds cells of other processes
         self.root: Cell | None = None

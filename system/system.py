@@ -274,6 +274,11 @@ class ActorSystem:
             cell = cell.parent
         return os.getpid()
 
+    @property
+    def late_replies(self) -> int:
+        """Replies that came when nobody waited any more, so far."""
+        return self.node.late_replies
+
     def tree(self) -> list[str]:
         """The addresses that live now, parents before children."""
         found: list[str] = []

@@ -129,12 +129,14 @@ async def test_an_expired_ask_is_not_run_and_says_so(system: hf.ActorSystem) -> 
 
 
 @virtual
-async def test_a_late_reply_is_dropped(system: hf.ActorSystem) -> None:
+async def test_a_late_reply_is_dropped_and_counted(system: hf.ActorSystem) -> None:
     worker = system.spawn(hf.start(Worker))
     asked = worker.ask(Quick("later"), timeout=1.0)
     with pytest.raises(hf.AskTimeout):
         await asked
+    assert system.late_replies == 0
     await worker.ask(Answer("too late"))
+    assert system.late_replies == 1
     assert isinstance(asked.exception(), hf.AskTimeout)
     assert await worker.ask(Quick("on")) == "on"
 
