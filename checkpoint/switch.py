@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
@@ -21,7 +20,6 @@ from ..actors.errors import (
     ActorStopped,
     AskDeadlock,
     AskTimeout,
-    BadMessage,
     HoldfastError,
     MailboxFull,
     Quarantined,
@@ -29,9 +27,11 @@ from ..actors.errors import (
 )
 from ..actors.events import JournalFull, MessageQuarantined, RecoveryFailed, SnapshotFailed, SnapshotTaken
 from ..actors.exits import pack_exit
-from ..actors.mail import Ask, Envelope, Item, ReplyHandle
+from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
 from ..actors.process.relay import RelayedAsk
+from .asks import SwitchAsk
+from .inputs import Batch, Input, TimerState, Turn
 from .journal import Entry, Journal
 from .method import Method
 from .records import (
@@ -49,7 +49,6 @@ from .records import (
     STASHED,
     TICK,
     Answer,
-    Feed,
     Go,
     Live,
     Out,
@@ -69,8 +68,6 @@ from .records import (
 if TYPE_CHECKING:
     from ..actors.node import Node
 
-EXPIRED = 1e-9
-"""A deadline that has passed. (Asks forget theirs when they expire.)"""
 OVERHEAD = 200
 """Bytes an input is counted with besides its payload."""
 
@@ -81,149 +78,6 @@ class LifePort(Protocol):
     def to_life(self, record: ToLife) -> None:
         """Hand a record to the life; it is handled in order."""
         ...
-
-
-class Input:
-    """One journaled input."""
-
-    __slots__ = (
-        "ask",
-        "body",
-        "chain",
-        "deliveries",
-        "id",
-        "kind",
-        "name",
-        "origin",
-        "positions",
-        "sender",
-        "time",
-        "turn",
-    )
-
-    def __init__(self, id: int, kind: str, name: str, body: bytes, when: float, sender: str | None) -> None:
-        self.id, self.kind, self.name, self.body, self.time, self.sender = id, kind, name, body, when, sender
-        self.ask: Ask | None = None
-        self.chain: tuple[tuple[str, int], ...] = ()
-        self.turn = 0  # the turn that ended it
-        self.deliveries = 0  # deaths of the process in this very turn
-        self.origin = ""  # the timer or pipe it comes from
-        self.positions: list[int] = []
-
-    def feed(self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False) -> Feed:
-        """As the life gets it; what has begun is finished whatever its deadline."""
-        ask = self.ask
-        deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
-        origin = self.origin if self.kind == TICK else ""
-        return Feed(
-            self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
-            ask is not None, self.chain, pipes, deadline, origin,
-        )  # fmt: skip
-
-
-class Turn:
-    """One ended turn since the last snapshot."""
-
-    __slots__ = ("digests", "input", "status")
-
-    def __init__(self, source: Input, status: str, digests: list[int]) -> None:
-        self.input, self.status, self.digests = source, status, digests
-
-
-class TimerState:
-    """A timer of the actor; its clock runs here, whoever lives."""
-
-    __slots__ = ("body", "due", "handle", "interval", "name")
-
-    def __init__(self, name: str, body: bytes, due: float, interval: float) -> None:
-        self.name, self.body, self.due, self.interval = name, body, due, interval
-        self.handle: asyncio.TimerHandle | None = None
-
-
-class Batch:
-    """What becomes one append, and what happens when it is safe."""
-
-    __slots__ = ("after", "entries", "sinks")
-
-    def __init__(self) -> None:
-        self.entries: list[tuple[str, Entry]] = []
-        self.sinks: list[list[int]] = []
-        self.after: list[Callable[[], None]] = []
-
-    def add(self, path: str, entry: Entry, sink: list[int]) -> None:
-        """One more entry; `sink` gets its position."""
-        self.entries.append((path, entry))
-        self.sinks.append(sink)
-
-    def commit(self, journal: Journal) -> None:
-        """Append all of it, then let it take effect."""
-        if self.entries and journal.durable:
-            for sink, position in zip(self.sinks, journal.append(self.entries), strict=True):
-                sink.append(position)
-        for effect in self.after:
-            effect()
-
-
-class Over:
-    """Stands for the future of an ask that is over."""
-
-    def done(self) -> bool:
-        """It is."""
-        return True
-
-
-OVER = Over()
-
-
-class SwitchAsk(RelayedAsk, eq=False):
-    """An ask from inside a recorded turn: its outcome is journaled before the turn hears of it.
-
-    To others it is an ask that was relayed: whoever has an encoded outcome hands that over.
-    """
-
-    switch: Any = None
-    turn: int = 0
-    k: int = 0
-
-    @classmethod
-    def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell) -> SwitchAsk:
-        """The ask that was output (turn, k)."""
-        deadline = switch.node.loop.time() + out.seconds
-        ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, deadline, None, to)
-        ask.future, ask.switch, ask.turn, ask.k = ask, switch, turn, out.k
-        return ask
-
-    def done(self) -> bool:
-        """As a future has it."""
-        return self.is_over
-
-    def answer(self, reply: object) -> None:
-        if isinstance(reply, ReplyHandle):
-            return
-        try:
-            body = self.switch.node.codec.encode(reply, self.switch.path)
-        except BadMessage as error:
-            self.fail(BadMessage("reply", error.message, error.problem))
-        else:
-            self.give(Answer(REPLY, "", body))
-
-    def answer_raw(self, body: bytes) -> None:
-        """An encoded reply."""
-        self.give(Answer(REPLY, "", body))
-
-    def fail(self, error: BaseException) -> None:
-        self.give(Answer(*self.switch.node.codec.encode_error(error)))
-
-    def fail_raw(self, kind: str, name: str, body: bytes) -> None:
-        """An encoded error."""
-        self.give(Answer(kind, name, body))
-
-    def give(self, answer: Answer, batch: Batch | None = None) -> None:
-        """The outcome, once."""
-        if not self.is_over:
-            self.is_over = True
-            self.future = OVER  # Not itself any more: a cycle would keep the message until the next collection.
-            self.switch.outcome(self.turn, self.k, answer, batch)
 
 
 class Switch:
