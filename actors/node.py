@@ -14,7 +14,7 @@ from . import lives
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
-from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SendError, SpecError, WrongActor, type_name
+from .errors import ActorStopped, NameTaken, NoSuchActor, SendError, SpecError, WrongActor, type_name
 from .events import DeadLetter, Event, EventHub
 from .exits import ExitReason
 from .lives import LOCAL
@@ -232,11 +232,6 @@ def cell_kind(cell: Cell) -> type[Actor] | None:
         return type(cell.actor)
     start = cell.more.start if cell.more is not None else None
     return None if start is None else start.kind
-
-
-def public(error: BaseException) -> bool:
-    """Whether an error is holdfast's own."""
-    return isinstance(error, HoldfastError)
 
 
 def message_of(item: object) -> Message[Any] | None:
