@@ -18,6 +18,8 @@ from .ref import ActorRef
 if TYPE_CHECKING:
     from .actor import Actor, Start
     from .context import ActorContext
+    from .control.calls import Call
+    from .control.tap import Tap
     from .loop import Suspended
     from .mailbox import Bound
     from .node import Node
@@ -69,6 +71,18 @@ class Host(Protocol):
         """Admit a message for a sender that waits until it is accepted. None: it is."""
         ...
 
+    def control(self, cell: Cell, call: Call) -> None:
+        """Have an order carried out between two turns of the actor, ahead of all messages."""
+        ...
+
+    def is_up(self, cell: Cell) -> bool:
+        """Whether a life takes messages now: it has started, and is not being recovered."""
+        ...
+
+    def backlog(self, cell: Cell) -> int:
+        """Messages that wait, as far as is known in this process."""
+        ...
+
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """A link or monitor at this cell was made or removed: its actor's own process has to know."""
         ...
@@ -80,8 +94,8 @@ class More:
     __slots__ = (
         "bindings",
         "bound",
+        "calls",
         "enders",
-        "held",
         "last",
         "links",
         "monitors",
@@ -91,6 +105,8 @@ class More:
         "start",
         "starting",
         "stash",
+        "suspended",
+        "tap",
         "tasks",
         "timers",
         "topics",
@@ -102,8 +118,8 @@ class More:
     def __init__(self) -> None:
         self.bindings: dict[str, Cell] = {}
         self.bound: Bound | None = None
+        self.calls: list[Call] = []  # control that waits for the actor's process to be up
         self.enders: list[asyncio.Future[ExitReason]] = []
-        self.held: deque[Any] | None = None  # user messages of a suspended actor
         self.last: Actor | None = None  # the actor of the ended life, if it wants what stays undelivered
         self.links: dict[Cell, None] = {}
         self.monitors: list[Any] = []  # who watches us (links.Monitor)
@@ -113,6 +129,8 @@ class More:
         self.start: Start[Any] | None = None
         self.starting: asyncio.Future[None] | None = None  # whoever waits for `on_start` of this life waits for it
         self.stash: deque[Any] | None = None
+        self.suspended = False
+        self.tap: Tap | None = None  # whoever counts or follows what the actor does
         self.tasks: set[asyncio.Task[Any]] = set()
         self.timers: set[Any] = set()
         self.topics: set[str] = set()
@@ -231,6 +249,8 @@ class Cell:
         more = self.more
         if more is None:
             return None
+        if self.admit is mailbox.admit_closing:
+            raise ActorStopped(self.path, "it is stopping")
         if more.outlet is not None and (wait := more.outlet.room()) is not None:
             return wait  # type: ignore[no-any-return]
         return more.bound.room(self) if more.bound is not None else None
@@ -279,6 +299,7 @@ class _NextUrgent(Item):
     """Stands at the front of a queue for the next command in `more.urgent`."""
 
     __slots__ = ()
+    is_command = True
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:

@@ -22,7 +22,7 @@ from .errors import (
     remote_crash,
     type_name,
 )
-from .message import Message, Refusal, UnknownRefusal, by_name, find_refusal, message_name, reply_type
+from .message import Message, Refusal, UnknownRefusal, find_refusal, message_name, reply_type
 from .ref import ActorRef
 
 if TYPE_CHECKING:
@@ -54,7 +54,6 @@ class Codec:
     def __init__(self, cell_at: Callable[[str], Cell]) -> None:
         self._cell_at = cell_at
         self.encoder = msgspec.msgpack.Encoder(enc_hook=encode_special)
-        self._kinds: dict[tuple[int, str], type[Message[Any]]] = {}
         self._decoders: dict[Any, Callable[[Any], Any]] = {}
         self._reply_decoders: dict[type[Message[Any]], Callable[[Any], Any]] = {}
 
@@ -106,13 +105,12 @@ class Codec:
         """
         if cell.host.takes_parcels and cell.actor is None:
             return Parcel(name, bytes(body))
-        table = cell.table
-        kind = self._kinds.get((id(table), name))
+        kind = cell.table.named.get(name)
         if kind is None:
-            kind = by_name(table).get(name)
-            if kind is None:
-                raise UnknownMessage(cell.path, name.replace(":", "."))
-            self._kinds[id(table), name] = kind
+            try:
+                kind = cell.table.kind_named(name)
+            except UnknownMessage as error:
+                raise UnknownMessage(cell.path, error.message) from None
         try:
             return self.decode(kind, body)
         except msgspec.DecodeError as error:

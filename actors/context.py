@@ -21,6 +21,7 @@ from .topics import NOT_TAKEN
 if TYPE_CHECKING:
     from .actor import Actor, Start
     from .cell import Cell
+    from .control.calls import Call
     from .ref import ActorRef
 
 A = TypeVar("A", bound="Actor")
@@ -254,7 +255,7 @@ class ActorContext:
             return
         if more.bound is not None:
             more.bound.count += len(stash)
-        mailbox.queue_of(self.cell).extendleft(reversed(stash))
+        mailbox.put_back(self.cell, stash)
         stash.clear()
         self.cell.schedule()
 
@@ -321,6 +322,21 @@ class ActorContext:
         """End this life after the turn in hand."""
         self._alive()
         self.cell.request_stop(reason)
+
+    # -- control (called between two turns, by what carries orders out) --------------------------------------------
+
+    def postpones(self, call: Call) -> bool:
+        """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""
+        return False
+
+    def may_replace(self) -> None:
+        """The state is about to be replaced from outside. Raises ControlFailed if it cannot be now."""
+
+    def replaced(self) -> None:
+        """The state was replaced from outside: a journaled actor saves it before anything else happens.
+
+        Raises whatever keeps it from being saved.
+        """
 
     def close(self) -> None:
         """The life is over."""

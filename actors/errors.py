@@ -6,13 +6,16 @@ HoldfastError
 │   ├── MailboxFull      the mailbox is at capacity
 │   ├── UnknownMessage   the receiver has no handler for this type
 │   ├── BadMessage       a field cannot be coded, or has the wrong type, or the frame is too large
-│   └── AskDeadlock      the receiver waits, directly or not, for this very asker
+│   ├── AskDeadlock      the receiver waits, directly or not, for this very asker
+│   └── ActorRestarting  the receiver is between two lives, and the asker did not want to wait
 ├── AskTimeout           no reply before the deadline (`handled` says whether the turn may have run)
 ├── AskFailed            the receiver ended in the middle of the turn
 ├── RemoteCrash          the receiver's handler raised
 ├── Quarantined          the message ended its actor's process again and again
 ├── ReplayDiverged       a replayed turn released something else than before
 ├── StartFailed          an actor could not be started
+├── ControlFailed        an order to a live actor could not be carried out; the actor is as before
+│   └── NotSuspended     the order is for suspended actors only
 ├── NameTaken            a living actor has this name already
 ├── NoSuchActor          nobody lives at this address
 ├── WrongActor           another class lives at this address
@@ -98,6 +101,17 @@ class AskDeadlock(SendError):
         return f"ask to {self.actor} would wait for itself ({way}); use tell, or ask from outside the turn"
 
 
+class ActorRestarting(SendError):
+    """The receiver is between two lives, or being recovered, and the asker said `restarting="fail"`."""
+
+    def __init__(self, actor: str) -> None:
+        super().__init__(actor)
+        self.actor = actor
+
+    def __str__(self) -> str:
+        return f"{self.actor} is being restarted; the message was not sent, try again"
+
+
 class AskTimeout(HoldfastError):
     """No reply before the deadline.
 
@@ -181,6 +195,25 @@ class StartFailed(HoldfastError):
 
     def __str__(self) -> str:
         return f"{self.actor} could not be started: {self.reason}"
+
+
+class ControlFailed(HoldfastError):
+    """An order to a live actor could not be carried out; the actor goes on as before."""
+
+    def __init__(self, actor: str, order: str, problem: str) -> None:
+        super().__init__(actor, order, problem)
+        self.actor, self.order, self.problem = actor, order, problem
+
+    def __str__(self) -> str:
+        return f"{self.order} of {self.actor} failed: {self.problem}"
+
+
+class NotSuspended(ControlFailed):
+    """The order is for suspended actors only."""
+
+    def __init__(self, actor: str, order: str) -> None:
+        super().__init__(actor, order, "the actor must be suspended first")
+        self.args = (actor, order)
 
 
 class NameTaken(HoldfastError):

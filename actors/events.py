@@ -129,6 +129,37 @@ class LogLine(Event, frozen=True, eq=False):
     text: str
 
 
+class MessageIn(Event, frozen=True, eq=False):
+    """Traced: a message was let into the actor's mailbox. (From another process messages come as text.)"""
+
+    message: Any
+
+
+class TurnBegan(Event, frozen=True, eq=False):
+    """Traced: the actor begins to handle a message."""
+
+    message: Any
+
+
+class TurnEnded(Event, frozen=True, eq=False):
+    """Traced: the turn is over, after `seconds`; `outcome` is "done", "refused" or "crashed: ..."."""
+
+    message: Any
+    seconds: float
+    outcome: str
+
+
+class MessageOut(Event, frozen=True, eq=False):
+    """Traced: the actor has sent a message to an address, or published it on a topic."""
+
+    to: str
+    message: Any
+
+
+TRACED = (MessageIn, TurnBegan, TurnEnded, MessageOut)
+"""What is told to those who trace the actor, and to nobody else."""
+
+
 class EventStream:
     """One listener's view: an async iterator over events, with a bound on how far it may fall behind."""
 

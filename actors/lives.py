@@ -25,6 +25,7 @@ from .ref import current
 
 if TYPE_CHECKING:
     from .actor import Start
+    from .control.calls import Call
     from .loop import Suspended
 
 PATIENCE = 5.0
@@ -51,13 +52,7 @@ class LocalHost:
             return
         actor: Any = cell.actor
         if cell.scheduled or cell.children or type(actor).on_stop is not Actor.on_stop:
-            queue = cell.queue
-            if queue and type(queue[0]) is FirstTurn:  # `on_start` comes first, or `on_stop` would find nothing done.
-                first = queue.popleft()
-                cell.urge(Stop(reason))
-                queue.appendleft(first)
-            else:
-                cell.urge(Stop(reason))
+            urge(cell, Stop(reason))
         else:
             ended(cell, reason)  # Idle, and nothing of the user's has to run: it is over at once.
 
@@ -79,8 +74,40 @@ class LocalHost:
     def offer(self, cell: Cell, item: Any) -> None:
         cell.admit(cell, item)
 
+    def control(self, cell: Cell, call: Call) -> None:
+        if call.is_urgent:
+            urge(cell, call)
+        else:
+            mailbox.queue_of(cell).append(call)
+            cell.schedule()
+
+    def is_up(self, cell: Cell) -> bool:
+        return is_up(cell)
+
+    def backlog(self, cell: Cell) -> int:
+        return sum(map(mailbox.counts, cell.queue or ()))
+
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         pass
+
+
+def is_up(cell: Cell) -> bool:
+    """Whether a life has begun in this process, `on_start` included."""
+    if cell.state is not RUNNING:
+        return False
+    starting = cell.more.starting if cell.more is not None else None
+    return starting is None or starting.done()
+
+
+def urge(cell: Cell, command: Item) -> None:
+    """Put a command ahead of all messages, but behind `on_start`: `on_stop` would find nothing done."""
+    queue = cell.queue
+    if queue and type(queue[0]) is FirstTurn:
+        first = deque.popleft(queue)
+        cell.urge(command)
+        queue.appendleft(first)
+    else:
+        cell.urge(command)
 
 
 LOCAL = LocalHost()
@@ -137,6 +164,8 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
         if cell.more is not None:
             cell.more.reason = reason
         raise StartFailed(cell.path, str(reason)) from error
+    if cell.more is not None and cell.more.tap is not None:
+        cell.more.tap.attach()
 
 
 def up(cell: Cell) -> None:
@@ -360,16 +389,16 @@ def _undo(cell: Cell) -> None:
     for name in more.names:
         cell.node.names.pop(name, None)
     more.names.clear()
-    more.urgent = None
+    more.suspended = False
     queue = cell.queue
     if queue:
         kept = deque.copy(queue) if type(queue) is deque else deque(queue)
         deque.clear(queue)
         queue.extend(item for item in kept if not isinstance(item, Item) or not item.of_life)
-    if more.held is not None:
-        mailbox.queue_of(cell).extend(more.held)
-        more.held = None
-        cell.admit = mailbox.admit_bounded if more.bound is not None else mailbox.admit_queue
+    urgent, more.urgent = more.urgent, None
+    for command in urgent or ():  # Control of the address waits for the next life; stop and kill were for this one.
+        if not command.of_life:
+            cell.urge(command)
     if more.stash:
         mailbox.queue_of(cell).extendleft(reversed(more.stash))
         if more.bound is not None:
@@ -397,6 +426,12 @@ def retire(cell: Cell, why: object) -> None:
             more.bound.release()
         links.announce(cell, more.reason, recovering=False)  # Links of a recorded actor wait for this.
         links.gone(cell, more.reason)
+        commands: list[Item] = [*more.calls, *(more.urgent or ())]
+        more.calls, more.urgent = [], None
+        for command in commands:
+            command.undelivered(cell, str(why))
+        if more.tap is not None:
+            more.tap.close()
     while queue:
         item = deque.popleft(queue)
         if isinstance(item, Item):

@@ -312,11 +312,12 @@ class TurnEnded(Item):
 class Suspended:
     """A turn that waits for something, and the runner that waits with it."""
 
-    __slots__ = ("cell", "coroutine", "item", "killed", "rebinds", "runner", "then", "waiting")
+    __slots__ = ("cell", "coroutine", "item", "killed", "rebinds", "runner", "since", "then", "waiting")
 
     def __init__(self, cell: Cell, item: Any, coroutine: Any, waiting: Any, runner: Runner) -> None:
         self.cell, self.item, self.coroutine, self.waiting, self.runner = cell, item, coroutine, waiting, runner
         self.killed = False
+        self.since: float = cell.node.now  # on the loop's clock, of the slice it began in
         self.rebinds: dict[str, Cell] | None = None  # bindings that change when this turn is over
         self.then: Callable[[], None] | None = None  # set when the coroutine is no turn but a winding down
 

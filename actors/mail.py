@@ -34,6 +34,8 @@ class Item:
     __slots__ = ()
     of_life: ClassVar[bool] = True
     """Whether it concerns one life only, and is dropped when that ends; messages stay with the address."""
+    is_command: ClassVar[bool] = False
+    """Whether it stands at the front of the queue for a command, ahead of all messages."""
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -58,6 +60,7 @@ class Table(dict[type, Handler]):
 
     def __init__(self) -> None:
         super().__init__({Envelope: Envelope.run, Ask: Ask.run})
+        self.named: dict[str, type[Message[Any]]] = {}  # found by wire name so far; the codec's
 
     def __missing__(self, kind: type) -> Handler:
         if issubclass(kind, Item):
@@ -75,9 +78,12 @@ class Table(dict[type, Handler]):
 
     def kind_named(self, name: str) -> type[Message[Any]]:
         """The handled message type with this wire name. Raises UnknownMessage."""
-        kind = by_name(self).get(name)
+        kind = self.named.get(name)
         if kind is None:
-            raise UnknownMessage("the actor", name.replace(":", "."))
+            kind = by_name(self).get(name)
+            if kind is None:
+                raise UnknownMessage("the actor", name.replace(":", "."))
+            self.named[name] = kind
         return kind
 
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections import deque
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from .errors import MailboxFull, SpecError
-from .mail import Ask, Envelope, Item
+from .mail import LEAVE, Ask, Envelope, Item
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -41,15 +42,6 @@ def admit_queue(cell: Cell, item: Any) -> None:
             node.wake()
 
 
-def admit_held(cell: Cell, item: Any) -> None:
-    """The actor is suspended: messages wait apart, so that commands still run."""
-    if type(item) not in cell.table:
-        cell.require(item)
-    more = cell.extra()
-    assert more.held is not None
-    more.held.append(item)
-
-
 def admit_bounded(cell: Cell, item: Any) -> None:
     """A mailbox with a capacity: what does not fit goes by the overflow policy."""
     if type(item) not in cell.table:
@@ -57,6 +49,14 @@ def admit_bounded(cell: Cell, item: Any) -> None:
     bound = cell.extra().bound
     assert bound is not None
     bound.admit(cell, item)
+
+
+def admit_closing(cell: Cell, item: Any) -> None:
+    """The actor handles what is queued and then stops: nothing new is let in. (`Cell.room` refuses a `send`.)"""
+    if isinstance(item, Ask):
+        item.fail(cell.stopped_error("it is stopping"))
+    else:
+        cell.node.dead_letter(cell, item.message if isinstance(item, Envelope) else item, "the actor is stopping")
 
 
 def admit_gone(cell: Cell, item: Any) -> None:
@@ -78,6 +78,16 @@ def queue_of(cell: Cell) -> deque[Any]:
         if cell.admit is admit_first:
             cell.admit = admit_queue
     return cell.queue
+
+
+def put_back(cell: Cell, items: Iterable[Any]) -> None:
+    """Put items at the front of the queue, in order, but behind the commands that stand there."""
+    queue = queue_of(cell)
+    commands: list[Any] = []
+    while queue and isinstance(queue[0], Item) and queue[0].is_command:
+        commands.append(deque.popleft(queue))
+    queue.extendleft(reversed(list(items)))
+    queue.extendleft(reversed(commands))
 
 
 class Bound:
@@ -117,7 +127,7 @@ class Bound:
     def put(self, cell: Cell, item: Any) -> None:
         """Append, counted."""
         self.count += 1
-        (cell.extra().held if cell.admit is admit_held else queue_of(cell)).append(item)  # type: ignore[union-attr]
+        queue_of(cell).append(item)
         cell.schedule()
 
     def taken(self, cell: Cell) -> None:
@@ -208,6 +218,37 @@ class _Nothing(Item):
 
 
 NOTHING = _Nothing()
+
+
+class _Hold(Item):
+    """Stands between the commands and the messages of a suspended actor: none of those is run, none is out of order."""
+
+    __slots__ = ()
+    is_command = True
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        cell: Cell = actor.ctx.cell
+        queue_of(cell).appendleft(item)
+        cell.scheduled = False
+        return LEAVE
+
+
+HOLD = _Hold()
+
+
+def hold(cell: Cell) -> None:
+    """Suspend: called between two turns."""
+    put_back(cell, (HOLD,))
+
+
+def release(cell: Cell) -> None:
+    """Resume: called between two turns."""
+    queue = queue_of(cell)
+    for index, item in enumerate(queue):  # Not removed: the run loop has counted it.
+        if item is HOLD:
+            queue[index] = NOTHING
+            return
 
 
 class BoundedQueue(deque[Any]):

@@ -53,6 +53,7 @@ class Node(RunLoop):
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
         self.here: Host = LOCAL  # lives in this very process
         self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
+        self.respec: Callable[[Cell, Start[Any]], None] = begin_with  # has an actor's next lives begin with this
         self._seeds = random.Random(seed)
         self._numbers = itertools.count(1)
         self._turns = itertools.count(1)
@@ -224,6 +225,11 @@ class Node(RunLoop):
         else:  # One turn sees one target, also if it waits meanwhile.
             more.turn.rebinds = {**(more.turn.rebinds or {}), port: target}
         cell.host.told(cell, "bind", {"port": port, "target": target.path})
+
+
+def begin_with(cell: Cell, start: Start[Any]) -> None:
+    """The next lives at `cell` begin with `start`; what its supervisor knows of it is the composition root's."""
+    cell.extra().start = start
 
 
 def cell_kind(cell: Cell) -> type[Actor] | None:

@@ -161,6 +161,12 @@ class TaskHost(lives.LocalHost):
             switch.live.set_exception(StartFailed(switch.path, ENDED))
             switch.live.exception()  # Nobody may be left to look.
 
+    def is_up(self, cell: Cell) -> bool:
+        return self.switch is not None and self.switch.is_released
+
+    def backlog(self, cell: Cell) -> int:
+        return self.switch.backlog() if self.switch is not None else 0
+
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
@@ -327,13 +333,18 @@ class RecordedProcessHost(ProcessHost):
         if switch.live is not None and not switch.live.done():
             switch.live.set_exception(StartFailed(cell.path, str(reason)))
             switch.live.exception()  # Nobody may be left to look.
-        worker.take_pending()
         keep_subscriptions(cell)
         lives.ended(cell, reason)
 
     def push(self, cell: Cell, item: Item) -> None:
         if self.switch is not None:
             self.switch.push(item)
+
+    def is_up(self, cell: Cell) -> bool:
+        return self.switch is not None and self.switch.is_released
+
+    def backlog(self, cell: Cell) -> int:
+        return self.switch.backlog() if self.switch is not None else 0
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""

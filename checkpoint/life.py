@@ -18,7 +18,7 @@ from ..actors import lives, mailbox
 from ..actors.actor import Actor, Start
 from ..actors.cell import RUNNING, Cell
 from ..actors.context import ActorContext, StashError
-from ..actors.errors import BadMessage, HoldfastError, RemoteCrash, StartFailed, remote_crash
+from ..actors.errors import BadMessage, ControlFailed, HoldfastError, RemoteCrash, StartFailed, remote_crash
 from ..actors.exits import NORMAL, ExitReason, unpack_exit
 from ..actors.links import Monitor
 from ..actors.mail import LEAVE, Item, ReplyHandle
@@ -53,6 +53,7 @@ from .records import (
 )
 
 if TYPE_CHECKING:
+    from ..actors.control.calls import Call
     from ..actors.node import Node
 
 T = TypeVar("T")
@@ -88,6 +89,7 @@ class Life:
         self.gone: tuple[int, ...] = ()
         self.cancelled: set[str] = set()  # timers whose ticks may still be on their way
         self.stop_wanted: ExitReason | None = None
+        self.postponed: list[Item] = []  # orders from outside that wait until it is live
         self.is_live = False
         self.has_replayed = False
         self.in_hook = False
@@ -280,6 +282,9 @@ class Life:
         if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
             self.cell.urge(TakeSnapshot(self))
         self._arm()
+        postponed, self.postponed = self.postponed, []
+        for call in postponed:
+            self.cell.urge(call)
         if self.stop_wanted is not None:
             self.cell.request_stop(self.stop_wanted)
 
@@ -304,6 +309,24 @@ class Life:
         except Exception as error:  # What the user's own `get_state` raises is no reason to lose what it has.
             self.port.to_home(Unsaved(str(error)))
             return
+        self._send_snapshot(data, begin)
+
+    def may_replace(self) -> str:
+        """Why the state cannot be replaced from outside now; "" if it can: a snapshot has to follow at once."""
+        return "background work (pipe_to_self) is out; try again when it is back" if self.pipes else ""
+
+    def replaced(self) -> None:
+        """The state was replaced from outside, in no turn: only a snapshot can bring it back.
+
+        Raises:
+            UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
+        """
+        actor = self.cell.actor
+        assert actor is not None
+        begin = time.perf_counter()
+        self._send_snapshot(save_state(actor), begin)
+
+    def _send_snapshot(self, data: bytes, begin: float) -> None:
         stash = [fed.feed.id for fed in self.stash]
         pause = time.perf_counter() - begin
         parts = pieces(data)
@@ -319,6 +342,8 @@ class Life:
         for future, _ in self.asks.values():
             future.cancel()
         self.asks.clear()
+        for call in self.postponed:  # The next life's.
+            self.cell.urge(call)
         self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.
         self.port.closed()
 
@@ -755,6 +780,20 @@ class RecordedContext(ActorContext):
 
     def unsubscribe(self, topic: str) -> None:
         self.recorded.put("unsubscribe", topic)
+
+    def postpones(self, call: Call) -> bool:
+        if self.recorded.is_live:
+            return False
+        self.recorded.postponed.append(call)
+        return True
+
+    def may_replace(self) -> None:
+        problem = self.recorded.may_replace()
+        if problem:
+            raise ControlFailed(self.path, "replace_state", problem)
+
+    def replaced(self) -> None:
+        self.recorded.replaced()
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
         if self.recorded.is_live:

@@ -172,6 +172,10 @@ class Switch:
         self._waiters.append(future)
         return future
 
+    def backlog(self) -> int:
+        """Messages and ticks that have no end yet."""
+        return sum(source.kind in (MESSAGE, TICK) for source in self.open.values())
+
     def record(
         self, kind: str, name: str, body: bytes, sender: str | None, batch: Batch | None = None, origin: str = ""
     ) -> Input:

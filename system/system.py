@@ -24,8 +24,10 @@ from ..actors.ref import ActorRef
 from ..actors.topics import NOT_TAKEN
 from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
 from ..checkpoint.stores import open_journal
+from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import DeleteChild, NoSuchChild, StartChild, Supervisor, TerminateChild
+from .controls import Controls
 from .logs import LogSink
 
 A = TypeVar("A", bound=Actor)
@@ -40,7 +42,7 @@ STOP_TIMEOUT = 365 * 86_400.0
 """Seconds `stop` waits: no limit of its own, the child specs say how long an end may take."""
 
 
-class ActorSystem:
+class ActorSystem(Controls):
     """A tree of actors: an async context manager that lives in whatever loop it is entered in.
 
     Args:
@@ -92,6 +94,7 @@ class ActorSystem:
         self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
+        node.respec = respec
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
         self._body = asyncio.current_task()

@@ -14,6 +14,7 @@ import uvloop
 
 from .. import exits, lives
 from ..cell import RUNNING, Cell
+from ..control.calls import obey_order
 from ..errors import HoldfastError, StartFailed
 from ..events import ActorStarted, Event, event_data
 from ..exits import ExitReason, pack_exit
@@ -277,6 +278,8 @@ class Guest(Peer):
     def _command(self, cell: Cell, frame: frames.Command) -> None:
         if frame.verb == "bind":
             cell.extra().bindings[text(frame, "port")] = named(self.node, frame, "target")
+        elif frame.verb == "control":
+            obey_order(self, cell, frame)
         else:
             obey(self.node, cell, frame)
 

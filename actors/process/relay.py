@@ -21,6 +21,7 @@ from .connection import BadFrame, Connection
 
 if TYPE_CHECKING:
     from ..cell import Cell
+    from ..control.calls import Call
     from ..node import Node
 
 Coroutine_ = types.CoroutineType
@@ -90,10 +91,14 @@ class Peer:
 
     def acceptance(self) -> tuple[int, asyncio.Future[None]]:
         """A number for the other side to answer under, and the future of its answer."""
-        self._last_id = key = self._last_id + 1
         accepted: asyncio.Future[None] = self.node.loop.create_future()
-        self.pending[key] = Ask(_ACCEPTANCE, None, (), math.inf, math.inf, accepted)
-        return key, accepted
+        return self.expect(Ask(_ACCEPTANCE, None, (), math.inf, math.inf, accepted)), accepted
+
+    def expect(self, ask: Ask) -> int:
+        """A number under which the other side shall answer this."""
+        self._last_id = key = self._last_id + 1
+        self.pending[key] = ask
+        return key
 
     def _payload(self, message: Any) -> tuple[frames.Name, Any]:
         """Type name and body; a parcel is passed on as it is."""
@@ -358,7 +363,7 @@ class OutsideHost:
     takes_parcels = True
 
     def __init__(self, peer: Peer) -> None:
-        self._peer = peer
+        self.peer = peer
 
     def start(self, cell: Cell) -> None:
         raise HoldfastError(f"{cell.path} is in another process")
@@ -376,20 +381,31 @@ class OutsideHost:
         return False
 
     def push(self, cell: Cell, item: Item) -> None:
-        send_signal(self._peer, cell.path, item)
+        send_signal(self.peer, cell.path, item)
 
     def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
         if isinstance(item, Envelope):
-            return self._peer.offer(cell.path, item.message, item.sender)
-        return self._peer.offer(cell.path, item, None)
+            return self.peer.offer(cell.path, item.message, item.sender)
+        return self.peer.offer(cell.path, item, None)
+
+    def control(self, cell: Cell, call: Call) -> None:
+        from ..control.calls import send_call
+
+        send_call(self.peer, cell.path, call)
+
+    def is_up(self, cell: Cell) -> bool:
+        return True  # As far as is known on this side.
+
+    def backlog(self, cell: Cell) -> int:
+        return 0
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        connection = self._peer.connection
+        connection = self.peer.connection
         connection.send(frames.Command(connection.name_out(cell.path), verb, data))
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit` of the stand-ins."""
-        self._peer.send_item(cell, cell.path, item, 0)
+        self.peer.send_item(cell, cell.path, item, 0)
 
 
 def send_signal(peer: Peer, path: str, item: Item) -> None:

@@ -25,6 +25,7 @@ from .relay import obey, send_signal, text
 from .workers import Worker, Workers
 
 if TYPE_CHECKING:
+    from ..control.calls import Call
     from ..node import Node
 
 
@@ -328,6 +329,31 @@ class ProcessHost:
 
     def offer(self, cell: Cell, item: Any) -> None:
         cell.admit(cell, item)
+
+    def control(self, cell: Cell, call: Call) -> None:
+        from ..control.calls import send_call
+
+        worker = self._workers.of(cell)
+        if worker is not None:
+            send_call(worker, cell.path, call)
+        else:
+            cell.extra().calls.append(call)  # Sent behind the next launch.
+
+    def is_up(self, cell: Cell) -> bool:
+        outlet: Outlet | None = cell.extra().outlet
+        return outlet is not None and outlet.worker is not None
+
+    def backlog(self, cell: Cell) -> int:
+        queued = sum(map(mailbox.counts, cell.queue or ()))
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None:
+            return queued
+        begun = max(outlet.worker.page[0], outlet.worker.page[1])
+        return queued + sum(number > begun for number, _ in outlet.flight)
+
+    def worker_of(self, cell: Cell) -> Worker | None:
+        """The actor's process, if it has one now."""
+        return self._workers.of(cell)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self._workers.of(cell)

@@ -14,7 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from ..cell import Cell
 from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed
-from ..events import LogLine, ProcessDied, ProcessStarted
+from ..control.calls import order, send_call
+from ..control.orders import Watch
+from ..events import TRACED, LogLine, ProcessDied, ProcessStarted
 from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpack_exit
 from ..mail import Ask
 from . import frames
@@ -31,6 +33,8 @@ if TYPE_CHECKING:
 
 REAPED_WITHIN = 2.0
 """Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
+ORDER_TIMEOUT = 60.0
+"""Seconds until it does not matter any more whether a new process counts for whoever wanted to know."""
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # as in malloc.h
 
 
@@ -106,10 +110,24 @@ class Worker(Peer):
         bindings = {port: target.path for port, target in cell.extra().bindings.items()}
         options = dict(options, limits=_limit_options(limits), bindings=bindings)
         connection.send(frames.Launch(key, connection.name_out(cell.path), cell.life, recipe, options), cell.path)
+        self._order_again(cell)
         try:
             await up
         finally:
             self._launches.pop(key, None)
+
+    def _order_again(self, cell: Cell) -> None:
+        """What was ordered while there was no process, and what counts and traces the actor over its lives."""
+        more = cell.extra()
+        calls, more.calls = more.calls, []
+        for call in calls:
+            if not call.ask.is_done:
+                send_call(self, cell.path, call)
+        if more.tap is not None and more.tap.is_on:
+            more.tap.attach()
+            wanted = more.tap.wanted
+            seen = order(cell, Watch(wanted["counting"], wanted["tracing"]), ORDER_TIMEOUT)
+            seen.add_done_callback(_seen)
 
     def kill(self, why: ExitReason) -> None:
         """SIGKILL, by pidfd; its end is then called `why`."""
@@ -254,6 +272,12 @@ class Worker(Peer):
 
 def _no_records(frame: frames.Record) -> None:
     """Nobody recovers the actor of this process."""
+
+
+def _seen(done: asyncio.Future[Any]) -> None:
+    """Nobody waits for it: asyncio need not complain of its failure."""
+    if not done.cancelled():
+        done.exception()
 
 
 def _limit_options(limits: Limits | None) -> dict[str, Any]:
@@ -407,7 +431,11 @@ class Workers:
         from ..events import event_from
 
         event = event_from(frame.kind, frame.data)
-        if event is not None and self.node.watched:
+        if isinstance(event, TRACED):
+            cell = self.node.find(event.address)
+            if cell is not None and cell.more is not None and cell.more.tap is not None:
+                cell.more.tap.hub.emit(event)
+        elif event is not None and self.node.watched:
             self.node.emit(event)
 
     def processes(self) -> dict[str, int]:

@@ -1,0 +1,289 @@
+"""What can be ordered of a live actor, each order as plain data, so that it can cross a process border.
+
+An order is carried out where the actor lives, between two of its turns.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+from .. import mailbox
+from ..actor import Actor, Start
+from ..errors import ControlFailed, NotSuspended, SpecError, error_text, type_name
+from ..message import message_name
+from ..process.recipe import pack_recipe, unpack_recipe
+from ..values import UnsavableValue
+from .state import change_state, state_to_show
+from .tap import Statistics, tap_of
+
+if TYPE_CHECKING:
+    from ..cell import Cell
+
+Change = Callable[[Any], Any]
+"""Takes a state and returns the one that shall be in its place."""
+Migrate = Callable[[Any, type[Actor]], Any]
+"""Takes a state and the class it is of, and returns it as the new class wants it."""
+
+
+class Order:
+    """Base of all orders."""
+
+    verb: ClassVar[str]
+
+    def run(self, cell: Cell, actor: Actor) -> Any:
+        """Carry it out; raises ControlFailed."""
+        raise NotImplementedError
+
+    def pack(self, where: str) -> dict[str, Any]:
+        """The order's fields for another process. Raises SpecError if they cannot be sent."""
+        return {}
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> Order:
+        """The order again."""
+        return cls()
+
+
+class Suspend(Order):
+    """Handle no message until Resume; twice is once."""
+
+    verb = "suspend"
+
+    def run(self, cell: Cell, actor: Actor) -> None:
+        more = cell.extra()
+        if not more.suspended:
+            more.suspended = True
+            mailbox.hold(cell)
+
+
+class Resume(Order):
+    """Handle messages again, in the order in which they came."""
+
+    verb = "resume"
+
+    def run(self, cell: Cell, actor: Actor) -> None:
+        more = cell.extra()
+        if more.suspended:
+            more.suspended = False
+            mailbox.release(cell)
+
+
+class GetState(Order):
+    """A copy of the state."""
+
+    verb = "get_state"
+
+    def run(self, cell: Cell, actor: Actor) -> Any:
+        return state_to_show(actor)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ReplaceState(Order):
+    """Put what `change` makes of the state in its place; returns the new one."""
+
+    verb: ClassVar[str] = "replace_state"
+    change: Change
+
+    def run(self, cell: Cell, actor: Actor) -> Any:
+        change_state(actor, self.change)
+        return state_to_show(actor)
+
+    def pack(self, where: str) -> dict[str, Any]:
+        return {"change": pack_function(self.change, where, self.verb)}
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> ReplaceState:
+        return cls(unpack_function(data["change"]))
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ReplaceCode(Order):
+    """Go on as another class, with the state that `migrate` makes of the present one."""
+
+    verb: ClassVar[str] = "replace_code"
+    start: Start[Any]
+    migrate: Migrate | None
+
+    def run(self, cell: Cell, actor: Actor) -> None:
+        more = cell.extra()
+        if not more.suspended:
+            raise NotSuspended(cell.path, self.verb)
+        old, new = type(actor), self.start.kind
+        migrate = self.migrate or getattr(new, "migrate", None)
+        change: Change = (lambda state: state) if migrate is None else (lambda state: migrate(state, old))
+
+        def become(state: Any) -> Any:
+            state = change(state)
+            cast("Any", actor).__class__ = new
+            return state
+
+        try:
+            change_state(actor, become)
+        except ControlFailed as error:
+            raise ControlFailed(cell.path, self.verb, error.problem) from error
+        cell.table = new._table
+        if more.tap is not None:
+            more.tap.attach()
+        for topic in set(old._topics) - set(new._topics):
+            cell.node.topics.unsubscribe(topic, cell)
+        for topic in new._topics:
+            cell.node.topics.subscribe(topic, cell)
+        cell.node.respec(cell, self.start)
+
+    def pack(self, where: str) -> dict[str, Any]:
+        try:
+            start = pack_recipe(self.start, where)
+        except UnsavableValue as error:
+            raise SpecError(where, f"{self.verb}: {error}") from error
+        return {
+            "start": start,
+            "migrate": None if self.migrate is None else pack_function(self.migrate, where, self.verb),
+        }
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> ReplaceCode:
+        migrate = data["migrate"]
+        return cls(unpack_recipe(data["start"]), None if migrate is None else unpack_function(migrate))
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Watch(Order):
+    """Count (`statistics`) and follow (`trace`) what the actor does, or do not any more; returns the counts."""
+
+    verb: ClassVar[str] = "watch"
+    counting: bool | None  # None: as it is
+    tracing: bool | None
+
+    def run(self, cell: Cell, actor: Actor) -> Statistics | None:
+        return tap_of(cell).switch(self.counting, self.tracing)
+
+    def pack(self, where: str) -> dict[str, Any]:
+        return {"counting": self.counting, "tracing": self.tracing}
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> Watch:
+        return cls(data["counting"], data["tracing"])
+
+
+class Mark(Order):
+    """Do nothing: its turn says that everything before it has been handled."""
+
+    verb = "mark"
+
+    def run(self, cell: Cell, actor: Actor) -> None:
+        return None
+
+
+ORDERS: dict[str, type[Order]] = {
+    kind.verb: kind for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Watch, Mark)
+}
+
+
+# -- the status is no order: it is asked for while a turn runs --------------------------------------------------------
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Status:
+    """One actor, as `get_status` tells it."""
+
+    address: str
+    kind: str
+    """The class, `module.Class`."""
+    state: str
+    """"running", "suspended", "restarting" (no life now, or being recovered) or "ending"."""
+    parent: str | None
+    life: int
+    """The number of this life at the address, from 1."""
+    queued: int
+    """Messages that wait."""
+    turn: str | None
+    """The message whose turn is not over, by type; seen only if the turn waits for something."""
+    turn_seconds: float
+    """How long that turn has taken so far."""
+    links: int
+    monitors: int
+    """Who watches this actor."""
+    pid: int
+    """The OS process; 0 if there is none now."""
+
+
+def status_of(cell: Cell) -> Status:
+    """The status of an actor in this process."""
+    more, parent = cell.more, cell.parent
+    turn = more.turn if more is not None else None
+    item = cell.ctx.item if turn is not None and cell.ctx is not None else None
+    start = more.start if more is not None else None
+    kind = type(cell.actor) if cell.actor is not None else start.kind if start is not None else None
+    return Status(
+        cell.path,
+        "" if kind is None else type_name(kind),
+        _state(cell),
+        None if parent is None else parent.path,
+        cell.life,
+        cell.host.backlog(cell),
+        None if turn is None else type_name(type(getattr(item, "message", None) or item)),
+        0.0 if turn is None else cell.node.loop.time() - turn.since,
+        0 if more is None else len(more.links),
+        0 if more is None else len(more.monitors),
+        os.getpid(),
+    )
+
+
+def _state(cell: Cell) -> str:
+    if cell.state == "ending":
+        return "ending"
+    if not cell.host.is_up(cell):
+        return "restarting"
+    return "suspended" if cell.more is not None and cell.more.suspended else "running"
+
+
+# -- functions by name ------------------------------------------------------------------------------------------------
+
+
+def pack_function(function: Callable[..., Any], where: str, order: str) -> list[Any]:
+    """A function that can be imported by name, or a `functools.partial` of one, as plain data.
+
+    Raises:
+        SpecError: another process could not import it.
+    """
+    if isinstance(function, functools.partial):
+        name, args, kwargs = pack_function(function.func, where, order)
+        return [name, [*args, *function.args], {**kwargs, **function.keywords}]
+    path = getattr(function, "__qualname__", "")
+    name = f"{getattr(function, '__module__', '')}:{path}"
+    if "<" not in path:
+        name = message_name(cast("Any", function))
+        try:
+            if _found(name) == function:
+                return [name, [], {}]
+        except (ImportError, AttributeError):
+            pass
+    raise SpecError(
+        where,
+        f"{order} needs a function of a module, because the actor lives in another process, which has to import it; "
+        f"{path or function!r} cannot be imported",
+    )
+
+
+def unpack_function(packed: Any) -> Callable[..., Any]:
+    """The function again. Imports its module."""
+    name, args, kwargs = packed
+    try:
+        function = _found(name)
+    except Exception as error:  # Importing a module runs it: it may raise anything.
+        raise SpecError("control", f"{name} cannot be imported: {error_text(error)}") from error
+    return functools.partial(function, *args, **kwargs) if args or kwargs else function
+
+
+def _found(name: str) -> Callable[..., Any]:
+    module, _, path = name.partition(":")
+    found: Any = sys.modules.get(module) or importlib.import_module(module)
+    for part in path.split("."):
+        found = getattr(found, part)
+    return cast("Callable[..., Any]", found)

@@ -1,0 +1,231 @@
+"""What a system lets its user do to live actors; all of it is asked for ahead of messages, and ends in time."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from typing import TYPE_CHECKING, Any, TypeVar, cast
+
+from ..actors.actor import Actor, Start
+from ..actors.cell import GONE, Cell
+from ..actors.control.calls import ask_status, order
+from ..actors.control.orders import (
+    Change,
+    GetState,
+    Migrate,
+    Order,
+    ReplaceCode,
+    ReplaceState,
+    Resume,
+    Status,
+    Suspend,
+    Watch,
+    status_of,
+)
+from ..actors.control.tap import Statistics, tap_of
+from ..actors.errors import ActorStopped, AskTimeout, SpecError, type_name
+from ..actors.events import EventStream
+from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.process.relay import OutsideHost
+from ..actors.process.remote import ProcessHost
+from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
+from ..supervision.respec import respec
+
+if TYPE_CHECKING:
+    from ..actors.node import Node
+
+A = TypeVar("A", bound=Actor)
+
+
+class Controls:
+    """Control of live actors: tasks, processes, actors of a subtree in a process, recorded or not.
+
+    Each call raises ActorStopped if nobody lives there, and AskTimeout if the actor does not come to it within
+    `timeout` seconds: it is carried out between two turns. While an actor is restarted, its next life is waited for.
+    """
+
+    @property
+    def node(self) -> Node:
+        """The node that hosts this process's actors."""
+        raise NotImplementedError
+
+    async def suspend(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:
+        """Have an actor handle no message until `resume`; they wait in order. Twice is once.
+
+        It still obeys its supervisor and all control. A suspension ends with the life.
+        """
+        await self._order(ref, Suspend(), timeout)
+
+    async def resume(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:
+        """Have it handle messages again. Twice is once."""
+        await self._order(ref, Resume(), timeout)
+
+    async def get_state(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Any:
+        """A copy of an actor's state: what its `get_state()` gives, else a dict of its key variables.
+
+        What cannot be copied (a ref, a socket) stands in it as `Opaque`.
+        """
+        return await self._order(ref, GetState(), timeout)
+
+    async def replace_state(self, ref: ActorRef[Any], change: Change, *, timeout: float = DEFAULT_TIMEOUT) -> Any:
+        """Put `change(state)` in the place of an actor's state; returns the new one.
+
+        `change` gets a copy and runs where the actor lives; for another process it must be a function of a module, or
+        a `functools.partial` of one. A recorded actor saves the new state before it handles anything else.
+
+        Raises:
+            ControlFailed: `change` raised, or the state does not fit; the old one stays.
+            SpecError: another process cannot import `change`.
+        """
+        return await self._order(ref, ReplaceState(change), timeout)
+
+    async def replace_code(
+        self,
+        ref: ActorRef[Any],
+        new: type[Actor] | Start[Any],
+        migrate: Migrate | None = None,
+        *,
+        timeout: float = DEFAULT_TIMEOUT,
+    ) -> None:
+        """Have a suspended actor go on as another class, now and after restarts.
+
+        Args:
+            ref: the actor.
+            new: the class, or `start(Class, ...)` if its arguments are to change too.
+            migrate: `migrate(state, old_class)` gives the state as the new class wants it; left out, the new class's
+                own classmethod `migrate` is called if it has one.
+            timeout: seconds.
+
+        Raises:
+            NotSuspended: suspend it first. ControlFailed: the migration raised; the old class stays.
+            SpecError: the class does not take the arguments, or cannot be imported by the actor's process.
+        """
+        cell = self._living(ref)
+        start = _recipe(cell, new)
+        if cell.spec is not None:
+            dataclasses.replace(cell.spec, start=start)  # What the spec does not allow is refused before anything.
+        await self._order(ref, ReplaceCode(start, migrate), timeout)
+        if isinstance(cell.host, (ProcessHost, OutsideHost)):
+            cell.table = start.kind._table
+            if cell.more is not None and cell.more.tap is not None:
+                cell.more.tap.attach()
+            respec(cell, start)
+
+    async def get_status(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> Status:
+        """How an actor is, also while a turn of it waits for something."""
+        cell = self._living(ref)
+        host = cell.host
+        if isinstance(host, OutsideHost):
+            return cast("Status", await ask_status(host.peer, cell, timeout))
+        if not isinstance(host, ProcessHost):
+            return status_of(cell)
+        own, worker = status_of(cell), host.worker_of(cell)
+        if worker is None:
+            return dataclasses.replace(own, pid=0)
+        there = cast("Status", await ask_status(worker, cell, timeout))
+        state = there.state if own.state == "running" else own.state
+        return dataclasses.replace(
+            there,
+            state=state,
+            parent=own.parent,
+            queued=own.queued,
+            links=own.links,
+            monitors=own.monitors,
+        )
+
+    async def statistics(
+        self, ref: ActorRef[Any], on: bool | None = None, *, timeout: float = DEFAULT_TIMEOUT
+    ) -> Statistics | None:
+        """What an actor has done since its statistics were switched on; None while they are off.
+
+        Args:
+            ref: the actor.
+            on: True switches them on, False off; left out, they stay as they are.
+            timeout: seconds.
+
+        Of an actor with a process of its own, what was counted before its last restart is lost (but for `restarts`
+        and `messages_in`).
+        """
+        cell = self._living(ref)
+        counts = cast("Statistics | None", await self._order(ref, Watch(on, None), timeout))
+        if not isinstance(cell.host, ProcessHost):
+            return counts
+        own = tap_of(cell).switch(on, None)
+        if own is None or counts is None:
+            return None
+        return dataclasses.replace(own, **_done(counts))
+
+    async def trace(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> EventStream:
+        """Follow an actor: a stream of MessageIn, TurnBegan, TurnEnded and MessageOut. Close it when done.
+
+        It goes on over restarts and ends when the address is given up.
+        """
+        cell = self._living(ref)
+        tap = tap_of(cell)
+        await self._order(ref, Watch(None, True), timeout)
+        stream = tap.listen()
+        if isinstance(cell.host, ProcessHost):
+            tap.attach()
+        if isinstance(cell.host, (ProcessHost, OutsideHost)):
+            tap.forget = lambda: _no_more(cell)
+        return stream
+
+    async def terminate(
+        self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, timeout: float = DEFAULT_TIMEOUT
+    ) -> ExitReason:
+        """Have a life end in good order, for `reason`; its supervisor then does as its spec says.
+
+        Returns:
+            The reason with which it ended.
+        """
+        cell = self._living(ref)
+        gone = cell.ended()
+        cell.request_stop(reason)
+        done, _ = await asyncio.wait((gone,), timeout=timeout)
+        if not done:
+            gone.cancel()
+            raise AskTimeout(cell.path, timeout, None)
+        return gone.result()
+
+    # -- how --------------------------------------------------------------------------------------------------------
+
+    def _living(self, ref: ActorRef[Any]) -> Cell:
+        cell = ref._cell
+        living = cell if cell.state is not GONE else self.node.successor(cell)
+        if living is None or living.is_dead:
+            raise ActorStopped(ref.path, "nobody lives there")
+        return living
+
+    async def _order(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
+        return await order(ref._cell, wanted, timeout)
+
+
+def _recipe(cell: Cell, new: type[Actor] | Start[Any]) -> Start[Any]:
+    """The recipe of the next lives."""
+    if isinstance(new, Start):
+        start = cast("Start[Any]", new)
+    elif isinstance(new, type) and issubclass(new, Actor):
+        old = cell.more.start if cell.more is not None else None
+        start = Start(new) if old is None else Start(new, old.args, old.kwargs)
+    else:
+        raise SpecError(cell.path, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
+    try:
+        start.check()
+    except TypeError as error:
+        if cell.spec is not None:  # Else it is never started again.
+            problem = f"{type_name(start.kind)} does not take the arguments of the old class ({error})"
+            raise SpecError(cell.path, f"{problem}; give start({start.kind.__name__}, ...)") from error
+    return start
+
+
+def _done(counts: Statistics) -> dict[str, Any]:
+    """What only the process itself has counted."""
+    names = ("messages_out", "turns", "turn_seconds", "longest_turn")
+    return {name: getattr(counts, name) for name in names}
+
+
+def _no_more(cell: Cell) -> None:
+    """Nobody follows any more: tell the process."""
+    if not cell.is_dead:
+        done = order(cell, Watch(None, False), DEFAULT_TIMEOUT)
+        done.add_done_callback(lambda future: future.cancelled() or future.exception())
