@@ -165,7 +165,8 @@ class TaskHost(lives.LocalHost):
         return self.switch is not None and self.switch.is_released
 
     def backlog(self, cell: Cell) -> int:
-        return self.switch.backlog() if self.switch is not None else 0
+        feed = self._life.feed if self._life is not None else None
+        return 0 if self.switch is None else self.switch.backlog(-1 if feed is None else feed.id)
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
@@ -344,7 +345,8 @@ class RecordedProcessHost(ProcessHost):
         return self.switch is not None and self.switch.is_released
 
     def backlog(self, cell: Cell) -> int:
-        return self.switch.backlog() if self.switch is not None else 0
+        worker = self._workers.of(cell)
+        return 0 if self.switch is None else self.switch.backlog(-1 if worker is None else int(worker.page[0]) - 1)
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""

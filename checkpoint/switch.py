@@ -172,9 +172,9 @@ class Switch:
         self._waiters.append(future)
         return future
 
-    def backlog(self) -> int:
-        """Messages and ticks that have no end yet."""
-        return sum(source.kind in (MESSAGE, TICK) for source in self.open.values())
+    def backlog(self, running: int) -> int:
+        """Messages and ticks that wait; `running` is the input in hand, -1 if none."""
+        return sum(source.kind in (MESSAGE, TICK) and source.id != running for source in self.open.values())
 
     def record(
         self, kind: str, name: str, body: bytes, sender: str | None, batch: Batch | None = None, origin: str = ""

@@ -12,6 +12,7 @@ from ..actors.control.calls import ask_status, order
 from ..actors.control.orders import (
     Change,
     GetState,
+    Look,
     Migrate,
     Order,
     ReplaceCode,
@@ -19,13 +20,14 @@ from ..actors.control.orders import (
     Resume,
     Status,
     Suspend,
-    Watch,
+    next_start,
     status_of,
 )
 from ..actors.control.tap import Statistics, tap_of
-from ..actors.errors import ActorStopped, AskTimeout, SpecError, type_name
+from ..actors.errors import ActorStopped, AskTimeout, SpecError
 from ..actors.events import EventStream
 from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.process.recipe import unpack_recipe
 from ..actors.process.relay import OutsideHost
 from ..actors.process.remote import ProcessHost
 from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
@@ -101,11 +103,15 @@ class Controls:
             SpecError: the class does not take the arguments, or cannot be imported by the actor's process.
         """
         cell = self._living(ref)
-        start = _recipe(cell, new)
-        if cell.spec is not None:
-            dataclasses.replace(cell.spec, start=start)  # What the spec does not allow is refused before anything.
-        await self._order(ref, ReplaceCode(start, migrate), timeout)
-        if isinstance(cell.host, (ProcessHost, OutsideHost)):
+        if not isinstance(new, Start) and not (isinstance(new, type) and issubclass(new, Actor)):
+            raise SpecError(cell.path, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
+        start = new if isinstance(new, Start) else Start(new)
+        keeps = not isinstance(new, Start)
+        if not isinstance(cell.host, OutsideHost):
+            next_start(cell, start, keeps_arguments=keeps)  # What cannot be is refused before anything is done.
+        recipe = await self._order(ref, ReplaceCode(start, keeps, migrate), timeout)
+        if recipe is not None:
+            start = unpack_recipe(recipe)
             cell.table = start.kind._table
             if cell.more is not None and cell.more.tap is not None:
                 cell.more.tap.attach()
@@ -147,7 +153,7 @@ class Controls:
         and `messages_in`).
         """
         cell = self._living(ref)
-        counts = cast("Statistics | None", await self._order(ref, Watch(on, None), timeout))
+        counts = cast("Statistics | None", await self._order(ref, Look(on, None), timeout))
         if not isinstance(cell.host, ProcessHost):
             return counts
         own = tap_of(cell).switch(on, None)
@@ -162,7 +168,7 @@ class Controls:
         """
         cell = self._living(ref)
         tap = tap_of(cell)
-        await self._order(ref, Watch(None, True), timeout)
+        await self._order(ref, Look(None, True), timeout)
         stream = tap.listen()
         if isinstance(cell.host, ProcessHost):
             tap.attach()
@@ -200,24 +206,6 @@ class Controls:
         return await order(ref._cell, wanted, timeout)
 
 
-def _recipe(cell: Cell, new: type[Actor] | Start[Any]) -> Start[Any]:
-    """The recipe of the next lives."""
-    if isinstance(new, Start):
-        start = cast("Start[Any]", new)
-    elif isinstance(new, type) and issubclass(new, Actor):
-        old = cell.more.start if cell.more is not None else None
-        start = Start(new) if old is None else Start(new, old.args, old.kwargs)
-    else:
-        raise SpecError(cell.path, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
-    try:
-        start.check()
-    except TypeError as error:
-        if cell.spec is not None:  # Else it is never started again.
-            problem = f"{type_name(start.kind)} does not take the arguments of the old class ({error})"
-            raise SpecError(cell.path, f"{problem}; give start({start.kind.__name__}, ...)") from error
-    return start
-
-
 def _done(counts: Statistics) -> dict[str, Any]:
     """What only the process itself has counted."""
     names = ("messages_out", "turns", "turn_seconds", "longest_turn")
@@ -227,5 +215,5 @@ def _done(counts: Statistics) -> dict[str, Any]:
 def _no_more(cell: Cell) -> None:
     """Nobody follows any more: tell the process."""
     if not cell.is_dead:
-        done = order(cell, Watch(None, False), DEFAULT_TIMEOUT)
+        done = order(cell, Look(None, False), DEFAULT_TIMEOUT)
         done.add_done_callback(lambda future: future.cancelled() or future.exception())

@@ -104,17 +104,22 @@ class ReplaceState(Order):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ReplaceCode(Order):
-    """Go on as another class, with the state that `migrate` makes of the present one."""
+    """Go on as another class, with the state that `migrate` makes of the present one.
+
+    Returns the recipe of the next lives, packed, if it is carried out in another process than it was given in.
+    """
 
     verb: ClassVar[str] = "replace_code"
     start: Start[Any]
+    keeps_arguments: bool  # those of the old recipe, which only the actor's supervisor knows
     migrate: Migrate | None
 
-    def run(self, cell: Cell, actor: Actor) -> None:
+    def run(self, cell: Cell, actor: Actor) -> bytes | None:
         more = cell.extra()
         if not more.suspended:
             raise NotSuspended(cell.path, self.verb)
-        old, new = type(actor), self.start.kind
+        start = next_start(cell, self.start, keeps_arguments=self.keeps_arguments)
+        old, new = type(actor), start.kind
         migrate = self.migrate or getattr(new, "migrate", None)
         change: Change = (lambda state: state) if migrate is None else (lambda state: migrate(state, old))
 
@@ -134,7 +139,8 @@ class ReplaceCode(Order):
             cell.node.topics.unsubscribe(topic, cell)
         for topic in new._topics:
             cell.node.topics.subscribe(topic, cell)
-        cell.node.respec(cell, self.start)
+        cell.node.respec(cell, start)
+        return None if cell.node.uplink is None else pack_recipe(start, cell.path)
 
     def pack(self, where: str) -> dict[str, Any]:
         try:
@@ -143,20 +149,40 @@ class ReplaceCode(Order):
             raise SpecError(where, f"{self.verb}: {error}") from error
         return {
             "start": start,
+            "keeps": self.keeps_arguments,
             "migrate": None if self.migrate is None else pack_function(self.migrate, where, self.verb),
         }
 
     @classmethod
     def unpack(cls, data: dict[str, Any]) -> ReplaceCode:
         migrate = data["migrate"]
-        return cls(unpack_recipe(data["start"]), None if migrate is None else unpack_function(migrate))
+        return cls(unpack_recipe(data["start"]), data["keeps"], None if migrate is None else unpack_function(migrate))
+
+
+def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[Any]:
+    """The recipe of the next lives.
+
+    Raises:
+        SpecError: the class does not take the arguments.
+    """
+    old = cell.more.start if cell.more is not None else None
+    start = Start(new.kind, old.args, old.kwargs) if keeps_arguments and old is not None else new
+    if cell.spec is None:
+        return start  # It is never started again.
+    try:
+        start.check()
+    except TypeError as error:
+        problem = f"{type_name(start.kind)} does not take the arguments of the old class ({error})"
+        raise SpecError(cell.path, f"{problem}; give start({start.kind.__name__}, ...)") from error
+    dataclasses.replace(cell.spec, start=start)  # Raises what the spec does not allow.
+    return start
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Watch(Order):
+class Look(Order):
     """Count (`statistics`) and follow (`trace`) what the actor does, or do not any more; returns the counts."""
 
-    verb: ClassVar[str] = "watch"
+    verb: ClassVar[str] = "look"
     counting: bool | None  # None: as it is
     tracing: bool | None
 
@@ -167,7 +193,7 @@ class Watch(Order):
         return {"counting": self.counting, "tracing": self.tracing}
 
     @classmethod
-    def unpack(cls, data: dict[str, Any]) -> Watch:
+    def unpack(cls, data: dict[str, Any]) -> Look:
         return cls(data["counting"], data["tracing"])
 
 
@@ -181,7 +207,7 @@ class Mark(Order):
 
 
 ORDERS: dict[str, type[Order]] = {
-    kind.verb: kind for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Watch, Mark)
+    kind.verb: kind for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Look, Mark)
 }
 
 

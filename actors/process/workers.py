@@ -13,9 +13,9 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..cell import Cell
-from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed
 from ..control.calls import order, send_call
-from ..control.orders import Watch
+from ..control.orders import Look
+from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed
 from ..events import TRACED, LogLine, ProcessDied, ProcessStarted
 from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpack_exit
 from ..mail import Ask
@@ -126,7 +126,7 @@ class Worker(Peer):
         if more.tap is not None and more.tap.is_on:
             more.tap.attach()
             wanted = more.tap.wanted
-            seen = order(cell, Watch(wanted["counting"], wanted["tracing"]), ORDER_TIMEOUT)
+            seen = order(cell, Look(wanted["counting"], wanted["tracing"]), ORDER_TIMEOUT)
             seen.add_done_callback(_seen)
 
     def kill(self, why: ExitReason) -> None:

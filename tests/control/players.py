@@ -1,0 +1,159 @@
+"""Actors that control is tried on, and the functions that change their state in another process."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from pathlib import Path
+from typing import Any
+
+import holdfast as hf
+
+
+class Add(hf.Message[int]):
+    n: int = 1
+
+
+class Total(hf.Message[int]): ...
+
+
+class Crash(hf.Message): ...
+
+
+class No(hf.Refusal):
+    why: str = ""
+
+
+class Refuse(hf.Message): ...
+
+
+class Wait(hf.Message[str]):
+    """Wait until the file is there."""
+
+    path: str
+
+
+class Pass(hf.Message):
+    to: hf.ActorRef[Any]
+    n: int
+
+
+class Account(hf.Actor):
+    """Counts, and notes what it is told on the way."""
+
+    def __init__(self, total: int = 0) -> None:
+        self.total = total
+        self.seen: list[int] = []
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.total += message.n
+        self.seen.append(message.n)
+        return self.total
+
+    @hf.on(Total, readonly=True)
+    def read(self, message: Total) -> int:
+        return self.total
+
+    @hf.on(Crash)
+    def crash(self, message: Crash) -> None:
+        raise ValueError("told to")
+
+    @hf.on(Refuse)
+    def refuse(self, message: Refuse) -> None:
+        raise No("never")
+
+    @hf.on(Pass)
+    def hand_on(self, message: Pass) -> None:
+        message.to.tell(Add(message.n))
+
+    @hf.on(Wait)
+    async def wait(self, message: Wait) -> str:
+        Path(f"{message.path}.begun").touch()
+        while not Path(message.path).exists():
+            await asyncio.sleep(0.005)
+        return "waited"
+
+
+class Stops(Account):
+    """Tells of its end by a file: its process may be gone by then."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__()
+        self._path = path
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        Path(self._path).write_text(f"{reason}")
+
+
+class Euros(hf.Message[int]): ...
+
+
+class Cents(Account):
+    """The next release of `Account`: the total in cents, and one more message."""
+
+    schema_version = 2
+
+    @classmethod
+    def migrate(cls, state: dict[str, Any], old: type[hf.Actor]) -> dict[str, Any]:
+        assert old is Account
+        return {"total": state["total"] * 100, "seen": state["seen"], "release": 2}
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.total += message.n * 100
+        return self.total
+
+    @hf.on(Euros)
+    def euros(self, message: Euros) -> int:
+        return self.total // 100
+
+
+class Whole(hf.Actor):
+    """Its state is one value, through hooks."""
+
+    def __init__(self) -> None:
+        self._values = [1, 2]
+
+    def get_state(self) -> list[int]:
+        return self._values
+
+    def set_state(self, state: list[int]) -> None:
+        self._values = sorted(state)
+
+
+class Holder(Account):
+    """Holds something that cannot leave its process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.file = Path(os.devnull).open()  # noqa: SIM115  # closed with the actor
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        self.file.close()
+
+
+def plus(n: int, state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "total": state["total"] + n}
+
+
+def spoil(state: dict[str, Any]) -> dict[str, Any]:
+    state["total"] = -1
+    state["seen"].append("spoilt")
+    raise KeyError("no such account")
+
+
+def no_state(state: dict[str, Any]) -> list[int]:
+    return [1, 2]
+
+
+def reverse(state: list[int]) -> list[int]:
+    return [*reversed(state), 7]
+
+
+def keep(state: Any, old: type[hf.Actor]) -> Any:
+    return state
+
+
+def cannot(state: Any, old: type[hf.Actor]) -> Any:
+    raise RuntimeError("no way from there")

@@ -1,0 +1,479 @@
+"""Control of a live actor, told again from OTP's sys_SUITE and gen_server_SUITE (otp.md 1.11, 1.12; W8).
+
+Each test runs for a task, a process, an actor of a subtree in a process, and recorded actors of both kinds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.control.conftest import Starter
+from tests.control.players import (
+    Account,
+    Add,
+    Cents,
+    Crash,
+    Euros,
+    Holder,
+    No,
+    Pass,
+    Refuse,
+    Stops,
+    Total,
+    Wait,
+    Whole,
+    cannot,
+    keep,
+    no_state,
+    plus,
+    reverse,
+    spoil,
+)
+
+
+async def until_there(path: Path) -> None:
+    async with asyncio.timeout(8.0):
+        while not path.exists():
+            await asyncio.sleep(0.005)
+
+
+# -- suspend and resume -----------------------------------------------------------------------------------------------
+
+
+async def test_a_suspended_actor_handles_what_came_meanwhile_in_order(
+    system: hf.ActorSystem, start_one: Starter
+) -> None:
+    one = await start_one(hf.start(Account))
+    await system.suspend(one)
+    for n in range(5):
+        one.tell(Add(n))
+    last = one.ask(Add(5))
+    assert (await system.get_state(one)) == {"total": 0, "seen": []}
+    assert not last.done()
+    await system.resume(one)
+    assert await last == 15
+    assert (await system.get_state(one))["seen"] == [0, 1, 2, 3, 4, 5]
+
+
+async def test_messages_that_were_queued_before_the_suspension_wait_too(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    one, gate = await start_one(hf.start(Account)), tmp_path / "gate"
+    waiting = one.ask(Wait(str(gate)))
+    await until_there(tmp_path / "gate.begun")
+    one.tell(Add(1))
+    suspended = asyncio.create_task(system.suspend(one))
+    await asyncio.sleep(0)
+    one.tell(Add(2))
+    gate.touch()
+    assert await waiting == "waited"
+    await suspended
+    assert await system.get_state(one) == {"total": 0, "seen": []}
+    await system.resume(one)
+    assert await one.ask(Add(3)) == 6
+    assert (await system.get_state(one))["seen"] == [1, 2, 3]
+
+
+async def test_a_caller_may_time_out_at_a_suspended_actor(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.suspend(one)
+    with pytest.raises(hf.AskTimeout):
+        await one.ask(Add(1), timeout=0.05)
+    await system.resume(one)
+    assert await one.ask(Total()) == 0  # expired before its turn, so it was not run
+
+
+async def test_suspending_and_resuming_twice_is_no_error(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.resume(one)
+    await system.suspend(one)
+    await system.suspend(one)
+    await system.resume(one)
+    assert await one.ask(Add(1)) == 1
+    await system.resume(one)
+    assert await one.ask(Add(1)) == 2
+
+
+async def test_a_suspended_actor_obeys_its_supervisor(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    told = tmp_path / "told"
+    one = await start_one(hf.start(Stops, str(told)), shutdown=8.0)
+    await system.suspend(one)
+    waiting = one.ask(Add(1))
+    await system.stop(one)
+    assert told.read_text() == "shutdown"
+    with pytest.raises(hf.ActorStopped):
+        await waiting
+
+
+async def test_a_suspension_ends_with_the_life(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.suspend(one)
+    added = one.ask(Add(1), timeout=8.0)
+    one.kill()
+    assert await added == 1
+    assert (await system.get_status(one)).state == "running"
+
+
+# -- the state --------------------------------------------------------------------------------------------------------
+
+
+async def test_the_state_that_is_shown_is_a_copy(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    (await system.get_state(one))["seen"].append(99)
+    assert await system.get_state(one) == {"total": 0, "seen": []}
+
+
+@pytest.mark.parametrize("suspended", [False, True])
+async def test_a_state_is_replaced_where_the_actor_lives(
+    system: hf.ActorSystem, start_one: Starter, suspended: bool
+) -> None:
+    one = await start_one(hf.start(Account))
+    assert await one.ask(Add(1)) == 1
+    if suspended:
+        await system.suspend(one)
+    assert await system.replace_state(one, functools.partial(plus, 10)) == {"total": 11, "seen": [1]}
+    await system.resume(one)
+    assert await one.ask(Add(1)) == 12
+
+
+async def test_a_change_that_raises_leaves_the_state_alone(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    assert await one.ask(Add(1)) == 1
+    with pytest.raises(hf.ControlFailed, match=r"replace_state of .*/one failed: KeyError: 'no such account'"):
+        await system.replace_state(one, spoil)
+    with pytest.raises(hf.ControlFailed, match="the state must be a dict of variables"):
+        await system.replace_state(one, no_state)
+    assert await system.get_state(one) == {"total": 1, "seen": [1]}
+    assert await one.ask(Add(1)) == 2
+
+
+async def test_hooks_give_and_take_the_state_as_one_value(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Whole))
+    assert await system.get_state(one) == [1, 2]
+    assert await system.replace_state(one, reverse) == [1, 2, 7]  # `set_state` has sorted it
+
+
+async def test_another_process_must_be_able_to_import_the_change(
+    system: hf.ActorSystem, start_one: Starter, way: str
+) -> None:
+    one = await start_one(hf.start(Account))
+    if "task" in way:
+        assert (await system.replace_state(one, lambda state: {**state, "total": 5}))["total"] == 5
+        return
+    with pytest.raises(hf.SpecError, match="replace_state needs a function of a module"):
+        await system.replace_state(one, lambda state: state)
+    assert await one.ask(Add(1)) == 1
+
+
+@pytest.mark.parametrize("way", ["recorded task", "recorded process"])
+async def test_a_replaced_state_survives_a_kill_together_with_what_follows(
+    system: hf.ActorSystem, start_one: Starter
+) -> None:
+    one = await start_one(hf.start(Account))
+    assert await one.ask(Add(1)) == 1
+    await system.replace_state(one, functools.partial(plus, 10))
+    assert await one.ask(Add(2)) == 13
+    for _ in range(2):
+        with system.events() as stream:
+            _strike(system, one)
+            await _recovered(stream)
+        assert await system.get_state(one) == {"total": 13, "seen": [1, 2]}
+    await system.replace_state(one, functools.partial(plus, 10))  # with no turn since: the last snapshot is not it
+    await system.replace_state(one, functools.partial(plus, 10))
+    with system.events() as stream:
+        _strike(system, one)
+        await _recovered(stream)
+    assert await one.ask(Total()) == 33
+
+
+def _strike(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    pid = system.pid_of(ref)
+    if pid == os.getpid():
+        ref.kill()
+    else:
+        os.kill(pid, signal.SIGKILL)
+
+
+async def _recovered(stream: hf.EventStream) -> None:
+    async with asyncio.timeout(8.0):
+        async for event in stream:
+            if isinstance(event, hf.Recovered):
+                return
+
+
+# -- the code ---------------------------------------------------------------------------------------------------------
+
+
+async def test_code_is_replaced_for_good(system: hf.ActorSystem, start_one: Starter, way: str) -> None:
+    one = await start_one(hf.start(Account))
+    assert await one.ask(Add(1)) == 1
+    await system.suspend(one)
+    queued = one.ask(Add(2))
+    await system.replace_code(one, Cents)
+    assert (await system.get_status(one)).state == "suspended"
+    await system.resume(one)
+    assert await queued == 300
+    assert await one.ask(Euros()) == 3
+    assert await system.get_state(one) == {"total": 300, "seen": [1], "release": 2}
+    one.kill()
+    assert await one.ask(Euros(), timeout=8.0) == (3 if "recorded" in way else 0)
+    assert (await system.get_status(one)).kind == "tests.control.players.Cents"
+    assert await one.ask(Add(1)) == (400 if "recorded" in way else 100)
+
+
+async def test_code_is_replaced_in_suspended_actors_only(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    with pytest.raises(hf.NotSuspended, match="must be suspended first"):
+        await system.replace_code(one, Cents)
+    assert await one.ask(Add(1)) == 1
+
+
+async def test_a_migration_that_fails_leaves_the_old_class(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.suspend(one)
+    with pytest.raises(hf.ControlFailed, match=r"replace_code of .* failed: RuntimeError: no way from there"):
+        await system.replace_code(one, Cents, cannot)
+    await system.resume(one)
+    assert await one.ask(Add(1)) == 1
+    assert (await system.get_status(one)).kind == "tests.control.players.Account"
+    one.kill()
+    assert await one.ask(Add(1), timeout=8.0) in (1, 2)
+    assert (await system.get_status(one)).kind == "tests.control.players.Account"
+
+
+async def test_a_class_that_does_not_take_the_arguments_is_refused(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account, total=3))
+    await system.suspend(one)
+    with pytest.raises(hf.SpecError, match="Whole does not take the arguments of the old class"):
+        await system.replace_code(one, Whole)
+    await system.replace_code(one, hf.start(Cents, 5), keep)
+    await system.resume(one)
+    assert await one.ask(Total()) == 3
+
+
+@pytest.mark.parametrize("way", ["task", "in a subtree"])
+async def test_replaced_code_outlives_its_supervisor(system: hf.ActorSystem, way: str) -> None:
+    inner = hf.supervisor("inner", children=[hf.child("one", hf.start(Account))], intensity=100)
+    isolation: Any = "process" if way == "in a subtree" else "task"
+    await system.start(hf.supervisor("top", children=[inner], intensity=100, isolation=isolation))
+    one = system.ref("/app/top/inner/one", Account)
+    await system.suspend(one)
+    await system.replace_code(one, Cents, keep)
+    gone = system.ref("/app/top", hf.Supervisor)._cell.ended()
+    with system.events() as stream:
+        system.ref("/app/top", hf.Supervisor).kill()
+        await gone
+        async with asyncio.timeout(8.0):
+            async for event in stream:
+                if isinstance(event, hf.ActorStarted) and event.address == "/app/top":
+                    break
+    assert await system.ref("/app/top/inner/one", Cents).ask(Add(1), timeout=8.0) == 100
+
+
+# -- looking ----------------------------------------------------------------------------------------------------------
+
+
+async def test_a_status_says_what_the_actor_does(system: hf.ActorSystem, start_one: Starter, tmp_path: Path) -> None:
+    one, gate = await start_one(hf.start(Account)), tmp_path / "gate"
+    status = await system.get_status(one)
+    assert (status.address, status.kind, status.state, status.life) == (
+        one.path,
+        "tests.control.players.Account",
+        "running",
+        1,
+    )
+    assert status.parent == one.path.rpartition("/")[0]
+    assert (status.queued, status.turn, status.pid) == (0, None, system.pid_of(one))
+    waiting = one.ask(Wait(str(gate)))
+    await until_there(tmp_path / "gate.begun")
+    one.tell(Add(1))
+    one.tell(Add(1))
+    status = await system.get_status(one)
+    assert status.turn == "tests.control.players.Wait"
+    assert 0 < status.turn_seconds < 8.0
+    assert status.queued == 2
+    gate.touch()
+    await waiting
+
+
+async def test_statistics_count_from_when_they_are_switched_on(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    sink = await system.start(hf.child("sink", hf.start(Account)))
+    assert await one.ask(Add(1)) == 1
+    assert await system.statistics(one) is None
+    await system.statistics(one, True)
+    assert await one.ask(Add(1)) == 2
+    with pytest.raises(No):
+        await one.ask(Refuse())
+    one.tell(Pass(sink, 7))
+    assert await one.ask(Add(1)) == 3
+    counts = await system.statistics(one)
+    assert counts is not None
+    assert (counts.turns, counts.messages_out, counts.restarts) == (4, 1, 0)
+    assert 0 < counts.longest_turn <= counts.turn_seconds < 8.0
+    if "/top/" not in one.path:
+        assert counts.messages_in == 4
+    assert await system.statistics(one, False) is None
+    assert await one.ask(Add(1)) == 4
+    assert await system.statistics(one) is None
+
+
+async def test_statistics_see_restarts(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.statistics(one, True)
+    with pytest.raises(hf.RemoteCrash):
+        await one.ask(Crash())
+    assert await one.ask(Add(1), timeout=8.0) == 1
+    counts = await system.statistics(one)
+    assert counts is not None
+    assert counts.restarts == 1
+
+
+async def test_a_trace_tells_turns_and_messages(system: hf.ActorSystem, start_one: Starter, way: str) -> None:
+    one = await start_one(hf.start(Account))
+    sink = await system.start(hf.child("sink", hf.start(Account)))
+    with await system.trace(one) as stream:
+        one.tell(Pass(sink, 7))
+        with pytest.raises(No):
+            await one.ask(Refuse())
+        told = await _until_ended(stream, 2)
+    kinds = [type(event).__name__ for event in told if not isinstance(event, hf.MessageIn)]
+    assert kinds == ["TurnBegan", "MessageOut", "TurnEnded", "TurnBegan", "TurnEnded"]
+    assert [event.outcome for event in told if isinstance(event, hf.TurnEnded)] == ["done", "refused"]
+    assert [event.to for event in told if isinstance(event, hf.MessageOut)] == ["/app/sink"]
+    assert sum(isinstance(event, hf.MessageIn) for event in told) == 2
+    assert all(event.address == one.path for event in told)
+
+
+async def _until_ended(stream: hf.EventStream, turns: int) -> list[Any]:
+    told: list[Any] = []
+    async with asyncio.timeout(8.0):
+        async for event in stream:
+            told.append(event)
+            turns -= isinstance(event, hf.TurnEnded)
+            if not turns:
+                break
+    return told
+
+
+async def test_a_trace_goes_on_over_a_restart_and_ends_with_the_address(
+    system: hf.ActorSystem, start_one: Starter
+) -> None:
+    one = await start_one(hf.start(Account))
+    with await system.trace(one) as stream:
+        one.tell(Crash())
+        (began,) = [event for event in await _until_ended(stream, 1) if isinstance(event, hf.TurnEnded)]
+        assert began.outcome == "crashed: ValueError"
+        await one.ask(Total(), timeout=8.0)
+        one.tell(Add(1))
+        await _until_ended(stream, 1)
+        await system.stop(one)
+        async with asyncio.timeout(8.0):
+            async for _ in stream:
+                pass
+
+
+async def test_nothing_is_left_in_the_actor_when_nobody_looks_any_more(system: hf.ActorSystem) -> None:
+    one = await system.start(hf.child("one", hf.start(Account)))
+    cell = one._cell
+    assert await one.ask(Add(1)) == 1
+    before = cell.admit, cell.table, type(cell.ctx), set(vars(cell.actor))
+    with await system.trace(one):
+        assert (cell.admit, cell.table, type(cell.ctx)) != before[:3]
+    assert (cell.admit, type(cell.ctx), set(vars(cell.actor))) == (before[0], *before[2:])
+    assert cell.table is before[1]
+
+
+# -- terminate, and who is not there ----------------------------------------------------------------------------------
+
+
+async def test_terminate_ends_a_suspended_actor_with_the_reason(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    told = tmp_path / "told"
+    one = await start_one(hf.start(Stops, str(told)), restart="temporary", shutdown=8.0)
+    await system.suspend(one)
+    reason = hf.Shutdown("by hand")
+    assert await system.terminate(one, reason) == reason
+    assert told.read_text() == str(reason)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda system, ref: system.suspend(ref),
+        lambda system, ref: system.resume(ref),
+        lambda system, ref: system.get_state(ref),
+        lambda system, ref: system.replace_state(ref, reverse),
+        lambda system, ref: system.replace_code(ref, Cents),
+        lambda system, ref: system.get_status(ref),
+        lambda system, ref: system.statistics(ref, True),
+        lambda system, ref: system.trace(ref),
+        lambda system, ref: system.terminate(ref),
+    ],
+)
+async def test_control_of_an_absent_actor_says_so(system: hf.ActorSystem, call: Any) -> None:
+    one = system.spawn(hf.start(Account))
+    await system.stop(one)
+    with pytest.raises(hf.ActorStopped):
+        await call(system, one)
+
+
+async def test_control_never_hangs_on_a_busy_actor(system: hf.ActorSystem, start_one: Starter, tmp_path: Path) -> None:
+    one, gate = await start_one(hf.start(Account)), tmp_path / "gate"
+    waiting = one.ask(Wait(str(gate)))
+    await until_there(tmp_path / "gate.begun")
+    for call in (
+        system.suspend(one, timeout=0.05),
+        system.get_state(one, timeout=0.05),
+        system.statistics(one, timeout=0.05),
+        system.trace(one, timeout=0.05),
+    ):
+        with pytest.raises(hf.AskTimeout):
+            await call
+    gate.touch()
+    assert await waiting == "waited"
+    assert await one.ask(Add(1)) == 1  # what was given up is not carried out: it is not suspended
+
+
+async def test_control_of_an_actor_whose_life_ends_is_told(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    one, gate = await start_one(hf.start(Account), restart="temporary"), tmp_path / "gate"
+    waiting = one.ask(Wait(str(gate)))
+    await until_there(tmp_path / "gate.begun")
+    asked = asyncio.create_task(system.get_state(one, timeout=20.0))
+    await asyncio.sleep(0)
+    one.kill()
+    with pytest.raises((hf.ActorStopped, hf.AskFailed)):
+        await asked
+    with pytest.raises((hf.ActorStopped, hf.AskFailed)):
+        await waiting
+
+
+async def test_control_while_a_process_starts_waits_for_it(system: hf.ActorSystem) -> None:
+    one = await system.start(hf.child("one", hf.start(Account), isolation="process"))
+    gone = one._cell.ended()
+    one.kill()
+    await gone
+    assert await system.get_state(one, timeout=8.0) == {"total": 0, "seen": []}
+
+
+async def test_what_cannot_leave_the_process_is_shown_as_text(system: hf.ActorSystem) -> None:
+    for isolation in ("task", "process"):
+        one = await system.start(hf.child(isolation, hf.start(Holder), isolation=isolation))  # type: ignore[arg-type]
+        shown = (await system.get_state(one))["file"]
+        assert isinstance(shown, hf.Opaque)
+        assert "/dev/null" in shown.text
+        await system.replace_state(one, functools.partial(plus, 4))  # what cannot be copied stays as it is
+        assert await one.ask(Total()) == 4
