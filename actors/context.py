@@ -7,7 +7,7 @@ import random
 import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 from . import links, mailbox
 from .errors import ActorStopped, AskDeadlock, HoldfastError
@@ -37,6 +37,9 @@ class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
     __slots__ = ("_asking", "_random", "_turn", "cell", "closed", "item")
+
+    may_fail_fast: ClassVar[bool] = True
+    """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
-from typing import TYPE_CHECKING, Any, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
 from . import mailbox
+from .errors import ActorRestarting, SpecError
 from .mail import Ask
 from .message import Message
 
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
 A_co = TypeVar("A_co", bound="Actor", covariant=True)
 R = TypeVar("R")
+
+Restarting = Literal["wait", "fail"]
+"""What an ask does at an actor that is between two lives."""
 
 DEFAULT_TIMEOUT = 5.0
 """Seconds an ask waits when nothing else is said."""
@@ -74,12 +78,17 @@ class ActorRef(Generic[A_co]):
         if accepted is not None:
             await accepted
 
-    def ask(self, message: Message[R], timeout: float = DEFAULT_TIMEOUT) -> asyncio.Future[R]:
+    def ask(
+        self, message: Message[R], timeout: float = DEFAULT_TIMEOUT, *, restarting: Restarting = "wait"
+    ) -> asyncio.Future[R]:
         """Send now, and return an awaitable with exactly one outcome.
 
         Args:
             message: what is asked; its class declares the reply's type.
             timeout: seconds until the deadline, > 0; it travels with the message and runs on during recovery.
+            restarting: "fail" sends nothing to an actor that is between two lives, or being recovered: the awaitable
+                raises ActorRestarting. (Of actors in another process than the root an actor process knows too little:
+                it waits. A recorded actor always waits, for its replay to do the same.)
 
         Returns:
             A future of the reply. Cancelling it ends the wait, never the turn.
@@ -90,6 +99,8 @@ class ActorRef(Generic[A_co]):
         """
         cell = self._cell
         sender = current.get(None)
+        if restarting != "wait" and (failed := _restarting(cell, restarting, sender)) is not None:
+            return failed
         if sender is not None:
             return sender.ask(cell, message, timeout)
         if type(message) not in cell.table:
@@ -124,3 +135,14 @@ class ActorRef(Generic[A_co]):
 
     def __hash__(self) -> int:
         return hash(self._cell.path)
+
+
+def _restarting(cell: Cell, restarting: str, sender: ActorContext | None) -> asyncio.Future[Any] | None:
+    """The failed ask to an actor that is not up now; None if the ask is to be made."""
+    if restarting != "fail":
+        raise SpecError("ask", f"restarting must be 'wait' or 'fail', not {restarting!r}")
+    if cell.is_dead or cell.host.is_up(cell) or (sender is not None and not sender.may_fail_fast):
+        return None
+    future: asyncio.Future[Any] = cell.node.loop.create_future()
+    future.set_exception(ActorRestarting(cell.path))
+    return future

@@ -582,6 +582,8 @@ class RecordedContext(ActorContext):
 
     __slots__ = ("_drawn", "recorded")
 
+    may_fail_fast = False
+
     recorded: Life
     _drawn: int  # the turn that `_random` belongs to
 

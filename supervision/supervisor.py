@@ -16,7 +16,7 @@ from ..actors.actor import Actor, Start, on
 from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import HoldfastError, NoSuchActor, SpecError, StartFailed
 from ..actors.events import ChildRestarted, SupervisorGaveUp
-from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.exits import SHUTDOWN, ExitReason, unpack_exit
 from ..actors.mail import Item, ReplyHandle
 from ..actors.message import Message, Refusal
 from ..actors.process.limits import Limits
@@ -62,9 +62,13 @@ class StartChild(Message[Any]):
 
 
 class TerminateChild(Message[None]):
-    """Stop a child by its spec; the spec stays, unless it is temporary."""
+    """Stop a child by its spec; the spec stays, unless it is temporary.
+
+    `reason` is what `pack_exit` gives; None is SHUTDOWN.
+    """
 
     id: str
+    reason: dict[str, Any] | None = None
 
 
 class RestartChild(Message[Any]):
@@ -342,7 +346,7 @@ class Supervisor(Actor):
                 self._try_again(one, reason)  # Of the group, it is the one that does not run.
                 return
 
-    async def _stop(self, one: Child) -> None:
+    async def _stop(self, one: Child, reason: ExitReason = SHUTDOWN) -> None:
         """Stop a child as its spec says; its address and queue stay."""
         cell = one.cell
         one.retry += 1
@@ -352,7 +356,7 @@ class Supervisor(Actor):
             return
         one.ignored_life = cell.life  # Also if it has ended just now: its end is in our queue, and is known here.
         if cell.state is not DOWN:
-            await one.spec.stop(cell)
+            await one.spec.stop(cell, reason)
         elif starting is not None:
             cell.kill()
 
@@ -383,8 +387,9 @@ class Supervisor(Actor):
     async def terminate_child(self, message: TerminateChild) -> None:
         """Stop a child; a pending restart is void."""
         one = self._child(message.id)
-        await self._stop(one)
-        self._give_up_address(one, SHUTDOWN)
+        reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
+        await self._stop(one, reason)
+        self._give_up_address(one, reason)
 
     @on(RestartChild)
     async def restart_child(self, message: RestartChild) -> Any:

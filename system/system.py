@@ -11,16 +11,17 @@ from typing import Any, TypeVar, cast
 from ..actors import lives
 from ..actors.actor import Actor, Start
 from ..actors.cell import Cell, Host
-from ..actors.errors import HoldfastError, NoSuchActor, SpecError, TreeFailed
+from ..actors.control.drain import drain as drain_queue
+from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
 from ..actors.events import EventStream
-from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.exits import SHUTDOWN, ExitReason, pack_exit
 from ..actors.lives import LOCAL
 from ..actors.mailbox import Bounded
 from ..actors.message import Message
 from ..actors.node import Node, cell_kind
 from ..actors.process.remote import ProcessHost, on_frame
 from ..actors.process.workers import Workers
-from ..actors.ref import ActorRef
+from ..actors.ref import ActorRef, current
 from ..actors.topics import NOT_TAKEN
 from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
 from ..checkpoint.stores import open_journal
@@ -84,6 +85,7 @@ class ActorSystem(Controls):
         self._body: asyncio.Task[Any] | None = None
         self._closing: asyncio.Task[None] | None = None
         self._failure: TreeFailed | None = None
+        self._stopping: set[asyncio.Task[None]] = set()
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -193,16 +195,43 @@ class ActorSystem(Controls):
         """
         return cast("ActorRef[A]", self.node.spawn(start, name, mailbox=mailbox).ref)
 
-    async def stop(self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN) -> None:
-        """Stop an actor for good and wait until its hook has run; one that has stopped already is no error."""
-        cell = ref._cell
+    async def stop(
+        self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, drain: bool = False, deadline: float = 5.0
+    ) -> None:
+        """Stop an actor for good; returns when its children have ended, then its hook has run. Twice is no error.
+
+        Args:
+            ref: the actor.
+            reason: what `on_stop` is told.
+            drain: let it handle what is queued first, and refuse what is new (an ask fails with ActorStopped, a tell
+                is a dead letter). What is left at the deadline goes to `on_undelivered`, as without draining.
+            deadline: seconds that draining may take.
+
+        Called by the actor itself, or by one below it, this returns at once: the end comes after the turn.
+        """
+        caller = current.get(None)
+        if caller is None or not is_below(caller.cell, ref._cell):
+            await self._stop(ref._cell, reason, deadline if drain else None)
+            return
+        node = self.node  # In nobody's name: it has to go on when the caller's life is over.
+        task = node.loop.create_task(
+            self._stop(ref._cell, reason, deadline if drain else None),
+            name=f"stop of {ref.path}",
+            context=node.base_context.copy(),
+        )
+        self._stopping.add(task)
+        task.add_done_callback(self._stopping.discard)
+
+    async def _stop(self, cell: Cell, reason: ExitReason, draining: float | None) -> None:
+        if draining is not None and not cell.is_dead:
+            await drain_queue(cell, draining)
         parent = cell.parent
         if parent is not None and is_supervised(cell, parent):
             supervisor = ActorRef[Supervisor](parent)
             try:
-                await supervisor.ask(TerminateChild(cell.name), STOP_TIMEOUT)
+                await supervisor.ask(TerminateChild(cell.name, pack_exit(reason)), STOP_TIMEOUT)
                 await supervisor.ask(DeleteChild(cell.name), ADMIN_TIMEOUT)
-            except NoSuchChild:  # It has stopped already, or was temporary: its spec went with it.
+            except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:
             await lives.stop_in_time(cell, reason)
@@ -291,6 +320,14 @@ class ActorSystem(Controls):
             found.append(cell.path)
             waiting.extend(reversed(list((cell.children or {}).values())))
         return found
+
+
+def is_below(cell: Cell, top: Cell) -> bool:
+    """Whether an actor is another, or below it."""
+    at: Cell | None = cell
+    while at is not None and at is not top:
+        at = at.parent
+    return at is not None
 
 
 def is_supervised(cell: Cell, parent: Cell) -> bool:

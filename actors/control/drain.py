@@ -1,0 +1,43 @@
+"""Letting an actor handle what it has before it is stopped."""
+
+from __future__ import annotations
+
+from .. import mailbox
+from ..cell import GONE, Cell
+from ..errors import ActorStopped, AskFailed, AskTimeout
+from .calls import order
+from .orders import Mark
+
+
+async def drain(cell: Cell, seconds: float) -> bool:
+    """Have what is queued handled, and let nothing new in: asks fail with ActorStopped, tells are dead letters.
+
+    It goes on over restarts. A suspended actor handles nothing, so there only the time passes.
+
+    Returns:
+        Whether all was handled within `seconds`. If so or not: nothing is let in from now on.
+    """
+    cell.extra()
+    clock, before = cell.node.loop.time, cell.admit
+    end = clock() + seconds
+    try:
+        while not cell.is_dead:
+            cell.admit = mailbox.admit_closing  # Each time: a life that begins may have opened it.
+            left = end - clock()
+            if left <= 0:
+                return False
+            try:
+                await order(cell, Mark(), left)
+            except AskFailed:  # Its process has ended: what it had not begun is handled by the next life.
+                continue
+            except AskTimeout:
+                return False
+            if cell.host.backlog(cell) == 0:
+                return True
+    except ActorStopped:
+        pass
+    except BaseException:  # Whoever wanted the stop does not want it any more.
+        if cell.state is not GONE:
+            cell.admit = before
+        raise
+    return True
