@@ -42,6 +42,7 @@ from holdfast.actors.events import (
     Event,
     EventStream,
     LogLine,
+    LoopLagged,
     MessageIn,
     MessageOut,
     MessageQuarantined,
@@ -54,6 +55,7 @@ from holdfast.actors.events import (
     SupervisorGaveUp,
     TurnBegan,
     TurnEnded,
+    TurnSlow,
 )
 from holdfast.actors.exits import (
     KILLED,
@@ -115,6 +117,7 @@ __all__ = [
     "Killed",
     "Limits",
     "LogLine",
+    "LoopLagged",
     "MailboxFull",
     "Message",
     "MessageIn",
@@ -158,6 +161,7 @@ __all__ = [
     "TreeFailed",
     "TurnBegan",
     "TurnEnded",
+    "TurnSlow",
     "Unbound",
     "UnknownMessage",
     "WrongActor",

@@ -13,6 +13,7 @@ from .bindings import Binding
 from .errors import type_name
 from .mail import Table
 from .message import Message
+from .threads import in_thread
 
 if TYPE_CHECKING:
     from .context import ActorContext
@@ -42,20 +43,23 @@ class Handles(typing.NamedTuple):
 
     kind: type[Message[Any]]
     readonly: bool
+    to_thread: bool
 
 
-def on(kind: type[Message[R]], *, readonly: bool = False) -> _On[R]:
+def on(kind: type[Message[R]], *, readonly: bool = False, to_thread: bool = False) -> _On[R]:
     """Make a method the handler of one message type (and of types derived from it that have none of their own).
 
     Args:
         kind: the message class; the method's return type must be the reply it declares.
         readonly: the handler changes no state, so a replay may leave it out.
+        to_thread: the handler, a plain `def`, blocks: it is run in a worker thread. The actor handles nothing else
+            meanwhile. In it, `self.ctx` and refs' `tell` work, and what has to be awaited does not.
     """
     if not (isinstance(kind, type) and issubclass(kind, Message)):
         raise TypeError(f"@on takes a Message class, not {kind!r}")
 
     def mark(handler: Any) -> Any:
-        handler.__handles__ = (*getattr(handler, "__handles__", ()), Handles(kind, readonly))
+        handler.__handles__ = (*getattr(handler, "__handles__", ()), Handles(kind, readonly, to_thread))
         return handler
 
     return cast("_On[R]", mark)
@@ -103,7 +107,7 @@ class Actor:
                 _check(cls, name, handler, handles.kind)
                 if handles.kind in table:
                     raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
-                table[handles.kind] = handler
+                table[handles.kind] = in_thread(handler) if handles.to_thread else handler
                 if handles.readonly:
                     readonly.add(handles.kind)
             topics.extend(getattr(handler, "__topics__", ()))
@@ -134,6 +138,8 @@ class Actor:
 
 def _check(cls: type, name: str, handler: Any, kind: type) -> None:
     """Refuse a handler whose message annotation contradicts `@on`, when the class is made."""
+    if any(handles.to_thread for handles in handler.__handles__) and inspect.iscoroutinefunction(handler):
+        raise TypeError(f"{type_name(cls)}.{name} is `async def`: to_thread is for handlers that block")
     parameters = list(inspect.signature(handler).parameters.values())
     if len(parameters) != 2:
         raise TypeError(f"{type_name(cls)}.{name} must take self and the message, nothing else")

@@ -122,6 +122,19 @@ class JournalFull(Event, frozen=True, eq=False):
     size_bytes: int
 
 
+class TurnSlow(Event, frozen=True, eq=False):
+    """A turn occupied the event loop for `seconds`: nothing else ran meanwhile; `message` is its type."""
+
+    message: str
+    seconds: float
+
+
+class LoopLagged(Event, frozen=True, eq=False):
+    """The event loop of a node (`address`) came `seconds` late to what was due."""
+
+    seconds: float
+
+
 class LogLine(Event, frozen=True, eq=False):
     """A line an actor's process wrote to stdout or stderr, or a log record of it."""
 

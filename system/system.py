@@ -23,6 +23,7 @@ from ..actors.process.remote import ProcessHost, on_frame
 from ..actors.process.workers import Workers
 from ..actors.ref import ActorRef, current
 from ..actors.topics import NOT_TAKEN
+from ..actors.watch import LoopWatch, check_limits
 from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
 from ..checkpoint.stores import open_journal
 from ..supervision.respec import respec
@@ -54,6 +55,9 @@ class ActorSystem(Controls):
         preload: modules the fork server imports beforehand, besides those of the actors it starts.
         log: write events to structlog (crashes, restarts, dead letters, output of processes).
         seed: for `ctx.random` of actors without a journal; random if left out.
+        watch_lag: tell (LoopLagged) when this process's event loop comes later than this many seconds.
+        watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
+            For actors in processes see `Limits(hung_after=...)`.
 
     Leaving the context stops all actors, newest first. If the root supervisor gives up, the body is cancelled and
     TreeFailed is raised.
@@ -70,6 +74,8 @@ class ActorSystem(Controls):
         log: bool = True,
         seed: int | None = None,
         takeover: bool = False,
+        watch_lag: float | None = None,
+        watch_turns: float | None = None,
     ) -> None:
         if not name or "/" in name:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
@@ -80,6 +86,7 @@ class ActorSystem(Controls):
         self._preload = tuple(preload)
         self._log = log
         self._seed = seed
+        self._watch_limits = check_limits(watch_lag, watch_turns)
         self._node: Node | None = None
         self._root: Cell | None = None
         self._body: asyncio.Task[Any] | None = None
@@ -97,6 +104,8 @@ class ActorSystem(Controls):
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
         node.respec = respec
+        self._watch = LoopWatch(node, *self._watch_limits)
+        self._watch.open()
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
         self._body = asyncio.current_task()
@@ -140,6 +149,7 @@ class ActorSystem(Controls):
 
     async def _close(self, root: Cell, node: Node) -> None:
         await lives.stop_and_wait(root)
+        self._watch.close()
         await self._workers.close()
         await node.close()
         self._homes.close()

@@ -1,0 +1,234 @@
+"""Blocking handlers run in worker threads, one turn at a time (W11, T33)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.control.conftest import Starter
+from tests.control.players import Account, Add, Total
+
+SEEN: contextvars.ContextVar[str] = contextvars.ContextVar("seen", default="nothing")
+
+
+class Do(hf.Message[Any]):
+    work: Any
+
+
+class Block(hf.Message[int]):
+    """Block the thread until the file is there."""
+
+    path: str
+
+
+class Hand(hf.Message):
+    to: hf.ActorRef[Any]
+    n: int
+
+
+class Now(hf.Message[int]): ...
+
+
+class No(hf.Refusal): ...
+
+
+class Blocks(hf.Actor):
+    def __init__(self) -> None:
+        self.turns = 0
+
+    @hf.on(Do, to_thread=True)
+    def do(self, message: Do) -> Any:
+        return message.work(self)
+
+    @hf.on(Block, to_thread=True)
+    def block(self, message: Block) -> int:
+        Path(f"{message.path}.begun").touch()
+        while not Path(message.path).exists():
+            time.sleep(0.005)
+        self.turns += 1
+        return self.turns
+
+    @hf.on(Hand, to_thread=True)
+    def hand(self, message: Hand) -> None:
+        message.to.tell(Add(message.n))
+        self.ctx.tell_after(0.0, Now())
+        self.turns += 1
+
+    @hf.on(Now)
+    def now(self, message: Now) -> int:
+        return self.turns
+
+
+async def until_there(path: Path) -> None:
+    async with asyncio.timeout(8.0):
+        while not path.exists():
+            await asyncio.sleep(0.005)
+
+
+async def test_a_blocking_handler_blocks_only_its_actor(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    one, gate = await start_one(hf.start(Blocks)), tmp_path / "gate"
+    blocked = one.ask(Block(str(gate)), timeout=8.0)
+    await until_there(tmp_path / "gate.begun")
+    other = await system.start(hf.child("other", hf.start(Account)))
+    assert await other.ask(Add(1)) == 1  # the loop goes on
+    assert (await system.get_status(one)).turn == "tests.control.test_threads.Block"  # that of its process too
+    after = one.ask(Now(), timeout=8.0)
+    done, _ = await asyncio.wait([after], timeout=0.05)
+    assert not done  # one turn at a time
+    gate.touch()
+    assert await blocked == 1
+    assert await after == 1
+
+
+async def test_what_a_thread_does_through_refs_and_ctx_works(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Blocks))
+    sink = await system.start(hf.child("sink", hf.start(Account)))
+    for n in range(3):
+        one.tell(Hand(sink, n))
+    assert await one.ask(Now(), timeout=8.0) == 3
+    async with asyncio.timeout(8.0):
+        while await sink.ask(Total()) != 3:
+            await asyncio.sleep(0.005)
+
+
+@pytest.mark.parametrize("way", ["recorded task", "recorded process"])
+async def test_a_recorded_turn_in_a_thread_comes_back_after_a_kill(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Blocks))
+    sink = await system.start(hf.child("sink", hf.start(Account)))
+    for _ in range(3):
+        one.tell(Hand(sink, 1))
+    assert await one.ask(Now(), timeout=8.0) == 3
+    one.kill()
+    assert await one.ask(Now(), timeout=8.0) == 3
+    async with asyncio.timeout(8.0):
+        while await sink.ask(Total()) != 3:
+            await asyncio.sleep(0.005)
+    assert await sink.ask(Total()) == 3  # nothing was sent twice
+
+
+@pytest.fixture
+def one(system: hf.ActorSystem) -> hf.ActorRef[Blocks]:
+    return system.spawn(hf.start(Blocks), "one")
+
+
+def refuse(actor: Blocks) -> None:
+    raise No
+
+
+def crash(actor: Blocks) -> None:
+    raise ValueError("told to")
+
+
+async def test_refusals_and_crashes_are_as_in_any_turn(system: hf.ActorSystem, one: hf.ActorRef[Blocks]) -> None:
+    with pytest.raises(No):
+        await one.ask(Do(refuse))
+    assert await one.ask(Do(lambda actor: threading.get_ident())) != threading.get_ident()
+    gone = one._cell.ended()
+    with pytest.raises(hf.RemoteCrash, match="ValueError: told to"):
+        await one.ask(Do(crash))
+    assert isinstance(await gone, hf.Crash)
+
+
+async def test_the_context_goes_along(system: hf.ActorSystem, one: hf.ActorRef[Blocks]) -> None:
+    token = SEEN.set("outside")
+    try:
+        async with hf.ActorSystem("inner", log=False) as inner:
+            ref = inner.spawn(hf.start(Blocks))
+            assert await ref.ask(Do(lambda actor: SEEN.get())) == "outside"
+    finally:
+        SEEN.reset(token)
+
+
+async def test_a_handle_from_a_thread_answers_later(system: hf.ActorSystem, one: hf.ActorRef[Blocks]) -> None:
+    handles: list[Any] = []
+
+    def later(actor: Blocks) -> Any:
+        handles.append(actor.ctx.reply_handle())
+        return handles[0]
+
+    asked = one.ask(Do(later))
+    assert await one.ask(Now()) == 0
+    handles[0].reply(7)
+    assert await asked == 7
+
+
+async def test_ctx_is_the_actors_own_again_after_the_turn(system: hf.ActorSystem, one: hf.ActorRef[Blocks]) -> None:
+    cell = one._cell
+    assert await one.ask(Do(lambda actor: actor.ctx.path)) == "/app/one"
+    assert cell.actor is not None
+    assert cell.actor.ctx is cell.ctx
+
+
+@pytest.mark.parametrize(
+    "work",
+    [
+        lambda actor: actor.ctx.ref.ask(Now()),
+        lambda actor: actor.ctx.ref.send(Now()),
+        lambda actor: actor.ctx.publish("/topic", Now()),
+        lambda actor: actor.ctx.create_task(None),
+    ],
+)
+async def test_what_has_to_be_awaited_is_refused_with_the_reason(
+    system: hf.ActorSystem, one: hf.ActorRef[Blocks], work: Callable[[Blocks], Any]
+) -> None:
+    def attempt(actor: Blocks) -> str:
+        try:
+            result = work(actor)
+        except hf.HoldfastError as error:
+            return str(error)
+        if asyncio.iscoroutine(result):  # `send` is a coroutine function: it says no when it is begun
+            try:
+                result.send(None)
+            except hf.HoldfastError as error:
+                return str(error)
+        return "allowed"
+
+    assert "a blocking handler cannot" in await one.ask(Do(attempt))
+
+
+async def test_a_killed_life_does_not_wait_for_its_thread(
+    system: hf.ActorSystem, one: hf.ActorRef[Blocks], tmp_path: Path
+) -> None:
+    gate, result = threading.Event(), []
+    sink = system.spawn(hf.start(Account))
+
+    def stay(actor: Blocks) -> None:
+        (tmp_path / "begun").touch()
+        gate.wait(8.0)
+        try:
+            sink.tell(Add(1))
+        except hf.HoldfastError as error:
+            result.append(type(error))
+
+    asked = one.ask(Do(stay), timeout=8.0)
+    await until_there(tmp_path / "begun")
+    gone = one._cell.ended()
+    one.kill()
+    assert await gone == hf.KILLED
+    with pytest.raises(hf.AskFailed):
+        await asked
+    gate.set()
+    async with asyncio.timeout(8.0):
+        while not result:
+            await asyncio.sleep(0.005)
+    assert result == [hf.ActorStopped]
+    assert await sink.ask(Total()) == 0
+
+
+def test_only_a_plain_def_can_block() -> None:
+    with pytest.raises(TypeError, match="`async def`: to_thread is for handlers that block"):
+
+        class Wrong(hf.Actor):
+            @hf.on(Now, to_thread=True)
+            async def now(self, message: Now) -> int:
+                return 1
