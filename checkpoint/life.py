@@ -324,16 +324,18 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
-        self._send_snapshot(save_state(actor), begin)
+        self._send_snapshot(save_state(actor), begin, is_replaced=True)
+        if self._snapshot_turn != self.turn:  # A home in another process says so later, and ends this life.
+            raise ControlFailed(self.cell.path, "replace_state", "the new state could not be saved")
 
-    def _send_snapshot(self, data: bytes, begin: float) -> None:
+    def _send_snapshot(self, data: bytes, begin: float, *, is_replaced: bool = False) -> None:
         stash = [fed.feed.id for fed in self.stash]
         pause = time.perf_counter() - begin
         parts = pieces(data)
-        for index, part in enumerate(parts, 1):
-            self.port.to_home(Snapshot(self.turn, part, index == len(parts), stash, pause))
-        self._snapshot_turn = self.turn
+        self._snapshot_turn = self.turn  # Before it is sent: a home in this process says at once if it cannot keep it.
         self._snapshot_wanted = False
+        for index, part in enumerate(parts, 1):
+            self.port.to_home(Snapshot(self.turn, part, index == len(parts), stash, pause, is_replaced))
 
     def close(self) -> None:
         """The life is over."""

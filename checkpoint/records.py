@@ -129,13 +129,17 @@ class Live(msgspec.Struct, array_like=True, tag=13):
 
 
 class Snapshot(msgspec.Struct, array_like=True, tag=14):
-    """A piece of the state after `turn`; `is_last` completes it."""
+    """A piece of the state after `turn`; `is_last` completes it.
+
+    `is_replaced`: it was put in place from outside, so no replay leads to it.
+    """
 
     turn: int
     data: bytes
     is_last: bool
     stash: list[int]
     pause: float
+    is_replaced: bool = False
 
 
 class PipeDone(msgspec.Struct, array_like=True, tag=15):

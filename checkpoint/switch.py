@@ -106,6 +106,8 @@ class Switch:
         self.is_released = False
         self.replayed = 0
         self.diverged: ReplayDiverged | None = None
+        self.is_void = False  # a state that was put in place from outside could not be kept: this life does not count
+        self.unsaved: list[str] = []  # why, for each of those
         self._next_id = 0
         self._bytes = 0
         self._waiters: list[asyncio.Future[None]] = []
@@ -229,6 +231,7 @@ class Switch:
         self.is_released = False
         self.replayed = 0
         self.diverged = None
+        self.is_void = False
         self._incoming.clear()  # The last life may have died in the middle of a snapshot.
         for key, timer in self.timers.items():
             if timer.handle is None:  # It was stopped together with its actor.
@@ -357,7 +360,7 @@ class Switch:
 
     def from_life(self, record: ToHome) -> None:
         """Take what the life says, in order."""
-        if self.diverged is not None:
+        if self.diverged is not None or self.is_void:
             return  # What it became is not what it was: above all, its snapshots must not be kept.
         try:
             match record:
@@ -695,6 +698,9 @@ class Switch:
             self.node.emit(SnapshotFailed(self.path, str(error)))
             if self.port is not None:
                 self.port.to_life(SnapshotNow(at_once=False))
+            if record.is_replaced and self.cell is not None:
+                self.is_void, self.unsaved = True, [*self.unsaved, str(error)]
+                self.cell.kill()
             return
         self._dropped.clear()
         self.state, self.state_turn, self.stash = state, record.turn, record.stash

@@ -24,13 +24,14 @@ from ..actors.control.orders import (
     status_of,
 )
 from ..actors.control.tap import Statistics, tap_of
-from ..actors.errors import ActorStopped, AskTimeout, SpecError
+from ..actors.errors import ActorStopped, AskTimeout, ControlFailed, HoldfastError, SpecError
 from ..actors.events import EventStream
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.process.recipe import unpack_recipe
 from ..actors.process.relay import OutsideHost
 from ..actors.process.remote import ProcessHost
 from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
+from ..checkpoint.switch import Switch, switch_of
 from ..supervision.respec import respec
 
 if TYPE_CHECKING:
@@ -79,7 +80,7 @@ class Controls:
             ControlFailed: `change` raised, or the state does not fit; the old one stays.
             SpecError: another process cannot import `change`.
         """
-        return await self._order(ref, ReplaceState(change), timeout)
+        return await self._replace(ref, ReplaceState(change), timeout)
 
     async def replace_code(
         self,
@@ -109,7 +110,7 @@ class Controls:
         keeps = not isinstance(new, Start)
         if not isinstance(cell.host, OutsideHost):
             next_start(cell, start, keeps_arguments=keeps)  # What cannot be is refused before anything is done.
-        recipe = await self._order(ref, ReplaceCode(start, keeps, migrate), timeout)
+        recipe = await self._replace(ref, ReplaceCode(start, keeps, migrate), timeout)
         if recipe is not None:
             start = unpack_recipe(recipe)
             cell.table = start.kind._table
@@ -202,8 +203,26 @@ class Controls:
             raise ActorStopped(ref.path, "nobody lives there")
         return living
 
+    async def _replace(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
+        """Carry out an order that gives a recorded actor another state; raises ControlFailed if that is not kept."""
+        switch = switch_of(ref._cell)
+        before = 0 if switch is None else len(switch.unsaved)
+        try:
+            result = await self._order(ref, wanted, timeout)
+        except HoldfastError:
+            _check_saved(switch, before, ref.path, wanted.verb)
+            raise
+        _check_saved(switch, before, ref.path, wanted.verb)
+        return result
+
     async def _order(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
         return await order(ref._cell, wanted, timeout)
+
+
+def _check_saved(switch: Switch | None, before: int, path: str, verb: str) -> None:
+    """Raises ControlFailed if the home could not keep a new state: that life ends, and the old state comes back."""
+    if switch is not None and len(switch.unsaved) > before:
+        raise ControlFailed(path, verb, f"the new state could not be saved ({switch.unsaved[-1]})")
 
 
 def _done(counts: Statistics) -> dict[str, Any]:

@@ -143,6 +143,10 @@ def spoil(state: dict[str, Any]) -> dict[str, Any]:
     raise KeyError("no such account")
 
 
+def large(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "total": 1000, "blob": b"x" * 3_000_000}
+
+
 def no_state(state: dict[str, Any]) -> list[int]:
     return [1, 2]
 

@@ -32,6 +32,7 @@ from tests.control.players import (
     Whole,
     cannot,
     keep,
+    large,
     no_state,
     plus,
     reverse,
@@ -194,6 +195,21 @@ async def test_a_replaced_state_survives_a_kill_together_with_what_follows(
         _strike(system, one)
         await _recovered(stream)
     assert await one.ask(Total()) == 33
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_replaced_state_that_cannot_be_saved_is_undone(tmp_path: Path, isolation: Any) -> None:
+    async with hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}") as system:
+        recipe = hf.start(Account)
+        one = await system.start(hf.child("one", recipe, isolation=isolation, recovery=hf.hybrid(interval=3600.0)))
+        assert await one.ask(Add(1)) == 1
+        (folder,) = [path for path in tmp_path.iterdir() if path.is_dir()]
+        folder.rmdir()  # large states are files in there
+        with pytest.raises(hf.ControlFailed, match="the new state could not be saved"):
+            await system.replace_state(one, large)
+        folder.mkdir()
+        assert await one.ask(Add(1), timeout=8.0) == 2
+        assert await system.get_state(one) == {"total": 2, "seen": [1, 1]}
 
 
 def _strike(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
