@@ -133,6 +133,52 @@ class Holder(Account):
         self.file.close()
 
 
+class Strict(Account):
+    """Refuses a state that is not good."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.level = 1
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name == "level" and value == 0:
+            raise ValueError("in debt")
+        super().__setattr__(name, value)
+
+
+class StrictWhole(Whole):
+    def set_state(self, state: list[int]) -> None:
+        self._values.clear()
+        if len(state) > 2:
+            raise ValueError("too many")
+        self._values.extend(state)
+
+
+class Stasher(hf.Actor):
+    """Stashes what is added until it is told to add."""
+
+    def __init__(self) -> None:
+        self.seen: list[int] = []
+        self._met: list[int] = []
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        if not self._met:
+            self._met.append(message.n)
+            self.ctx.stash()
+        else:
+            self.seen.append(message.n)
+        return 0
+
+    @hf.on(Total)
+    def total(self, message: Total) -> int:
+        return len(self.seen)
+
+
+def in_debt(state: dict[str, Any]) -> dict[str, Any]:
+    return {"total": 5, "seen": [5], "level": 0}
+
+
 def plus(n: int, state: dict[str, Any]) -> dict[str, Any]:
     return {**state, "total": state["total"] + n}
 

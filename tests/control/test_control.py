@@ -26,11 +26,15 @@ from tests.control.players import (
     No,
     Pass,
     Refuse,
+    Stasher,
     Stops,
+    Strict,
+    StrictWhole,
     Total,
     Wait,
     Whole,
     cannot,
+    in_debt,
     keep,
     large,
     no_state,
@@ -195,6 +199,55 @@ async def test_a_replaced_state_survives_a_kill_together_with_what_follows(
         _strike(system, one)
         await _recovered(stream)
     assert await one.ask(Total()) == 33
+
+
+async def test_a_state_that_the_class_refuses_half_way_is_put_back(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Strict))
+    with pytest.raises(hf.ControlFailed, match="ValueError: in debt"):
+        await system.replace_state(one, in_debt)
+    assert await system.get_state(one) == {"total": 0, "seen": [], "level": 1}
+    hooked = await system.start(hf.child("hooked", hf.start(StrictWhole)))
+    with pytest.raises(hf.ControlFailed, match="ValueError: too many"):
+        await system.replace_state(hooked, reverse)
+    assert await system.get_state(hooked) == [1, 2]
+
+
+@pytest.mark.parametrize("way", ["recorded task", "recorded process"])
+async def test_control_waits_until_an_actor_is_recovered(
+    system: hf.ActorSystem, start_one: Starter, tmp_path: Path
+) -> None:
+    one, gate = await start_one(hf.start(Account)), tmp_path / "gate"
+    gate.touch()
+    assert await one.ask(Add(1)) == 1
+    assert await one.ask(Wait(str(gate))) == "waited"
+    assert await one.ask(Add(2)) == 3
+    gate.unlink()
+    (tmp_path / "gate.begun").unlink()
+    gone = one._cell.ended()
+    one.kill()
+    await gone
+    await until_there(tmp_path / "gate.begun")  # the replay has come as far as that
+    assert (await system.get_status(one)).state == "restarting"
+    replaced = asyncio.create_task(system.replace_state(one, functools.partial(plus, 10), timeout=8.0))
+    done, _ = await asyncio.wait([replaced], timeout=0.1)
+    assert not done
+    gate.touch()
+    assert await replaced == {"total": 13, "seen": [1, 2]}
+    assert await one.ask(Add(1)) == 14
+
+
+async def test_what_a_suspended_actor_unstashes_waits_too(system: hf.ActorSystem) -> None:
+    one = system.spawn(hf.start(Stasher))
+    one.tell(Add(1))
+    await one.ask(Total())
+    await system.suspend(one)
+    cell = one._cell
+    assert cell.ctx is not None
+    cell.ctx.unstash()  # as a background task of the actor may
+    await system.node.settled()
+    assert await system.get_state(one) == {"seen": []}
+    await system.resume(one)
+    assert await one.ask(Total()) == 1
 
 
 @pytest.mark.parametrize("isolation", ["task", "process"])
