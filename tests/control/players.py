@@ -133,6 +133,11 @@ class Holder(Account):
         self.file.close()
 
 
+class Opened(Account):
+    def on_start(self, restored: bool) -> None:
+        self.total = 5
+
+
 class Strict(Account):
     """Refuses a state that is not good."""
 

@@ -24,6 +24,7 @@ from tests.control.players import (
     Euros,
     Holder,
     No,
+    Opened,
     Pass,
     Refuse,
     Stasher,
@@ -127,6 +128,11 @@ async def test_a_suspension_ends_with_the_life(system: hf.ActorSystem, start_one
     one.kill()
     assert await added == 1
     assert (await system.get_status(one)).state == "running"
+
+
+async def test_control_comes_behind_on_start(system: hf.ActorSystem) -> None:
+    one = system.spawn(hf.start(Opened))
+    assert await system.get_state(one) == {"total": 5, "seen": []}
 
 
 # -- the state --------------------------------------------------------------------------------------------------------
