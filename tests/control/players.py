@@ -10,6 +10,13 @@ from typing import Any
 import holdfast as hf
 
 
+async def until_there(path: Path) -> None:
+    """What another process does is seen by the files it makes."""
+    async with asyncio.timeout(8.0):
+        while not path.exists():
+            await asyncio.sleep(0.005)
+
+
 class Add(hf.Message[int]):
     n: int = 1
 

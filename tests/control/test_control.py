@@ -20,13 +20,8 @@ from tests.control.players import (
     Account,
     Add,
     Cents,
-    Crash,
-    Euros,
     Holder,
-    No,
     Opened,
-    Pass,
-    Refuse,
     Stasher,
     Stops,
     Strict,
@@ -34,22 +29,14 @@ from tests.control.players import (
     Total,
     Wait,
     Whole,
-    cannot,
     in_debt,
-    keep,
     large,
     no_state,
     plus,
     reverse,
     spoil,
+    until_there,
 )
-
-
-async def until_there(path: Path) -> None:
-    async with asyncio.timeout(8.0):
-        while not path.exists():
-            await asyncio.sleep(0.005)
-
 
 # -- suspend and resume -----------------------------------------------------------------------------------------------
 
@@ -286,189 +273,6 @@ async def _recovered(stream: hf.EventStream) -> None:
                 return
 
 
-# -- the code ---------------------------------------------------------------------------------------------------------
-
-
-async def test_code_is_replaced_for_good(system: hf.ActorSystem, start_one: Starter, way: str) -> None:
-    one = await start_one(hf.start(Account))
-    assert await one.ask(Add(1)) == 1
-    await system.suspend(one)
-    queued = one.ask(Add(2))
-    await system.replace_code(one, Cents)
-    assert (await system.get_status(one)).state == "suspended"
-    await system.resume(one)
-    assert await queued == 300
-    assert await one.ask(Euros()) == 3
-    assert await system.get_state(one) == {"total": 300, "seen": [1], "release": 2}
-    one.kill()
-    assert await one.ask(Euros(), timeout=8.0) == (3 if "recorded" in way else 0)
-    assert (await system.get_status(one)).kind == "tests.control.players.Cents"
-    assert await one.ask(Add(1)) == (400 if "recorded" in way else 100)
-
-
-async def test_code_is_replaced_in_suspended_actors_only(system: hf.ActorSystem, start_one: Starter) -> None:
-    one = await start_one(hf.start(Account))
-    with pytest.raises(hf.NotSuspended, match="must be suspended first"):
-        await system.replace_code(one, Cents)
-    assert await one.ask(Add(1)) == 1
-
-
-async def test_a_migration_that_fails_leaves_the_old_class(system: hf.ActorSystem, start_one: Starter) -> None:
-    one = await start_one(hf.start(Account))
-    await system.suspend(one)
-    with pytest.raises(hf.ControlFailed, match=r"replace_code of .* failed: RuntimeError: no way from there"):
-        await system.replace_code(one, Cents, cannot)
-    await system.resume(one)
-    assert await one.ask(Add(1)) == 1
-    assert (await system.get_status(one)).kind == "tests.control.players.Account"
-    one.kill()
-    assert await one.ask(Add(1), timeout=8.0) in (1, 2)
-    assert (await system.get_status(one)).kind == "tests.control.players.Account"
-
-
-async def test_a_class_that_does_not_take_the_arguments_is_refused(system: hf.ActorSystem, start_one: Starter) -> None:
-    one = await start_one(hf.start(Account, total=3))
-    await system.suspend(one)
-    with pytest.raises(hf.SpecError, match="Whole does not take the arguments of the old class"):
-        await system.replace_code(one, Whole)
-    await system.replace_code(one, hf.start(Cents, 5), keep)
-    await system.resume(one)
-    assert await one.ask(Total()) == 3
-
-
-@pytest.mark.parametrize("way", ["task", "in a subtree"])
-async def test_replaced_code_outlives_its_supervisor(system: hf.ActorSystem, way: str) -> None:
-    inner = hf.supervisor("inner", children=[hf.child("one", hf.start(Account))], intensity=100)
-    isolation: Any = "process" if way == "in a subtree" else "task"
-    await system.start(hf.supervisor("top", children=[inner], intensity=100, isolation=isolation))
-    one = system.ref("/app/top/inner/one", Account)
-    await system.suspend(one)
-    await system.replace_code(one, Cents, keep)
-    gone = system.ref("/app/top", hf.Supervisor)._cell.ended()
-    with system.events() as stream:
-        system.ref("/app/top", hf.Supervisor).kill()
-        await gone
-        async with asyncio.timeout(8.0):
-            async for event in stream:
-                if isinstance(event, hf.ActorStarted) and event.address == "/app/top":
-                    break
-    assert await system.ref("/app/top/inner/one", Cents).ask(Add(1), timeout=8.0) == 100
-
-
-# -- looking ----------------------------------------------------------------------------------------------------------
-
-
-async def test_a_status_says_what_the_actor_does(system: hf.ActorSystem, start_one: Starter, tmp_path: Path) -> None:
-    one, gate = await start_one(hf.start(Account)), tmp_path / "gate"
-    status = await system.get_status(one)
-    assert (status.address, status.kind, status.state, status.life) == (
-        one.path,
-        "tests.control.players.Account",
-        "running",
-        1,
-    )
-    assert status.parent == one.path.rpartition("/")[0]
-    assert (status.queued, status.turn, status.pid) == (0, None, system.pid_of(one))
-    waiting = one.ask(Wait(str(gate)))
-    await until_there(tmp_path / "gate.begun")
-    one.tell(Add(1))
-    one.tell(Add(1))
-    status = await system.get_status(one)
-    assert status.turn == "tests.control.players.Wait"
-    assert 0 < status.turn_seconds < 8.0
-    assert status.queued == 2
-    gate.touch()
-    await waiting
-
-
-async def test_statistics_count_from_when_they_are_switched_on(system: hf.ActorSystem, start_one: Starter) -> None:
-    one = await start_one(hf.start(Account))
-    sink = await system.start(hf.child("sink", hf.start(Account)))
-    assert await one.ask(Add(1)) == 1
-    assert await system.statistics(one) is None
-    await system.statistics(one, True)
-    assert await one.ask(Add(1)) == 2
-    with pytest.raises(No):
-        await one.ask(Refuse())
-    one.tell(Pass(sink, 7))
-    assert await one.ask(Add(1)) == 3
-    counts = await system.statistics(one)
-    assert counts is not None
-    assert (counts.turns, counts.messages_out, counts.restarts) == (4, 1, 0)
-    assert 0 < counts.longest_turn <= counts.turn_seconds < 8.0
-    if "/top/" not in one.path:
-        assert counts.messages_in == 4
-    assert await system.statistics(one, False) is None
-    assert await one.ask(Add(1)) == 4
-    assert await system.statistics(one) is None
-
-
-async def test_statistics_see_restarts(system: hf.ActorSystem, start_one: Starter) -> None:
-    one = await start_one(hf.start(Account))
-    await system.statistics(one, True)
-    with pytest.raises(hf.RemoteCrash):
-        await one.ask(Crash())
-    assert await one.ask(Add(1), timeout=8.0) == 1
-    counts = await system.statistics(one)
-    assert counts is not None
-    assert counts.restarts == 1
-
-
-async def test_a_trace_tells_turns_and_messages(system: hf.ActorSystem, start_one: Starter, way: str) -> None:
-    one = await start_one(hf.start(Account))
-    sink = await system.start(hf.child("sink", hf.start(Account)))
-    with await system.trace(one) as stream:
-        one.tell(Pass(sink, 7))
-        with pytest.raises(No):
-            await one.ask(Refuse())
-        told = await _until_ended(stream, 2)
-    kinds = [type(event).__name__ for event in told if not isinstance(event, hf.MessageIn)]
-    assert kinds == ["TurnBegan", "MessageOut", "TurnEnded", "TurnBegan", "TurnEnded"]
-    assert [event.outcome for event in told if isinstance(event, hf.TurnEnded)] == ["done", "refused"]
-    assert [event.to for event in told if isinstance(event, hf.MessageOut)] == ["/app/sink"]
-    assert sum(isinstance(event, hf.MessageIn) for event in told) == 2
-    assert all(event.address == one.path for event in told)
-
-
-async def _until_ended(stream: hf.EventStream, turns: int) -> list[Any]:
-    told: list[Any] = []
-    async with asyncio.timeout(8.0):
-        async for event in stream:
-            told.append(event)
-            turns -= isinstance(event, hf.TurnEnded)
-            if not turns:
-                break
-    return told
-
-
-async def test_a_trace_goes_on_over_a_restart_and_ends_with_the_address(
-    system: hf.ActorSystem, start_one: Starter
-) -> None:
-    one = await start_one(hf.start(Account))
-    with await system.trace(one) as stream:
-        one.tell(Crash())
-        (began,) = [event for event in await _until_ended(stream, 1) if isinstance(event, hf.TurnEnded)]
-        assert began.outcome == "crashed: ValueError"
-        await one.ask(Total(), timeout=8.0)
-        one.tell(Add(1))
-        await _until_ended(stream, 1)
-        await system.stop(one)
-        async with asyncio.timeout(8.0):
-            async for _ in stream:
-                pass
-
-
-async def test_nothing_is_left_in_the_actor_when_nobody_looks_any_more(system: hf.ActorSystem) -> None:
-    one = await system.start(hf.child("one", hf.start(Account)))
-    cell = one._cell
-    assert await one.ask(Add(1)) == 1
-    before = cell.admit, cell.table, type(cell.ctx), set(vars(cell.actor))
-    with await system.trace(one):
-        assert (cell.admit, cell.table, type(cell.ctx)) != before[:3]
-    assert (cell.admit, type(cell.ctx), set(vars(cell.actor))) == (before[0], *before[2:])
-    assert cell.table is before[1]
-
-
 # -- terminate, and who is not there ----------------------------------------------------------------------------------
 
 
@@ -546,7 +350,7 @@ async def test_control_while_a_process_starts_waits_for_it(system: hf.ActorSyste
 
 async def test_what_cannot_leave_the_process_is_shown_as_text(system: hf.ActorSystem) -> None:
     for isolation in ("task", "process"):
-        one = await system.start(hf.child(isolation, hf.start(Holder), isolation=isolation))  # type: ignore[arg-type]
+        one = await system.start(hf.child(isolation, hf.start(Holder), isolation=isolation))
         shown = (await system.get_state(one))["file"]
         assert isinstance(shown, hf.Opaque)
         assert "/dev/null" in shown.text

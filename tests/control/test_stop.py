@@ -10,15 +10,9 @@ import pytest
 
 import holdfast as hf
 from tests.control.conftest import Starter
-from tests.control.players import Account, Add, Crash, Stops, Total, Wait
+from tests.control.players import Account, Add, Crash, Stops, Total, Wait, until_there
 
 BY_HAND = hf.Shutdown("by hand")
-
-
-async def until_there(path: Path) -> None:
-    async with asyncio.timeout(8.0):
-        while not path.exists():
-            await asyncio.sleep(0.005)
 
 
 async def test_stop_returns_when_the_hook_has_run_with_the_reason(

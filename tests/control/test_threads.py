@@ -14,7 +14,7 @@ import pytest
 
 import holdfast as hf
 from tests.control.conftest import Starter
-from tests.control.players import Account, Add, Total
+from tests.control.players import Account, Add, Total, until_there
 
 SEEN: contextvars.ContextVar[str] = contextvars.ContextVar("seen", default="nothing")
 
@@ -65,12 +65,6 @@ class Blocks(hf.Actor):
     @hf.on(Now)
     def now(self, message: Now) -> int:
         return self.turns
-
-
-async def until_there(path: Path) -> None:
-    async with asyncio.timeout(8.0):
-        while not path.exists():
-            await asyncio.sleep(0.005)
 
 
 async def test_a_blocking_handler_blocks_only_its_actor(

@@ -1,0 +1,87 @@
+"""Another class for a live actor, now and after restarts (otp.md 1.12, `change_code`)."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.control.conftest import Starter
+from tests.control.players import (
+    Account,
+    Add,
+    Cents,
+    Euros,
+    Total,
+    Whole,
+    cannot,
+    keep,
+)
+
+
+async def test_code_is_replaced_for_good(system: hf.ActorSystem, start_one: Starter, way: str) -> None:
+    one = await start_one(hf.start(Account))
+    assert await one.ask(Add(1)) == 1
+    await system.suspend(one)
+    queued = one.ask(Add(2))
+    await system.replace_code(one, Cents)
+    assert (await system.get_status(one)).state == "suspended"
+    await system.resume(one)
+    assert await queued == 300
+    assert await one.ask(Euros()) == 3
+    assert await system.get_state(one) == {"total": 300, "seen": [1], "release": 2}
+    one.kill()
+    assert await one.ask(Euros(), timeout=8.0) == (3 if "recorded" in way else 0)
+    assert (await system.get_status(one)).kind == "tests.control.players.Cents"
+    assert await one.ask(Add(1)) == (400 if "recorded" in way else 100)
+
+
+async def test_code_is_replaced_in_suspended_actors_only(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    with pytest.raises(hf.NotSuspended, match="must be suspended first"):
+        await system.replace_code(one, Cents)
+    assert await one.ask(Add(1)) == 1
+
+
+async def test_a_migration_that_fails_leaves_the_old_class(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.suspend(one)
+    with pytest.raises(hf.ControlFailed, match=r"replace_code of .* failed: RuntimeError: no way from there"):
+        await system.replace_code(one, Cents, cannot)
+    await system.resume(one)
+    assert await one.ask(Add(1)) == 1
+    assert (await system.get_status(one)).kind == "tests.control.players.Account"
+    one.kill()
+    assert await one.ask(Add(1), timeout=8.0) in (1, 2)
+    assert (await system.get_status(one)).kind == "tests.control.players.Account"
+
+
+async def test_a_class_that_does_not_take_the_arguments_is_refused(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account, total=3))
+    await system.suspend(one)
+    with pytest.raises(hf.SpecError, match="Whole does not take the arguments of the old class"):
+        await system.replace_code(one, Whole)
+    await system.replace_code(one, hf.start(Cents, 5), keep)
+    await system.resume(one)
+    assert await one.ask(Total()) == 3
+
+
+@pytest.mark.parametrize("way", ["task", "in a subtree"])
+async def test_replaced_code_outlives_its_supervisor(system: hf.ActorSystem, way: str) -> None:
+    inner = hf.supervisor("inner", children=[hf.child("one", hf.start(Account))], intensity=100)
+    isolation: Any = "process" if way == "in a subtree" else "task"
+    await system.start(hf.supervisor("top", children=[inner], intensity=100, isolation=isolation))
+    one = system.ref("/app/top/inner/one", Account)
+    await system.suspend(one)
+    await system.replace_code(one, Cents, keep)
+    gone = system.ref("/app/top", hf.Supervisor)._cell.ended()
+    with system.events() as stream:
+        system.ref("/app/top", hf.Supervisor).kill()
+        await gone
+        async with asyncio.timeout(8.0):
+            async for event in stream:
+                if isinstance(event, hf.ActorStarted) and event.address == "/app/top":
+                    break
+    assert await system.ref("/app/top/inner/one", Cents).ask(Add(1), timeout=8.0) == 100

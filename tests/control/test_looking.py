@@ -1,0 +1,134 @@
+"""What a live actor does, seen from outside: status, statistics, trace (otp.md 1.12; W19)."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.control.conftest import Starter
+from tests.control.players import (
+    Account,
+    Add,
+    Crash,
+    No,
+    Pass,
+    Refuse,
+    Total,
+    Wait,
+    until_there,
+)
+
+
+async def test_a_status_says_what_the_actor_does(system: hf.ActorSystem, start_one: Starter, tmp_path: Path) -> None:
+    one, gate = await start_one(hf.start(Account)), tmp_path / "gate"
+    status = await system.get_status(one)
+    assert (status.address, status.kind, status.state, status.life) == (
+        one.path,
+        "tests.control.players.Account",
+        "running",
+        1,
+    )
+    assert status.parent == one.path.rpartition("/")[0]
+    assert (status.queued, status.turn, status.pid) == (0, None, system.pid_of(one))
+    waiting = one.ask(Wait(str(gate)))
+    await until_there(tmp_path / "gate.begun")
+    one.tell(Add(1))
+    one.tell(Add(1))
+    status = await system.get_status(one)
+    assert status.turn == "tests.control.players.Wait"
+    assert 0 < status.turn_seconds < 8.0
+    assert status.queued == 2
+    gate.touch()
+    await waiting
+
+
+async def test_statistics_count_from_when_they_are_switched_on(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    sink = await system.start(hf.child("sink", hf.start(Account)))
+    assert await one.ask(Add(1)) == 1
+    assert await system.statistics(one) is None
+    await system.statistics(one, True)
+    assert await one.ask(Add(1)) == 2
+    with pytest.raises(No):
+        await one.ask(Refuse())
+    one.tell(Pass(sink, 7))
+    assert await one.ask(Add(1)) == 3
+    counts = await system.statistics(one)
+    assert counts is not None
+    assert (counts.turns, counts.messages_out, counts.restarts) == (4, 1, 0)
+    assert 0 < counts.longest_turn <= counts.turn_seconds < 8.0
+    if "/top/" not in one.path:
+        assert counts.messages_in == 4
+    assert await system.statistics(one, False) is None
+    assert await one.ask(Add(1)) == 4
+    assert await system.statistics(one) is None
+
+
+async def test_statistics_see_restarts(system: hf.ActorSystem, start_one: Starter) -> None:
+    one = await start_one(hf.start(Account))
+    await system.statistics(one, True)
+    with pytest.raises(hf.RemoteCrash):
+        await one.ask(Crash())
+    assert await one.ask(Add(1), timeout=8.0) == 1
+    counts = await system.statistics(one)
+    assert counts is not None
+    assert counts.restarts == 1
+
+
+async def test_a_trace_tells_turns_and_messages(system: hf.ActorSystem, start_one: Starter, way: str) -> None:
+    one = await start_one(hf.start(Account))
+    sink = await system.start(hf.child("sink", hf.start(Account)))
+    with await system.trace(one) as stream:
+        one.tell(Pass(sink, 7))
+        with pytest.raises(No):
+            await one.ask(Refuse())
+        told = await _until_ended(stream, 2)
+    kinds = [type(event).__name__ for event in told if not isinstance(event, hf.MessageIn)]
+    assert kinds == ["TurnBegan", "MessageOut", "TurnEnded", "TurnBegan", "TurnEnded"]
+    assert [event.outcome for event in told if isinstance(event, hf.TurnEnded)] == ["done", "refused"]
+    assert [event.to for event in told if isinstance(event, hf.MessageOut)] == ["/app/sink"]
+    assert sum(isinstance(event, hf.MessageIn) for event in told) == 2
+    assert all(event.address == one.path for event in told)
+
+
+async def _until_ended(stream: hf.EventStream, turns: int) -> list[Any]:
+    told: list[Any] = []
+    async with asyncio.timeout(8.0):
+        async for event in stream:
+            told.append(event)
+            turns -= isinstance(event, hf.TurnEnded)
+            if not turns:
+                break
+    return told
+
+
+async def test_a_trace_goes_on_over_a_restart_and_ends_with_the_address(
+    system: hf.ActorSystem, start_one: Starter
+) -> None:
+    one = await start_one(hf.start(Account))
+    with await system.trace(one) as stream:
+        one.tell(Crash())
+        (began,) = [event for event in await _until_ended(stream, 1) if isinstance(event, hf.TurnEnded)]
+        assert began.outcome == "crashed: ValueError"
+        await one.ask(Total(), timeout=8.0)
+        one.tell(Add(1))
+        await _until_ended(stream, 1)
+        await system.stop(one)
+        async with asyncio.timeout(8.0):
+            async for _ in stream:
+                pass
+
+
+async def test_nothing_is_left_in_the_actor_when_nobody_looks_any_more(system: hf.ActorSystem) -> None:
+    one = await system.start(hf.child("one", hf.start(Account)))
+    cell = one._cell
+    assert await one.ask(Add(1)) == 1
+    before = cell.admit, cell.table, type(cell.ctx), set(vars(cell.actor))
+    with await system.trace(one):
+        assert (cell.admit, cell.table, type(cell.ctx)) != before[:3]
+    assert (cell.admit, type(cell.ctx), set(vars(cell.actor))) == (before[0], *before[2:])
+    assert cell.table is before[1]
