@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from . import exits, links, mailbox
@@ -76,8 +76,9 @@ class LocalHost:
         mailbox.queue_of(cell).append(item)
         cell.schedule()
 
-    def offer(self, cell: Cell, item: Any) -> None:
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         cell.admit(cell, item)
+        return None
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         pass
@@ -313,16 +314,16 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     """The life is over: undo what it had, tell who wants to know, and pass the address on."""
     cell.state = DOWN
     cell.scheduled = True
-    ctx = cell.ctx
+    more, ctx = cell.more, cell.ctx
+    if more is not None:
+        more.reason = reason
     if ctx is not None:
         ctx.close()
     actor = cell.actor
     if actor is not None and type(actor).on_undelivered is not Actor.on_undelivered:
         cell.extra().last = actor  # It may yet be handed what was queued.
     cell.actor = cell.ctx = cell.context = None
-    more = cell.more
     if more is not None:
-        more.reason = reason
         starting, more.starting = more.starting, None
         if starting is not None and not starting.done():
             starting.set_exception(StartFailed(cell.path, str(reason)))

@@ -9,6 +9,8 @@ from ..actors.mail import Ask
 from .journal import Entry, Journal
 from .records import TICK, Feed
 
+OVERHEAD = 200
+"""Bytes an input is counted with besides its payload."""
 EXPIRED = 1e-9
 """A deadline that has passed. (Asks forget theirs when they expire.)"""
 

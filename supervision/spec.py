@@ -84,10 +84,6 @@ class ChildSpec:
                     where, f"recovery must be a method such as hybrid(...) or left out, not {self.recovery!r}"
                 )
             self.recovery.check(where, self.start.kind)
-            if self.recovery.records and self.mailbox is not None:
-                raise SpecError(
-                    where, "mailbox=bounded(...) does not go with recovery yet: its journal_limit bounds what waits"
-                )
         if self.isolation == "process":
             try:
                 pack_recipe(self.start, where)

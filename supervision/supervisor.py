@@ -479,6 +479,4 @@ def supervisor(
         where = f"supervisor {name!r}"
         if holds(specs, lambda spec: spec.isolation == "process"):
             raise SpecError(where, "a subtree in a process cannot hold process children: its own is theirs")
-        if holds(specs, lambda spec: spec.recovery is not None and spec.recovery.records):
-            raise SpecError(where, "a subtree in a process cannot hold recorded children yet: give them their own")
     return ChildSpec(name, start, restart, shutdown, isolation, limits=limits, is_supervisor=True)

@@ -7,7 +7,7 @@ import socket
 
 from ..actors.cell import Cell
 from ..actors.process import frames, guest
-from ..checkpoint.controller import RecordedGuest
+from ..checkpoint.guest import RecordedGuest
 
 
 def main(sock: socket.socket, page_fd: int) -> int:
@@ -18,6 +18,7 @@ def main(sock: socket.socket, page_fd: int) -> int:
 def prepare(host: guest.Guest) -> None:
     """Before the root's first frame: a recorded life may get its state before it is launched."""
     host.recovery = RecordedGuest(host)
+    host.node.host_for = host.recovery.host_for
 
 
 def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:

@@ -22,8 +22,10 @@ from ..actors.process.remote import ProcessHost, on_frame
 from ..actors.process.workers import Workers
 from ..actors.ref import ActorRef
 from ..actors.topics import NOT_TAKEN
-from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
+from ..checkpoint.controller import RecordedProcessHost, TaskHost
+from ..checkpoint.homes import Homes
 from ..checkpoint.stores import open_journal
+from ..checkpoint.subtree import SubtreeHost
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import DeleteChild, NoSuchChild, StartChild, Supervisor, TerminateChild
 from .logs import LogSink
@@ -92,6 +94,7 @@ class ActorSystem:
         self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
+        node.outside = self._homes.find
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
         self._body = asyncio.current_task()
@@ -147,6 +150,8 @@ class ActorSystem:
             self._workers.want(spec.start.kind.__module__)
             if spec.recovery is not None and spec.recovery.records:
                 return RecordedProcessHost(self._workers, spec.limits, self._homes, spec.recovery)
+            if spec.is_supervisor:
+                return SubtreeHost(self._workers, spec.limits, self._homes)
             return ProcessHost(self._workers, spec.limits)
         if spec.recovery is not None and spec.recovery.records:
             return TaskHost(self._homes, spec.recovery)

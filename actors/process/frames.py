@@ -6,6 +6,7 @@ a number from then on. `body` is a payload that whoever routes the frame does no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -117,6 +118,10 @@ class Record(Frame, tag=12):
 
     to: Name
     body: Raw
+
+
+TakeRecord = Callable[[Record], None]
+"""Who takes the records for one address."""
 
 
 class Offer(Frame, tag=13):

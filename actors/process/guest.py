@@ -31,7 +31,7 @@ Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None
 
 def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
     """Serve the root until its socket ends. Returns the exit code."""
-    page = memoryview(mmap.mmap(page_fd, mmap.PAGESIZE)).cast("Q")
+    page = memoryview(mmap.mmap(page_fd, 0)).cast("Q")
     os.close(page_fd)
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         return runner.run(_serve(sock, page, launcher, prepare))
@@ -116,7 +116,6 @@ class Guest(Peer):
         super().__init__(Node("guest", loop))
         self.page: Any = page
         self.ended: asyncio.Future[int] = loop.create_future()
-        self.on_record: Callable[[frames.Record], None] | None = None
         self.recovery: Any = None  # the recovery method's side in this process, if it has one
         self._launcher = launcher
         self._targets: dict[int, Cell] = {}
@@ -135,7 +134,7 @@ class Guest(Peer):
             frames.Failure: self.on_failure,
             frames.Launch: self._launch,
             frames.Command: lambda frame: self._command(self._target(frame.to), frame),
-            frames.Record: self._record,
+            frames.Record: self.on_record,
         }
 
     # -- the world outside ------------------------------------------------------------------------------------------
@@ -169,8 +168,10 @@ class Guest(Peer):
         """An address of this process is free."""
         root = self.node.root
         reason = cell.more.reason if cell.more is not None else exits.SHUTDOWN
+        with_parent = cell.parent is not None and cell.parent.state is not RUNNING
         if root is not None:
-            self.command(root, "gone", {"path": cell.path, "reason": pack_exit(reason)})
+            data = {"path": cell.path, "reason": pack_exit(reason), "with_parent": with_parent}
+            self.command(root, "gone", data)
 
     def _tell_born(self, path: str) -> None:
         """A life has begun at an address below ours."""
@@ -225,10 +226,6 @@ class Guest(Peer):
                 cell.admit(cell, ask)
                 return
         self.on_ask(self._target(frame.to), frame, self.page if frame.number else None)
-
-    def _record(self, frame: frames.Record) -> None:
-        if self.on_record is not None:
-            self.on_record(frame)
 
     def _target(self, to: frames.Name) -> Cell:
         """The cell at an address of this process."""

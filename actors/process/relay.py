@@ -38,6 +38,8 @@ class Peer:
         self._last_id = 0
         self.routes: dict[tuple[frames.Name, frames.Name], tuple[Cell, Callable[[Any], Any]]] = {}
         self.kinds_out: dict[type, int] = {}
+        self.record_taker: Callable[[str], frames.TakeRecord] = no_records  # the recovery method's, by address
+        self._record_takers: dict[frames.Name, frames.TakeRecord] = {}
 
     # -- out --------------------------------------------------------------------------------------------------------
 
@@ -135,6 +137,14 @@ class Peer:
         else:
             ask.answer(reply)
 
+    def on_record(self, frame: frames.Record) -> None:
+        """Something for the recovery method at an address."""
+        take = self._record_takers.get(frame.to)
+        if take is None:
+            take = self.record_taker(self.connection.name_in(frame.to))
+            self._record_takers[self.connection.number_in(frame.to)] = take
+        take(frame)
+
     def on_failure(self, frame: frames.Failure) -> None:
         """The other side failed an ask of ours."""
         ask = self.pending.pop(frame.id, None)
@@ -199,6 +209,11 @@ class Peer:
             if page is not None:
                 page[1] = frame.number
             ask.fail(error)
+
+
+def no_records(path: str) -> frames.TakeRecord:
+    """Nobody is recovered over this connection."""
+    raise BadFrame(f"a record for {path}, which is not recovered")
 
 
 class Accepted(Message[None]):

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any
 
 from .. import links, lives, mailbox
 from ..cell import DOWN, GONE, RUNNING, Cell
 from ..codec import Parcel
-from ..errors import AskFailed, BadMessage, HoldfastError, ProcessUnavailable, StartFailed
+from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
 from ..events import ActorStarted
 from ..exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..mail import Ask, Envelope, Item
@@ -216,19 +217,27 @@ class ProcessHost:
             if more.bound is not None:
                 more.bound = RemoteBound(more.bound)
                 cell.admit = admit_remote_bounded
+        return self.begin(cell, self._start(cell))
+
+    def begin(self, cell: Cell, start: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
+        """Run the start of a life outside the supervisor's turn."""
         self._stop_wanted = None
-        self._starting = cell.node.loop.create_task(self._start(cell), name=f"start of {cell.path}")
+        self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
         self._starting.add_done_callback(_seen)
         return self._starting
 
-    async def _start(self, cell: Cell) -> None:
-        more = cell.extra()
-        start = more.start
+    async def take(self, cell: Cell) -> tuple[Worker, bytes]:
+        """A process for the next life at `cell`, which is running from now on, and its recipe.
+
+        Raises:
+            StartFailed: there is none to be had, or the actor was stopped meanwhile.
+        """
+        start = cell.extra().start
         assert start is not None
         try:
             recipe = pack_recipe(start, cell.path)
             worker = await self._workers.take()
-        except ProcessUnavailable as error:
+        except HoldfastError as error:
             raise StartFailed(cell.path, str(error)) from error
         if cell.state is not DOWN:
             worker.kill(KILLED)
@@ -236,6 +245,13 @@ class ProcessHost:
         cell.life += 1
         cell.state = RUNNING
         worker.adopt(cell, self._limits, self.died)
+        return worker, recipe
+
+    async def _start(self, cell: Cell) -> None:
+        more = cell.extra()
+        start = more.start
+        assert start is not None
+        worker, recipe = await self.take(cell)
         for topic in start.kind._topics:
             cell.node.topics.subscribe(topic, cell)
         try:
@@ -394,6 +410,7 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "born":
             worker.inner.born(cell, text(frame, "path"), text(frame, "kind"), int(frame.data.get("life", 0)))
         case "gone":
-            worker.inner.gone(text(frame, "path"), unpack_exit(frame.data.get("reason")))
+            reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
+            worker.inner.gone(text(frame, "path"), reason, with_parent=with_parent)
         case _:
             obey(node, cell, frame)

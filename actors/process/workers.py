@@ -45,7 +45,6 @@ class Worker(Peer):
         self.targets: dict[int, Cell] = {}
         self.inner = Inner(self.node, self)
         self.cell: Cell | None = None
-        self.on_record: Callable[[frames.Record], None] = _no_records
         self._workers = workers
         self._died: Callable[[Cell, ExitReason], None] | None = None
         self._launches: dict[int, asyncio.Future[None]] = {}
@@ -70,7 +69,7 @@ class Worker(Peer):
         self.connection.takers = {
             frames.Reply: self.on_reply,
             frames.Failure: self.on_failure,
-            frames.Record: lambda frame: self.on_record(frame),
+            frames.Record: self.on_record,
         }
         await self.connection.open(forked.sock)
         for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
@@ -250,10 +249,6 @@ class Worker(Peer):
                 return OutOfMemory("killed by the kernel")
             return Signal(number)
         return Exited(os.waitstatus_to_exitcode(status))
-
-
-def _no_records(frame: frames.Record) -> None:
-    """Nobody recovers the actor of this process."""
 
 
 def _limit_options(limits: Limits | None) -> dict[str, Any]:

@@ -16,9 +16,9 @@ if ROOT not in sys.path:
     sys.path.append(ROOT)
 
 
-@pytest.fixture(params=["task", "process"])
+@pytest.fixture(params=["task", "process", "subtree"])
 def isolation(request: pytest.FixtureRequest) -> str:
-    """The same class, unchanged, lives as a task and in a process of its own."""
+    """The same class, unchanged, lives as a task, in a process of its own, and below a supervisor that has one."""
     return str(request.param)
 
 
