@@ -31,13 +31,13 @@ class HomeBound:
         self._counted = {  # by id, in admission order
             key: source for key, source in home.open.items() if source.kind == MESSAGE and key not in stashed
         }
-        self._waiting: deque[tuple[Ask, str, bytes, str | None]] = deque()  # asks that wait for room
-        self._senders: deque[asyncio.Future[None]] = deque()
+        self.waiting: deque[tuple[Ask, str, bytes, str | None]] = deque()  # asks that wait for room
+        self.senders: deque[asyncio.Future[None]] = deque()
         self._fed = -1  # one at a time: the input in hand
         self._behind: dict[int, Input] = {}  # and those that wait for it
 
     @property
-    def queued(self) -> int:
+    def count(self) -> int:
         """Messages that wait for their turn."""
         if self.one_at_a_time:
             in_hand = self._fed in self._counted
@@ -48,7 +48,7 @@ class HomeBound:
     @property
     def is_full(self) -> bool:
         """Whether one more would be too many."""
-        return self.queued >= self.capacity or bool(self._waiting)
+        return self.count >= self.capacity or bool(self.waiting)
 
     # -- admission --------------------------------------------------------------------------------------------------
 
@@ -62,7 +62,7 @@ class HomeBound:
             return True
         match self.overflow:
             case "block" if ask is not None:
-                self._waiting.append((ask, name, body, sender))
+                self.waiting.append((ask, name, body, sender))
                 return False
             case "block" | "fail":
                 error = MailboxFull(self._home.path, self.capacity)
@@ -90,7 +90,7 @@ class HomeBound:
         batch = Batch()
         error = Answer(*home.node.codec.encode_error(MailboxFull(home.path, self.capacity)))
         for source in list(self._counted.values()):
-            if self.queued <= keep:
+            if self.count <= keep:
                 break
             if source.id not in (self._fed, home.partial_id):
                 self._behind.pop(source.id, None)
@@ -103,7 +103,7 @@ class HomeBound:
         if self.overflow != "block" or not self.is_full:
             return None
         future: asyncio.Future[None] = self._home.node.loop.create_future()
-        self._senders.append(future)
+        self.senders.append(future)
         return future
 
     # -- what the home tells of its inputs --------------------------------------------------------------------------
@@ -125,22 +125,22 @@ class HomeBound:
     def refill(self) -> None:
         """Let in who waits, as far as there is room."""
         home = self._home
-        while self._waiting and self.queued < self.capacity:
-            ask, name, body, sender = self._waiting.popleft()
+        while self.waiting and self.count < self.capacity:
+            ask, name, body, sender = self.waiting.popleft()
             if not ask.is_done:  # Expired or given up while it waited: never admitted.
                 home.take(ask, name, body, sender)
-        while self._senders and not self.is_full:
-            waiter = self._senders.popleft()
+        while self.senders and not self.is_full:
+            waiter = self.senders.popleft()
             if not waiter.done():
                 waiter.set_result(None)
                 break  # One for each free place: it tries again.
 
     def release(self, error: MailboxFull | Exception) -> None:
         """The address is given up: whoever waits shall see it."""
-        waiting, self._waiting = self._waiting, deque()
+        waiting, self.waiting = self.waiting, deque()
         for ask, *_ in waiting:
             ask.fail(error)
-        senders, self._senders = self._senders, deque()
+        senders, self.senders = self.senders, deque()
         for sender in senders:
             if not sender.done():
                 sender.set_result(None)

@@ -10,7 +10,7 @@ from ..actors.cell import GONE, Cell
 from ..actors.codec import Parcel
 from ..actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ..actors.mail import Envelope
-from .asks import SwitchAsk
+from .asks import SwitchAsk, answer_ask
 from .inputs import Batch
 from .records import MESSAGE, Answer, Out
 
@@ -48,7 +48,7 @@ class Outputs:
                 if isinstance(ask, SwitchAsk):
                     ask.give(Answer(kind, name, out.body), batch)
                 elif ask is not None:
-                    batch.after.append(lambda: home.answer_ask(ask, Answer(kind, name, out.body)))
+                    batch.after.append(lambda: answer_ask(home, ask, Answer(kind, name, out.body)))
             case "forward":
                 self._forward(key, out, batch)
             case "timer" | "cancel":
@@ -99,7 +99,7 @@ class Outputs:
         home = self._home
         target = home.node.cell_at(out.to)
         switch = switch_of(target)
-        home.sends.add((turn, out.k))
+        home.calls.sends.add((turn, out.k))
         if switch is None:
             batch.after.append(lambda: self._offer(target, turn, out))
             return
@@ -110,7 +110,7 @@ class Outputs:
                 source = switch.record(MESSAGE, out.name, out.body, home.path, batch)
                 batch.after.append(lambda: switch.forward(source))
         except MailboxFull as error:
-            home.refused(turn, out.k, error, batch)
+            home.calls.refused(turn, out.k, error, batch)
             return
         batch.after.append(lambda: self._wait(switch, turn, out.k))
 
@@ -118,7 +118,7 @@ class Outputs:
         """Let the sender go on when its receiver has room."""
         room = switch.room() if switch.cell is not None and switch.cell.state is not GONE else None
         if room is None:
-            self._home.accepted(turn, k)
+            self._home.calls.accepted(turn, k)
         else:
             room.add_done_callback(lambda _: self._wait(switch, turn, k))
 
@@ -133,19 +133,19 @@ class Outputs:
             message = home.node.codec.message_in(target, out.name, out.body)
             taken = target.host.offer(target, Envelope(message, home.cell))
         except HoldfastError as error:
-            home.refused(turn, out.k, error)
+            home.calls.refused(turn, out.k, error)
             return
         if taken is None:
-            home.accepted(turn, out.k)
+            home.calls.accepted(turn, out.k)
         else:  # It is in another process, which answers.
             asyncio.ensure_future(taken).add_done_callback(lambda done: self._offered(turn, out.k, done))
 
     def _offered(self, turn: int, k: int, done: asyncio.Future[None]) -> None:
         error = None if done.cancelled() else done.exception()
         if isinstance(error, HoldfastError):
-            self._home.refused(turn, k, error)
+            self._home.calls.refused(turn, k, error)
         else:
-            self._home.accepted(turn, k)
+            self._home.calls.accepted(turn, k)
 
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
@@ -153,7 +153,7 @@ class Outputs:
         source = home.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
         ask = SwitchAsk.made(home, turn, out, chain, target)
-        home.asks[turn, out.k] = ask
+        home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)
         switch = switch_of(target)
         if switch is None:

@@ -45,8 +45,8 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
         if turn.status != STASHED:
             home.bytes -= len(turn.input.body) + OVERHEAD
         home.pipes_done.pop(number, None)
-    for key in [key for key in home.outcomes if key[0] <= record.turn]:
-        del home.outcomes[key]
+    for key in [key for key in home.calls.outcomes if key[0] <= record.turn]:
+        del home.calls.outcomes[key]
 
 
 def load(home: Switch) -> None:
@@ -99,7 +99,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
                 home.partial, home.partial_id = list(digests), key
         case ("got", turn, k, kind, name, body):
             home.positions_of(turn).append(position)
-            home.outcomes[turn, k] = Answer(kind, name, body)
+            home.calls.outcomes[turn, k] = Answer(kind, name, body)
         case ("drop", key):
             dropped = home.open.pop(key, None)
             home.dropped.extend((*(dropped.positions if dropped is not None else ()), position))

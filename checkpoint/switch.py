@@ -8,6 +8,7 @@ actors are one append; a reply leaves behind that append; the journal is cut onl
 from __future__ import annotations
 
 import asyncio
+import functools
 import time
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -19,7 +20,6 @@ from ..actors.codec import Parcel
 from ..actors.errors import (
     ActorStopped,
     AskDeadlock,
-    AskTimeout,
     HoldfastError,
     MailboxFull,
     Quarantined,
@@ -29,8 +29,7 @@ from ..actors.events import JournalFull, MessageQuarantined, RecoveryFailed, Sna
 from ..actors.exits import pack_exit
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
-from ..actors.process.relay import RelayedAsk
-from .asks import SwitchAsk
+from .asks import Calls, SwitchAsk, answer_ask
 from .bound import HomeBound
 from .inputs import OVERHEAD, Batch, Input, Turn
 from .journal import Journal
@@ -46,14 +45,12 @@ from .records import (
     NOTHING,
     OK,
     PIPE,
-    REPLY,
     START,
     STASHED,
     Answer,
     Go,
     Live,
     Out,
-    Outcome,
     PipeDone,
     Released,
     Restore,
@@ -70,8 +67,6 @@ from .timers import Timers
 
 if TYPE_CHECKING:
     from ..actors.node import Node
-
-ACCEPTED = Answer(REPLY, "", msgspec.msgpack.encode(None))
 
 
 class LifePort(Protocol):
@@ -92,15 +87,13 @@ class Switch:
         self.turn = -1  # the last ended turn; `on_start` is turn 0
         self.turns: dict[int, Turn] = {}
         self.open: dict[int, Input] = {}  # inputs without an end, in admission order
-        self.asks: dict[tuple[int, int], SwitchAsk] = {}
-        self.outcomes: dict[tuple[int, int], Answer] = {}
+        self.calls = Calls(self)
         self.partial: list[int] = []  # digests of what the turn after `turn` has released
         self.partial_id = -1
         self.later: dict[int, Ask] = {}
         self.timers = Timers(self)
         self.outputs = Outputs(self)
         self.bound: HomeBound | None = None
-        self.sends: set[tuple[int, int]] = set()  # whose receivers have no room yet
         self.pipes_done: dict[int, set[int]] = {}
         self.topics: dict[str, None] = {}
         self.state: bytes | None = None
@@ -317,14 +310,10 @@ class Switch:
         if status != STASHED:
             del self.open[source.id]
         if self.bound is not None:
-            batch.after.append(lambda: self._ended(source))
+            batch.after.append(functools.partial(self.bound.ended, source))
         if self.journal.durable:
             entry = ("end", number, source.id, status, tuple(turn.digests))
             batch.add(self.path, entry, self.positions_of(number))
-
-    def _ended(self, source: Input) -> None:
-        if self.bound is not None:
-            self.bound.ended(source)
 
     def positions_of(self, turn: int) -> list[int]:
         """Where in the journal a turn's own entries stand."""
@@ -444,23 +433,12 @@ class Switch:
                     raise ReplayDiverged(self.path, turn, out.k)
                 self._replay_k = out.k
                 if out.verb in ("ask", "send"):
-                    self._join(out.verb, turn, out.k)
+                    self.calls.join(out.verb, turn, out.k)
             elif ended:
                 raise ReplayDiverged(self.path, turn, out.k)
             else:
                 known.append(out.digest())
                 self.outputs.execute(turn, key, out, batch)
-
-    def _join(self, verb: str, turn: int, k: int) -> None:
-        """An ask or send that was made before the crash: answered from the journal, or when its pending call is."""
-        answer = self.outcomes.get((turn, k))
-        if answer is None and verb == "send":
-            answer = None if (turn, k) in self.sends else ACCEPTED
-        elif answer is None and (turn, k) not in self.asks:
-            # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
-            answer = Answer(*self.node.codec.encode_error(AskTimeout("(unknown since the restart)", 0.0, None)))
-        if answer is not None and self.port is not None:
-            self.port.to_life(Outcome(turn, k, answer))
 
     def _turn_end(self, end: TurnEnd) -> None:
         if end.turn <= self.turn:
@@ -497,51 +475,7 @@ class Switch:
         if isinstance(ask, SwitchAsk):
             ask.give(answer, batch)
         else:
-            batch.after.append(lambda: self.answer_ask(ask, answer))
-
-    def answer_ask(self, ask: Ask, answer: Answer) -> None:
-        if isinstance(ask, RelayedAsk):
-            if answer.kind == REPLY:
-                ask.answer_raw(answer.body)
-            else:
-                ask.fail_raw(answer.kind, answer.name, answer.body)
-            return
-        codec = self.node.codec
-        if answer.kind != REPLY:
-            ask.fail(codec.decode_error(answer.kind, answer.name, answer.body))
-            return
-        try:
-            reply = codec.decode_reply(type(ask.message), answer.body)
-        except msgspec.DecodeError as error:
-            ask.fail(HoldfastError(f"the reply of {self.path} does not fit its type: {error}"))
-        else:
-            ask.answer(reply)
-
-    def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
-        """An ask of ours has its outcome: journal it, then tell the turn that waits."""
-        own = batch if batch is not None else Batch()
-        self.asks.pop((turn, k), None)
-        if turn > self.state_turn:  # Else it will not be replayed.
-            self.outcomes[turn, k] = answer
-            entry = ("got", turn, k, answer.kind, answer.name, answer.body)
-            own.add(self.path, entry, self.positions_of(turn))
-        own.after.append(lambda: self._tell_outcome(turn, k, answer))
-        if batch is None:
-            own.commit(self.journal)
-
-    def accepted(self, turn: int, k: int) -> None:
-        """A `send` of ours was accepted. (Not journaled: under replay it is accepted unless it still waits.)"""
-        self.sends.discard((turn, k))
-        self._tell_outcome(turn, k, ACCEPTED)
-
-    def refused(self, turn: int, k: int, error: HoldfastError, batch: Batch | None = None) -> None:
-        """A `send` of ours was not."""
-        self.sends.discard((turn, k))
-        self.outcome(turn, k, Answer(*self.node.codec.encode_error(error)), batch)
-
-    def _tell_outcome(self, turn: int, k: int, answer: Answer) -> None:
-        if self.port is not None:
-            self.port.to_life(Outcome(turn, k, answer))
+            batch.after.append(lambda: answer_ask(self, ask, answer))
 
     def _pipe_done(self, record: PipeDone) -> None:
         done = self.pipes_done.setdefault(record.turn, set())

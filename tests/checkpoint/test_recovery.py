@@ -479,7 +479,7 @@ async def test_snapshots_are_taken_while_turns_are_in_flight_and_cut_the_journal
     switch: Any = ref._cell.host.switch  # type: ignore[attr-defined]
     await snapshot_after(system, ref, switch.turn)
     assert not switch.turns
-    assert not switch.outcomes
+    assert not switch.calls.outcomes
     assert switch.bytes == 0
 
 
