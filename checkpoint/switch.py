@@ -339,6 +339,8 @@ class Switch:
         if self.live is not None and not self.live.done():
             self.live.cancel()
         self.timers.pause()
+        if self.bound is not None:
+            self.bound.release(ActorStopped(self.path, why))
         for source in list(self.open.values()):
             if source.kind == START or (keep_tells and source.ask is None):
                 continue
@@ -349,8 +351,6 @@ class Switch:
         for ask in self.later.values():
             ask.fail(ActorStopped(self.path, why))
         self.later.clear()
-        if self.bound is not None:
-            self.bound.release(ActorStopped(self.path, why))
         self._wake_waiters()
 
     def _wake_waiters(self) -> None:
