@@ -22,7 +22,6 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-import holdfast.checkpoint.sqlite as sqlite_engine
 from holdfast.actors.errors import HoldfastError
 from holdfast.checkpoint.journal import (
     DamagedStore,
@@ -35,6 +34,10 @@ from holdfast.checkpoint.journal import (
     StoreInUse,
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.sqlite import store as sqlite_store
+from holdfast.checkpoint.sqlite.chains import Chain
+from holdfast.checkpoint.sqlite.claim import Claim
+from holdfast.checkpoint.sqlite.rows import crc_of
 
 A, B = "/app/bank/alice", "/app/bank/bob"
 
@@ -236,7 +239,7 @@ def test_many_interleaved_entries_are_dropped(path: Path) -> None:
         journal.cut(A, b"2", [], turn=2)
         assert [position for position, _ in journal.load(A).entries] == mine[-1:]
         assert len(journal.load(B).entries) == 1667
-        assert journal._live == 1668
+        assert journal._store.live == 1668
     assert numbers(reopened(path)) == [4999]
 
 
@@ -297,7 +300,7 @@ def abandon(journal: SqliteJournal) -> SqliteJournal:
     with closing(sqlite3.connect(journal.path, isolation_level=None)) as db:
         row = db.execute("SELECT epoch, pid, start, floor, live FROM store").fetchone()
         dead = (row[0], 0, "", row[3], row[4])
-        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (sqlite_engine._crc(*dead),))
+        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc_of(*dead),))
     return SqliteJournal(journal.path)
 
 
@@ -377,8 +380,8 @@ def test_appends_go_on_while_other_threads_cut_and_load(store: SqliteJournal) ->
 
 
 def test_the_wal_is_brought_into_the_database_meanwhile(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sqlite_engine, "_CHECKPOINT_BYTES", 1 << 16)
-    monkeypatch.setattr(sqlite_engine, "_WAL_FRAMES", 64)
+    monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 16)
+    monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
     with closing(SqliteJournal(path)) as journal:
         sizes, count = [-1, 0], 0
         while sizes[-1] != sizes[-2]:  # The file does not shrink, but once it is written over it does not grow either.
@@ -392,12 +395,12 @@ def test_the_wal_is_brought_into_the_database_meanwhile(path: Path, monkeypatch:
 
 def test_a_broken_off_transaction_leaves_no_trace(store: SqliteJournal, monkeypatch: pytest.MonkeyPatch) -> None:
     positions = store.append(inputs(2))
-    for interrupted in ("_write_chain", "_write_store"):
+    for interrupted in (Chain, Claim):
         with monkeypatch.context() as patch:
-            patch.setattr(store, interrupted, lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+            patch.setattr(interrupted, "write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):
                 store.cut(A, b"1", positions, turn=1)
-            if interrupted == "_write_chain":
+            if interrupted is Chain:
                 with pytest.raises(KeyboardInterrupt):
                     store.append([*inputs(1), *inputs(1, "/new")])
         assert store.load(A) == (None, 0, list(zip(positions, [("in", 0), ("in", 1)], strict=True)), "")
@@ -429,7 +432,7 @@ if what == "hold":
     print("held", flush=True)
     sys.stdin.read()
 if what == "stop":  # in the middle of a transaction, with SQLite's write lock held
-    with journal._transaction():
+    with journal._store.transaction():
         os.kill(os.getpid(), signal.SIGSTOP)
 number, live, done = 0, {0: [], 1: []}, 0
 while what == "write":
@@ -538,7 +541,7 @@ def test_a_dead_owner_holds_nothing_even_if_its_pid_lives_again(path: Path) -> N
     edit(path, f"UPDATE store SET pid = {row[1]}, start = '{row[2]}'")
     with closing(sqlite3.connect(path, isolation_level=None)) as db:
         floor, live = db.execute("SELECT floor, live FROM store").fetchone()
-        db.execute("UPDATE store SET crc = ?", (sqlite_engine._crc(*row[:3], floor, live),))
+        db.execute("UPDATE store SET crc = ?", (crc_of(*row[:3], floor, live),))
     assert numbers(reopened(path)) == [1]
 
 
@@ -553,8 +556,8 @@ def test_of_many_openers_one_wins(path: Path) -> None:
 def test_an_owner_whose_epoch_is_stale_writes_nothing(store: SqliteJournal, path: Path) -> None:
     positions = store.append(inputs(2))
     store.cut(A, b"1", [], turn=1)
-    epoch, *_, floor, live = store._read_store()
-    edit(path, f"UPDATE store SET epoch = 5, crc = {sqlite_engine._crc(5, 0, '', floor, live)}, pid = 0, start = ''")
+    epoch, *_, floor, live = store._store.claim.read()
+    edit(path, f"UPDATE store SET epoch = 5, crc = {crc_of(5, 0, '', floor, live)}, pid = 0, start = ''")
     big = b"x" * (2 << 20)
     attempts: list[Callable[[], object]] = [
         lambda: store.append(inputs(1)),
