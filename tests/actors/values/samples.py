@@ -16,7 +16,6 @@ from zoneinfo import ZoneInfo
 
 import msgpack
 import msgspec
-import msgspec.inspect
 import numpy as np
 
 from holdfast.actors.values import decode_value, encode_value

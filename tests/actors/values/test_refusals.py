@@ -44,7 +44,7 @@ from tests.actors.values.samples import (
 REFUSED: list[tuple[Any, str]] = [
     (lambda: {"x": [1, 2, 3, {"socket": len}]}, "['x'][3]['socket']: a value of type builtin_function_or_method"),
     (object, ": a value of type object"),
-    (lambda: [test_refusal_names_what_and_where], "[0]: a value of type function"),
+    (lambda: [is_same], "[0]: a value of type function"),
     (lambda: (1, [types]), "[1][0]: a value of type module"),
     (lambda: [int], "[0]: a value of type type"),
     (lambda: {"a": slice(1)}, "['a']: a value of type slice"),
