@@ -17,6 +17,8 @@ HoldfastError
 ├── NoSuchActor          nobody lives at this address
 ├── WrongActor           another class lives at this address
 ├── SpecError            a child specification is not valid
+├── UnsavableValue       a value that no snapshot can hold
+├── DamagedValue         saved bytes that cannot be read
 ├── ProcessUnavailable   no OS process could be had
 ├── TreeFailed           the root supervisor gave up
 └── Refusal              a handler's typed "no" (`message.py`)
@@ -225,6 +227,31 @@ class SpecError(HoldfastError):
 
     def __str__(self) -> str:
         return f"{self.where}: {self.problem}"
+
+
+class UnsavableValue(HoldfastError):
+    """A value that no snapshot can hold: `where` is the path to it, `problem` what sits there."""
+
+    def __init__(self, where: str, problem: str) -> None:
+        super().__init__(where, problem)
+        self.where, self.problem = where, problem
+
+    def __str__(self) -> str:
+        return (
+            f"{self.where}: {self.problem} cannot be saved; make it a key variable of a supported type, "
+            "name it with a leading underscore, or define get_state/set_state"
+        )
+
+
+class DamagedValue(HoldfastError):
+    """Saved bytes that cannot be read: cut short, altered, of another format, or of a class that is no longer there."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(problem)
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return f"a saved value cannot be read: {self.problem}; use an older one"
 
 
 class ProcessUnavailable(HoldfastError):

@@ -19,7 +19,8 @@ from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpac
 from ..mail import Ask
 from . import frames
 from .connection import Connection
-from .forkserver import Forked, ForkServer, has_ended
+from .forked import Forked, has_ended
+from .forkserver import ForkServer
 from .inner import Inner
 from .limits import Limits
 from .output import OutputReader

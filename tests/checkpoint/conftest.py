@@ -27,3 +27,9 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
     """A running system that allows many restarts; it stops when the test ends."""
     async with hf.ActorSystem("app", log=False, intensity=1000) as running:
         yield running
+
+
+@pytest.fixture
+def gate(tmp_path: Path) -> Path:
+    """Where a `Doer` stops, until it is let through."""
+    return tmp_path / "gate"
