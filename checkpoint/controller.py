@@ -185,8 +185,10 @@ class RemoteLife:
     """From a home to its life, in another process."""
 
     def __init__(self, path: str, worker: Worker) -> None:
-        self._path, self._worker = path, worker
+        self._path, self._connection = path, worker.connection
+        self._name: frames.Name = path
 
     def to_life(self, record: ToLife) -> None:
-        connection = self._worker.connection
-        connection.send(frames.Record(connection.name_out(self._path), record), self._path)  # type: ignore[arg-type]  # encoded in place
+        if type(self._name) is str:  # The number is known from the second record on.
+            self._name = self._connection.name_out(self._path)
+        self._connection.send(frames.Record(self._name, record), self._path)  # type: ignore[arg-type]  # encoded in place

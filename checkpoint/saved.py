@@ -39,12 +39,11 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
         home.journal.cut(home.path, msgspec.msgpack.encode(meta), drop, turn=record.turn)
     home.dropped.clear()
     home.state, home.state_turn, home.stash = state, record.turn, record.stash
-    for number in covered:
-        turn = home.turns.pop(number)
-        home.positions.pop(number, None)
-        if turn.status != STASHED:
-            home.bytes -= len(turn.input.body) + OVERHEAD
-        home.pipes_done.pop(number, None)
+    done = (home.turns.pop(number) for number in covered)
+    home.bytes -= sum(len(turn.input.body) + OVERHEAD for turn in done if turn.status != STASHED)
+    for known in (home.positions, home.pipes_done):
+        for number in [number for number in known if number <= record.turn]:
+            del known[number]
     for key in [key for key in home.calls.outcomes if key[0] <= record.turn]:
         del home.calls.outcomes[key]
 
@@ -77,7 +76,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
         case ("in", key, kind, name, body, when, sender, origin):
             source = home.open[key] = Input(key, kind, name, body, when, sender)
             source.origin = origin
-            source.positions.append(position)
+            source.positions = [position]
             home.next_id = max(home.next_id, key + 1)
             if kind == TICK and origin in timers and not timers[origin][3]:
                 del timers[origin]

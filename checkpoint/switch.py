@@ -119,16 +119,14 @@ class Switch:
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: number, journal, and feed unless the actor is being recovered."""
-        kind = type(item)
-        if kind is Envelope:
-            message, sender, ask = item.message, item.sender, None
-        elif isinstance(item, Ask):
+        message, sender, ask = item, None, None
+        if isinstance(item, Ask):
             message, sender, ask = item.message, item.sender, item
             if item.chain and self.waits(item):
                 item.fail(AskDeadlock(self.path, tuple(path for path, _ in item.chain)))
                 return
-        else:
-            message, sender, ask = item, None, None
+        elif type(item) is Envelope:
+            message, sender = item.message, item.sender
         if type(message) is Parcel:
             name, body = message.name, message.body
         else:
@@ -183,13 +181,15 @@ class Switch:
         key = self.next_id
         self.next_id = key + 1
         source = Input(key, kind, name, body, self.node.wall(), sender)
-        source.origin = origin
+        if origin:
+            source.origin = origin
         self.open[key] = source
         self.bytes += len(body) + OVERHEAD
         if self.bound is not None:
             self.bound.added(source)
         if self.journal.durable:
             entry = ("in", key, kind, name, body, source.time, sender, origin)
+            source.positions = []
             if batch is not None:
                 batch.add(self.path, entry, source.positions)
             else:
@@ -449,6 +449,13 @@ class Switch:
             raise HoldfastError(f"{self.path}: the life ended turn {end.turn} with unknown input {end.id}")
         if source.kind == START and end.status == FAILED:
             return  # Its start failed, and will be tried again.
+        if not end.outs and source.ask is None and not self.partial and self.bound is None and not self.journal.durable:
+            self.turns[end.turn] = Turn(source, end.status, [])  # The shortest way: nothing leaves, nobody waits.
+            self.turn = source.turn = end.turn
+            self.partial_id, source.deliveries = -1, 0
+            if end.status != STASHED:
+                del self.open[end.id]
+            return
         batch = Batch()
         self._take(end.turn, end.id, end.outs, batch)
         self._end(source, end.turn, end.status, batch)
