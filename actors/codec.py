@@ -180,9 +180,14 @@ def encode_array(array: Any) -> bytes:
     """dtype, shape and the elements in C order, in one copy."""
     if array.dtype.hasobject:
         raise TypeError("a numpy array of objects cannot be sent")
-    head = msgspec.msgpack.encode((array.dtype.str if array.dtype.names is None else array.dtype.descr, array.shape))
     elements = array.reshape(-1).view("u1") if array.flags.c_contiguous else array.tobytes()
-    return b"".join((len(head).to_bytes(4, "little"), head, elements))
+    return b"".join((array_head(array), elements))
+
+
+def array_head(array: Any) -> bytes:
+    """What stands before the elements."""
+    head = msgspec.msgpack.encode((array.dtype.str if array.dtype.names is None else array.dtype.descr, array.shape))
+    return len(head).to_bytes(4, "little") + head
 
 
 def decode_array(data: memoryview) -> Any:

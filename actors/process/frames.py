@@ -120,6 +120,15 @@ class Record(Frame, tag=12):
     body: Raw
 
 
+class Run(Frame, tag=15):
+    """Messages of one type to one address, numbered from `first` on: stands for that many `Tell`s."""
+
+    to: int
+    name: int
+    first: int
+    bodies: Raw
+
+
 TakeRecord = Callable[[Record], None]
 """Who takes the records for one address."""
 
@@ -138,6 +147,27 @@ class Moved(Frame, tag=14):
     """The page has changed: told to a bounded mailbox only, at most once per loop tick."""
 
 
+def tagged(kind: type[Frame]) -> bytes:
+    """How a frame of this kind begins: an array, and its tag."""
+    tag = kind.__struct_config__.tag
+    assert isinstance(tag, int)
+    return bytes((0x90 | (len(kind.__struct_fields__) + 1), tag))
+
+
 AnyFrame = (
-    Tell | Ask | Reply | Failure | Launch | Launched | Ended | Command | Publish | Beat | Note | Record | Offer | Moved
+    Tell
+    | Ask
+    | Reply
+    | Failure
+    | Launch
+    | Launched
+    | Ended
+    | Command
+    | Publish
+    | Beat
+    | Note
+    | Record
+    | Offer
+    | Moved
+    | Run
 )

@@ -10,6 +10,7 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import uvloop
 
 from .. import exits, lives
@@ -24,6 +25,8 @@ from . import frames
 from .connection import BadFrame, Connection
 from .recipe import unpack_recipe
 from .relay import Arrived, OutsideHost, Peer, RelayedAsk, named, obey, text
+
+_BODIES = msgspec.msgpack.Decoder(list[frames.Raw])
 
 Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
 """Begins the life a launch frame asks for; the composition root gives one that knows recovery and supervision."""
@@ -128,6 +131,7 @@ class Guest(Peer):
         self.node.events.add_sink(self._on_event)
         self.takers: dict[type[frames.Frame], Callable[[Any], None]] = {
             frames.Tell: self._tell,
+            frames.Run: self._run,
             frames.Ask: self._ask,
             frames.Offer: lambda frame: self.on_offer([self._target(frame.to)], frame),
             frames.Reply: self.on_reply,
@@ -201,7 +205,7 @@ class Guest(Peer):
         """The hot path in: a plain message to our own actor, of a type it has had before."""
         route = self.routes.get((frame.to, frame.name))
         if route is not None and frame.sender is None:
-            cell, decode = route
+            cell, decode, _ = route
             try:
                 message = decode(frame.body)
             except Exception:
@@ -211,11 +215,31 @@ class Guest(Peer):
                 return
         self.on_tell(self._target(frame.to), frame, self.page if frame.number else None)
 
+    def _run(self, frame: frames.Run) -> None:
+        """Many such messages: decoded in one call."""
+        route = self.routes.get((frame.to, frame.name))
+        number, page = frame.first, self.page
+        if route is not None:
+            cell, _, decode = route
+            try:
+                messages = decode(frame.bodies)
+            except Exception:
+                route = None  # One of them: said below, with all names.
+            else:
+                admit = cell.admit
+                for message in messages:
+                    admit(cell, Arrived(message, None, number, page))
+                    number += 1
+                return
+        for body in _BODIES.decode(frame.bodies):
+            self._tell(frames.Tell(frame.to, frame.name, body, number))
+            number += 1
+
     def _ask(self, frame: frames.Ask) -> None:
         """The same for an ask that no turn waits for."""
         route = self.routes.get((frame.to, frame.name))
         if route is not None and frame.sender is None and not frame.chain:
-            cell, decode = route
+            cell, decode, _ = route
             try:
                 message = decode(frame.body)
             except Exception:

@@ -27,6 +27,10 @@ Coroutine_ = types.CoroutineType
 NIL = msgspec.msgpack.encode(None)
 
 
+Route = tuple["Cell", Callable[[Any], Any], Callable[[Any], Any]]
+"""Where messages of one type go, and what decodes one of them, or a run."""
+
+
 class Peer:
     """One end of a connection, with the asks that wait for the other end."""
 
@@ -36,7 +40,7 @@ class Peer:
         self.codec: Codec = node.codec
         self.pending: dict[int, Ask] = {}
         self._last_id = 0
-        self.routes: dict[tuple[frames.Name, frames.Name], tuple[Cell, Callable[[Any], Any]]] = {}
+        self.routes: dict[tuple[frames.Name, frames.Name], Route] = {}
         self.kinds_out: dict[type, int] = {}
         self.record_taker: Callable[[str], frames.TakeRecord] = no_records  # the recovery method's, by address
         self._record_takers: dict[frames.Name, frames.TakeRecord] = {}
@@ -158,7 +162,8 @@ class Peer:
         message = self.codec.message_in(cell, self.connection.name_in(frame.name), frame.body)
         if type(frame.name) is int and cell is self.node.root and not cell.host.takes_parcels:
             # Our own actor's class stays: so does the way in for this type.
-            self.routes[frame.to, frame.name] = cell, self.codec.decoder(type(message))
+            kind: Any = type(message)
+            self.routes[frame.to, frame.name] = cell, self.codec.decoder(kind), self.codec.decoder(list[kind])
         return message
 
     def _sender(self, name: frames.Name | None) -> Cell | None:

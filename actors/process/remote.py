@@ -60,7 +60,7 @@ class Outlet:
             worker.send_item(cell, self.path, item, number)
         else:  # A plain message of a type that was sent before: all names are numbers.
             connection = worker.connection
-            connection.send(frames.Tell(connection.name_out(self.path), name, item, number), self.path)
+            connection.tell(connection.name_out(self.path), name, item, number, self.path)  # type: ignore[arg-type]
         self.sent = number
         flight = self.flight
         flight.append((number, item))
@@ -386,8 +386,8 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_note(frame)
         case frames.Record():
             worker.on_record(frame)
-        case frames.Launch():
-            raise BadFrame("an actor process cannot launch actors here")
+        case frames.Launch() | frames.Run():
+            raise BadFrame(f"an actor process cannot send a {type(frame).__name__} here")
 
 
 def _target(node: Node, worker: Worker, to: frames.Name) -> Cell:

@@ -42,7 +42,7 @@ def busy(system: hf.ActorSystem, isolation: str, gate: Path) -> Busy:
         mailbox = hf.bounded(capacity, overflow=overflow)
         recovery = hf.hybrid() if isolation.startswith("recorded") else None
         where: Any = isolation.removeprefix("recorded ")
-        own = "task" if where == "subtree" else where
+        own: Any = "task" if where == "subtree" else where
         spec = hf.child("busy", hf.start(kind), isolation=own, mailbox=mailbox, recovery=recovery, shutdown=0.2)
         if where == "subtree":
             await system.start(hf.supervisor("team", children=[spec], isolation="process"))
@@ -60,7 +60,7 @@ def bound_of(ref: hf.ActorRef[Any]) -> Bound | HomeBound:
     home = getattr(ref._cell.host, "switch", None)
     bound = home.bound if home is not None else ref._cell.extra().bound
     assert bound is not None
-    return bound  # type: ignore[no-any-return]
+    return bound
 
 
 async def test_tell_is_refused_when_it_is_full(busy: Busy, gate: Path) -> None:
