@@ -25,7 +25,8 @@ from ..actors.topics import NOT_TAKEN
 from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
 from ..checkpoint.stores import open_journal
 from ..supervision.spec import ChildSpec, Flags
-from ..supervision.supervisor import DeleteChild, NoSuchChild, StartChild, Supervisor, TerminateChild
+from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
+from ..supervision.supervisor import Supervisor
 from .logs import LogSink
 
 A = TypeVar("A", bound=Actor)

@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 import pytest
 
 import holdfast as hf
-from holdfast.supervision.supervisor import RestartChild, TerminateChild
+from holdfast.supervision.admin import RestartChild, TerminateChild
 from tests.checkpoint.players import Dice, Do, Doer, Honest, Hooks, No, Note, Notes, Seen, Sink, Unsavable, until
 
 E = TypeVar("E", bound=hf.Event)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.supervision.supervisor import (
+from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
     ChildBusy,
@@ -118,10 +118,10 @@ async def test_what_does_not_fit_is_refused_by_type_and_changes_nothing() -> Non
         top = await begin(system, kid("up"), kid("down"))
         await top.ask(TerminateChild("down"))
         refusals: list[tuple[hf.Message[Any], hf.Refusal]] = [
-            (StartChild(kid("up")), AlreadyStarted("up")),
+            (StartChild(kid("up")), AlreadyStarted("up", system.ref("/app/top/up", Kid))),
             (StartChild(kid("down")), AlreadyPresent("down")),
-            (RestartChild("up"), ChildBusy("up")),
-            (DeleteChild("up"), ChildBusy("up")),
+            (RestartChild("up"), ChildBusy("up", "running")),
+            (DeleteChild("up"), ChildBusy("up", "running")),
             (TerminateChild("nobody"), NoSuchChild("nobody")),
             (RestartChild("nobody"), NoSuchChild("nobody")),
             (DeleteChild("nobody"), NoSuchChild("nobody")),
@@ -268,7 +268,7 @@ async def test_the_supervisor_answers_while_children_back_off() -> None:
             system.ref(f"/app/top/{name}", Kid).tell(Boom())
         await system.node.settled()
         assert await states(top) == {"x": "restarting", "y": "restarting"}
-        with pytest.raises(AlreadyStarted):
+        with pytest.raises(AlreadyPresent):
             await top.ask(StartChild(kid("x")))
         with pytest.raises(ChildBusy):
             await top.ask(RestartChild("x"))
