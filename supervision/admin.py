@@ -116,7 +116,7 @@ class StartChild(Message[Any]):
 
     spec: Any = None
     args: tuple[Any, ...] = ()
-    kwargs: dict[str, Any] = {}
+    kwargs: dict[str, Any] = msgspec.field(default_factory=dict[str, Any])
     id: str | None = None
 
     def __post_init__(self) -> None:

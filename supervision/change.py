@@ -89,7 +89,7 @@ def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> d
         if one.cell is not None and one.cell.state is not GONE:
             one.cell.spec = spec
             one.cell.extra().start = spec.start
-    return {**children, **{id: one for id, one in known.items() if id not in children}}
+    return {**children, **{name: one for name, one in known.items() if name not in children}}
 
 
 def check_place(where: str, specs: Iterable[ChildSpec], node: Node) -> None:

@@ -1,7 +1,8 @@
 """Dynamic supervisors: children come and go by request, each on its own. Elixir's DynamicSupervisor, in OTP's words.
 
-Differences from a supervisor with a list: it starts empty; only one_for_one; a child that is not restarted is forgotten;
-at the end all children are stopped at once; `max_children` bounds them; with a template each start gives arguments only.
+Differences from a supervisor with a list: it starts empty; only one_for_one; a child that is not restarted is
+forgotten; at the end all children are stopped at once; `max_children` bounds them; with a template each start gives
+arguments only.
 """
 
 from __future__ import annotations
@@ -203,8 +204,8 @@ def dynamic(
 
     Args:
         name: the last part of its address.
-        template: `child(None, start(Class, ...))`: every child is one of these, and `StartChild(args=...)` adds the rest
-            of its arguments; without one `StartChild` takes any child spec, or a bare `start(...)`.
+        template: `child(None, start(Class, ...))`: every child is one of these, and `StartChild(args=...)` adds the
+            rest of its arguments; without one `StartChild` takes any child spec, or a bare `start(...)`.
         max_children: how many there may be, those that are being restarted among them; None sets no limit.
         intensity: restarts allowed within `period` seconds; one more and it gives up.
         period: seconds, > 0.

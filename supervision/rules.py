@@ -7,7 +7,6 @@ import dataclasses
 import sys
 from typing import Literal, get_args
 
-from ..actors import exits
 from ..actors.errors import SpecError, type_name
 from ..actors.exits import Crash, ExitReason, OutOfMemory
 
@@ -47,8 +46,9 @@ def rule(reason: ExitReason | type[ExitReason] | type[BaseException] | str, acti
 
     >>> rule(ValueError, "stop").fits(Crash("ValueError", "boom"))
     True
-    >>> rule(exits.Signal, "escalate").fits(exits.KILLED)
-    False
+    >>> from holdfast.actors.exits import KILLED, Signal
+    >>> rule(Signal, "escalate").fits(KILLED), rule(Signal, "escalate").fits(Signal(9))
+    (False, True)
     """
     if action not in get_args(Action):
         raise SpecError("rule", f"the action must be one of {', '.join(get_args(Action))}, not {action!r}")

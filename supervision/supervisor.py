@@ -7,6 +7,7 @@ It decides in pure functions (`decisions.py`, `intensity.py`) and acts here. The
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections import deque
 from collections.abc import Coroutine
 from typing import Any, ClassVar
@@ -281,9 +282,12 @@ class Supervisor(Actor):
                     if one.spec.recovery is not None:
                         one.state = RECOVERING
                     one.up = up
-                    up.add_done_callback(lambda done: self._post(StartOver(one, done)))
+                    up.add_done_callback(functools.partial(self._started, one))
                     return
                 self._is_up(one)
+
+    def _started(self, one: Child, up: asyncio.Future[None]) -> None:
+        self._post(StartOver(one, up))
 
     def _attempt_failed(self, one: Child, error: HoldfastError, row: Row) -> None:
         """A child of the row did not start: the others are stopped, or stay up, until it is tried again."""

@@ -36,7 +36,8 @@ def supervisor(
         strategy: "one_for_one", "one_for_all" or "rest_for_one".
         intensity: restarts allowed within `period` seconds; one more and it gives up.
         period: seconds, > 0.
-        auto_shutdown: it ends when "any_significant" or "all_significant" children have ended by themselves, or "never".
+        auto_shutdown: it ends when "any_significant" or "all_significant" children have ended by themselves, or
+            "never".
         children: specs, in start order.
         restart, shutdown, significant, rules: as a child of its own supervisor.
         isolation: "process" puts the whole subtree into one OS process.

@@ -24,8 +24,8 @@ from ..actors.ref import ActorRef
 from ..actors.topics import NOT_TAKEN
 from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
 from ..checkpoint.stores import open_journal
-from ..supervision.spec import ChildSpec, Flags
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
+from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor
 from .logs import LogSink
 

@@ -12,8 +12,8 @@ import hypothesis.strategies as st
 from hypothesis import given, settings
 
 import holdfast as hf
-from holdfast.supervision.spec import Restart, Strategy
 from holdfast.supervision.admin import DeleteChild, RestartChild, StartChild, TerminateChild, WhichChildren
+from holdfast.supervision.spec import Restart, Strategy
 from holdfast.testing.clock import virtual_loop_factory
 
 STRATEGIES: tuple[Strategy, ...] = ("one_for_one", "one_for_all", "rest_for_one")
