@@ -15,7 +15,7 @@ from ..actors.process.limits import Limits
 from ..actors.ref import ActorRef
 from ..actors.values import state_digest
 from .admin import DeleteChild, NoPartitions, NotSupported, StartChild
-from .children import STOPPED, UP, Child
+from .children import STOPPED, Child
 from .spec import ChildSpec, Isolation, Plan, Restart, Shutdown, Strategy, check_spec, child
 from .supervisor import Supervisor
 from .tree import supervisor
@@ -73,15 +73,19 @@ class PartitionSupervisor(Supervisor):
         super()._take(plan)
         self._all = plan.children
 
+    def _specs(self) -> tuple[ChildSpec, ...]:
+        return self._all  # A temporary partition that has ended is still one.
+
     @on(Route, readonly=True)
-    def _route(self, message: Route) -> ActorRef[Any]:
+    def _route(self, message: Route) -> Any:
         """The partition of a key; while it is restarted, messages wait at its address."""
         if not self._now:
             raise NoPartitions(self.ctx.path)
-        one = self._children[str(partition_of(message.key, self._now))]
-        if one.cell is None or one.state == STOPPED:
-            return self.ctx.cell.node.cell_at(f"{self.ctx.path}/{one.spec.id}").ref
-        return one.cell.ref
+        try:
+            number = partition_of(message.key, self._now)
+        except HoldfastError as error:
+            return self._fail(error)
+        return self.ctx.cell.node.cell_at(f"{self.ctx.path}/{number}").ref
 
     @on(CountPartitions, readonly=True)
     def _count_partitions(self, message: CountPartitions) -> int:
@@ -104,7 +108,7 @@ class PartitionSupervisor(Supervisor):
         for number in range(before, message.count):
             one = self._partition(number)
             try:
-                if one.state != UP:
+                if one.state == STOPPED:
                     await self._start(one)
             except HoldfastError as error:
                 self._give_up_address(one, "it could not be started")
