@@ -95,6 +95,7 @@ from holdfast.supervision.admin import (
     WhichChildren,
 )
 from holdfast.supervision.backoff import Backoff
+from holdfast.supervision.config import load_tree, tree_from
 from holdfast.supervision.dynamic import DynamicSupervisor, dynamic
 from holdfast.supervision.partition import (
     CountPartitions,
@@ -214,6 +215,7 @@ __all__ = [
     "dynamic",
     "fresh",
     "hybrid",
+    "load_tree",
     "on",
     "partition_of",
     "partitions",
@@ -222,4 +224,5 @@ __all__ = [
     "start",
     "subscribe",
     "supervisor",
+    "tree_from",
 ]
