@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 from ..actors.actor import Actor, Start
 from ..actors.errors import HoldfastError, SpecError
@@ -18,6 +18,8 @@ from .rules import rule
 from .spec import ChildSpec, child
 from .tree import supervisor
 
+T = TypeVar("T")
+
 START = ("start", "args", "kwargs")
 """What makes a recipe in a table; all other keys of a child are options of `child`."""
 
@@ -27,8 +29,8 @@ def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
 
     A table is a child (`id`, `start = "package.module:Class"`, `args`, `kwargs`, and the options of `child`), or a
     supervisor (`name`, `children` and the options of `supervisor`; with `kind = "dynamic"` or `"partitions"` those of
-    `dynamic` and `partitions`, whose `template` and `copy` are tables too). `recovery` is a table with `use`, the name of
-    a method such as `"holdfast:hybrid"`, and its options.
+    `dynamic` and `partitions`, whose `template` and `copy` are tables too). `recovery` is a table with `use`, the name
+    of a method such as `"holdfast:hybrid"`, and its options.
 
     Args:
         mapping: the table of the top supervisor.
@@ -123,7 +125,7 @@ def _rules(value: object, where: str) -> list[Any]:
     ]
 
 
-def _call(make: Callable[..., Any], options: dict[str, Any], where: str) -> Any:
+def _call(make: Callable[..., T], options: dict[str, Any], where: str) -> T:
     """Make it, and say where it went wrong; unknown and missing options are found by the call itself."""
     try:
         return make(**options)
@@ -160,4 +162,4 @@ def _table(value: object, where: str) -> dict[str, Any]:
 def _list(value: object, where: str) -> Sequence[Any]:
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise SpecError(where, f"must be a list, not {value!r}")
-    return cast("Sequence[Any]", value)
+    return value  # type: ignore[no-any-return,unused-ignore]

@@ -115,7 +115,7 @@ class Bank(hf.Supervisor):
     def init(self) -> hf.Plan:
         type(self).asked += 1
         if Bank.answer is not None:
-            return Bank.answer(self.branches)  # type: ignore[no-any-return]
+            return Bank.answer(self.branches)
         children = [named(f"branch{number}", str(number)) for number in range(self.branches)]
         return hf.Plan(children, strategy="one_for_all", intensity=self.branches)
 

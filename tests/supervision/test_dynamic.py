@@ -31,8 +31,8 @@ class Adder(hf.Actor):
         raise ValueError("boom")
 
 
-async def begin(system: hf.ActorSystem, **options: Any) -> hf.ActorRef[hf.DynamicSupervisor]:
-    return await system.start(hf.dynamic("top", **{"intensity": 9, **options}))
+async def begin(system: hf.ActorSystem, *, intensity: int = 9, **options: Any) -> hf.ActorRef[hf.DynamicSupervisor]:
+    return await system.start(hf.dynamic("top", intensity=intensity, **options))
 
 
 async def test_it_starts_empty_and_takes_specs_and_bare_starts() -> None:
@@ -153,10 +153,11 @@ async def test_terminate_forgets_and_a_second_time_there_is_nobody() -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await begin(system)
         ref = await top.ask(hf.StartChild(hf.start(Adder)))
-        for call in (hf.RestartChild("adder-1"), hf.DeleteChild("adder-1")):
+        calls: list[hf.Message[Any]] = [hf.RestartChild("adder-1"), hf.DeleteChild("adder-1")]
+        for call in calls:
             assert isinstance(await refused(top.ask(call)), hf.NotSupported)
         await top.ask(hf.TerminateChild("adder-1"))
-        for call in (hf.TerminateChild("adder-1"), hf.RestartChild("adder-1"), hf.DeleteChild("adder-1")):
+        for call in [hf.TerminateChild("adder-1"), *calls]:
             assert await refused(top.ask(call)) == hf.NoSuchChild("adder-1")
         with pytest.raises(hf.ActorStopped):
             await ref.ask(Sum())
@@ -306,3 +307,35 @@ async def test_children_in_processes_and_a_whole_pool_in_a_process() -> None:
         assert "cannot hold process children" in str(error)
         again = await refused(remote.ask(hf.StartChild(hf.child("first", hf.start(Adder)))))
         assert again == hf.AlreadyStarted("first", first)
+
+
+class Hire(hf.Message[str]):
+    at: hf.ActorRef[hf.Actor]
+    how: str
+
+
+class Boss(hf.Actor):
+    """Lives in a process, and asks a supervisor elsewhere for workers."""
+
+    @hf.on(Hire)
+    async def hire(self, message: Hire) -> str:
+        if message.how == "spec":
+            ask = hf.StartChild(hf.child("w", hf.start(Adder, 1)))
+        else:
+            ask = hf.StartChild(args=(1, 2), id="w")
+        try:
+            ref = await message.at.ask(ask)
+        except hf.SpecError as error:
+            return str(error)
+        return f"{ref.path} {await ref.ask(Sum())}"
+
+
+async def test_an_actor_in_a_process_starts_from_a_template_but_sends_no_code() -> None:
+    """Nothing that comes from a process is imported or made in the root, so its specs are not opened there."""
+    async with hf.ActorSystem(log=False) as system:
+        boss = await system.start(hf.child("boss", hf.start(Boss), isolation="process"))
+        plain = await begin(system)
+        assert "from an actor process is not taken here" in await boss.ask(Hire(plain, "spec"))
+        assert await plain.ask(hf.WhichChildren()) == []
+        pool = await system.start(hf.dynamic("pool", template=hf.child(None, hf.start(Adder))))
+        assert await boss.ask(Hire(pool, "args")) == "/app/pool/w 3"

@@ -124,7 +124,8 @@ async def test_there_are_never_more_than_at_the_start(count: int) -> None:
     async with hf.ActorSystem(log=False) as system:
         top = await begin(system)
         error = await refused(top.ask(hf.ResizePartitions(count)))
-        assert isinstance(error, hf.SpecError) and "from 0 to 4" in str(error)
+        assert isinstance(error, hf.SpecError)
+        assert "from 0 to 4" in str(error)
         assert await top.ask(hf.CountPartitions()) == 4
 
 

@@ -10,7 +10,8 @@ from tests.supervision.family import Boom, Family, Leave, Plan, kid, refused
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
-ANY, ALL, NEVER = "any_significant", "all_significant", "never"
+ANY: AutoShutdown = "any_significant"
+ALL: AutoShutdown = "all_significant"
 
 
 def significant(plan: Plan, id: str, restart: Restart = "transient", **options: Any) -> hf.ChildSpec:
