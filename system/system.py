@@ -173,7 +173,7 @@ class ActorSystem:
         return self._node
 
     async def start(self, spec: ChildSpec) -> ActorRef[Any]:
-        """Start a child of the root, and wait until it is up.
+        """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
         Raises:
             StartFailed: naming the actor and why. AlreadyStarted, AlreadyPresent: the id is in use.
