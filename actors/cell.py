@@ -18,6 +18,7 @@ from .ref import ActorRef
 if TYPE_CHECKING:
     from .actor import Actor, Start
     from .context import ActorContext
+    from .errors import StartFailed
     from .loop import Suspended
     from .mailbox import Bound
     from .node import Node
@@ -89,6 +90,7 @@ class More:
         "outlet",
         "reason",
         "start",
+        "start_error",
         "starting",
         "stash",
         "tasks",
@@ -111,6 +113,7 @@ class More:
         self.outlet: Any = None  # the way into another process (process.remote.Outlet)
         self.reason: ExitReason = SHUTDOWN
         self.start: Start[Any] | None = None
+        self.start_error: StartFailed | None = None  # why `on_start` of this life failed; told when it has ended
         self.starting: asyncio.Future[None] | None = None  # whoever waits for `on_start` of this life waits for it
         self.stash: deque[Any] | None = None
         self.tasks: set[asyncio.Task[Any]] = set()

@@ -13,6 +13,8 @@ HoldfastError
 ├── Quarantined          the message ended its actor's process again and again
 ├── ReplayDiverged       a replayed turn released something else than before
 ├── StartFailed          an actor could not be started
+│   └── StartIgnored     it did not want to be started, which is no failure
+├── Ignore               raised by an actor that does not want to be started
 ├── NameTaken            a living actor has this name already
 ├── NoSuchActor          nobody lives at this address
 ├── WrongActor           another class lives at this address
@@ -183,6 +185,30 @@ class StartFailed(HoldfastError):
 
     def __str__(self) -> str:
         return f"{self.actor} could not be started: {self.reason}"
+
+
+class StartIgnored(StartFailed):
+    """An actor did not want to be started (it raised `Ignore`): to a supervisor that is no failure."""
+
+    def __init__(self, actor: str, reason: str = "") -> None:
+        super().__init__(actor, reason)
+
+    def __str__(self) -> str:
+        return f"{self.actor} does not want to be started{f': {self.reason}' if self.reason else ''}"
+
+
+class Ignore(HoldfastError):
+    """Raised in an actor's `__init__` or `on_start`: do not start me, and that is no failure.
+
+    Its supervisor keeps the spec of a permanent or transient child, without a life, and drops that of a temporary one.
+    """
+
+    def __init__(self, why: str = "") -> None:
+        super().__init__(why)
+        self.why = why
+
+    def __str__(self) -> str:
+        return self.why or "not to be started"
 
 
 class NameTaken(HoldfastError):

@@ -26,8 +26,9 @@ from ..checkpoint.controller import RecordedProcessHost, TaskHost
 from ..checkpoint.homes import Homes
 from ..checkpoint.stores import open_journal
 from ..checkpoint.subtree import SubtreeHost
+from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.spec import ChildSpec, Flags
-from ..supervision.supervisor import DeleteChild, NoSuchChild, StartChild, Supervisor, TerminateChild
+from ..supervision.supervisor import Supervisor
 from .logs import LogSink
 
 A = TypeVar("A", bound=Actor)
@@ -177,7 +178,7 @@ class ActorSystem:
         return self._node
 
     async def start(self, spec: ChildSpec) -> ActorRef[Any]:
-        """Start a child of the root, and wait until it is up.
+        """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
         Raises:
             StartFailed: naming the actor and why. AlreadyStarted, AlreadyPresent: the id is in use.

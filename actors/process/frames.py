@@ -70,10 +70,11 @@ class Launch(Frame, tag=5):
 
 
 class Launched(Frame, tag=6):
-    """The actor is up, or (`problem`) is not."""
+    """The actor is up, or (`problem`) is not; `ignored`: it did not want to be."""
 
     id: int
     problem: str = ""
+    ignored: bool = False
 
 
 class Ended(Frame, tag=7):

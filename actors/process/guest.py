@@ -15,7 +15,7 @@ import uvloop
 
 from .. import exits, lives
 from ..cell import RUNNING, Cell
-from ..errors import HoldfastError, StartFailed
+from ..errors import HoldfastError, StartFailed, StartIgnored
 from ..events import ActorStarted, Event, event_data
 from ..exits import ExitReason, pack_exit
 from ..message import message_name
@@ -121,6 +121,7 @@ class Guest(Peer):
         self.ended: asyncio.Future[int] = loop.create_future()
         self.recovery: Any = None  # the recovery method's side in this process, if it has one
         self._launcher = launcher
+        self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}
         self._host = OutsideHost(self)
@@ -278,22 +279,25 @@ class Guest(Peer):
                 self._beat(float(limits["beat"]))
             up = self._launcher(self, cell, frame)
         except Exception as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
-            self._launched(frame.id, error.reason if isinstance(error, StartFailed) else str(exits.crash(error)))
+            self._launched(frame.id, error)
             return
         if up is None:
-            self._launched(frame.id, "")
+            self._launched(frame.id, None)
         else:
-            up.add_done_callback(lambda done: self._on_up(frame.id, done))
+            self._starting = frame.id, up
+            up.add_done_callback(lambda done: self._on_up())
 
-    def _on_up(self, key: int, done: asyncio.Future[None]) -> None:
-        error = done.exception()
+    def _on_up(self) -> None:
+        """Tell how the start went, once; it may be over before the loop calls back."""
+        if self._starting is not None and self._starting[1].done():
+            (key, done), self._starting = self._starting, None
+            self._launched(key, done.exception())
+
+    def _launched(self, key: int, error: BaseException | None) -> None:
         if isinstance(error, StartFailed):
-            self._launched(key, error.reason)
+            self.connection.send(frames.Launched(key, error.reason, isinstance(error, StartIgnored)))
         else:
-            self._launched(key, "" if error is None else str(error))
-
-    def _launched(self, key: int, problem: str) -> None:
-        self.connection.send(frames.Launched(key, problem))
+            self.connection.send(frames.Launched(key, "" if error is None else str(exits.crash(error))))
 
     def _command(self, cell: Cell, frame: frames.Command) -> None:
         if frame.verb == "bind":
@@ -305,6 +309,7 @@ class Guest(Peer):
 
     def report_end(self, cell: Cell, reason: ExitReason | None) -> None:
         """The process's own actor has ended: tell why, and end with it."""
+        self._on_up()
         told = pack_exit(reason if reason is not None else exits.SHUTDOWN)
         self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
         self.connection.close()

@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from ..cell import Cell
-from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed
+from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed, StartIgnored
 from ..events import LogLine, ProcessDied, ProcessStarted
 from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpack_exit
 from ..mail import Ask
@@ -141,8 +141,9 @@ class Worker(Peer):
         up = self._launches.get(frame.id)
         if up is None or up.done():
             return
-        if frame.problem:
-            up.set_exception(StartFailed(self.cell.path if self.cell is not None else "", frame.problem))
+        if frame.ignored or frame.problem:
+            kind = StartIgnored if frame.ignored else StartFailed
+            up.set_exception(kind(self.cell.path if self.cell is not None else "", frame.problem))
         else:
             up.set_result(None)
 

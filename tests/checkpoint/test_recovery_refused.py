@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.supervision.supervisor import RestartChild, TerminateChild
+from holdfast.supervision.admin import RestartChild, TerminateChild
 from tests.checkpoint.players import Dice, Do, Doer, Honest, Note, Notes, Seen, until
 from tests.checkpoint.strikes import NEVER, doer, event, let_through, sink, strike, struck
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.supervision.supervisor import DeleteChild, RestartChild, TerminateChild
+from holdfast.supervision.admin import DeleteChild, RestartChild, TerminateChild
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, until
 
 NEVER = 3600.0
