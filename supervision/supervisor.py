@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-import random
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
@@ -139,7 +138,7 @@ class Supervisor(Actor):
         self._flags = flags
         self._children: dict[str, Child] = {spec.id: Child(spec) for spec in children}
         self._restarts: tuple[float, ...] = ()
-        self._rng = random.Random()
+        self._rng = self.ctx.random  # of the node's seed: a run can be repeated
 
     # -- start ------------------------------------------------------------------------------------------------------
 

@@ -5,10 +5,13 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
+from ..actors.cell import Host
 from ..actors.errors import HoldfastError
 from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
 from ..actors.exits import Exited, Hung, OutOfMemory, Signal
+from ..supervision.spec import ChildSpec
 from ..system.system import ActorSystem
+from .clock import RealTimeNeeded, VirtualClockLoop
 from .leaks import Leaks
 from .sends import SendChecks
 
@@ -77,6 +80,11 @@ class GuardedSystem(ActorSystem):
         self.node.events.add_sink(self._note)
         self._checks = SendChecks(self.node)
         return self
+
+    def _host_for(self, spec: ChildSpec) -> Host:
+        if spec.isolation == "process" and isinstance(self.node.loop, VirtualClockLoop):
+            raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")
+        return super()._host_for(spec)
 
     async def shutdown(self) -> None:
         # What is still queued when the test is over was never waited for: its end is no news.

@@ -86,7 +86,9 @@ class SendChecks(TurnWatcher):
             same = False
         if not same:
             was = self.node.codec.decode(type(sent.message), sent.body)
-            self._mutated.append(f"  from {sent.sender} to {cell.path}: sent {was!r}, after its turn it was {message!r}")
+            self._mutated.append(
+                f"  from {sent.sender} to {cell.path}: sent {was!r}, after its turn it was {message!r}"
+            )
 
     def problem(self) -> str | None:
         """The mutated messages, as text."""

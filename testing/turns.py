@@ -13,6 +13,7 @@ from ..actors import loop as run_loop
 from ..actors.cell import Cell
 from ..actors.loop import RunLoop, Suspended
 from ..actors.mail import Handler, Table
+from ..actors.message import Message
 from .swaps import Swaps
 
 Substitute = Callable[[Handler], Handler]
@@ -52,15 +53,14 @@ class Watched:
         return True
 
     def _run_one(self, original: Callable[[Cell, int], bool], cell: Cell, item: Any) -> bool:
-        substitutes = [made for watcher in self.watchers if (made := watcher.begins(cell, item)) is not None]
-        table = cell.table
-        if substitutes:
-            cell.table = own = SubstituteTable(table, substitutes)
-            try:
+        made = [made for watcher in self.watchers if (made := watcher.begins(cell, item)) is not None]
+        if made:
+            with Swaps() as swaps:
+                # A bare message is looked up in its cell's table; what carries one looks it up in its actor's.
+                owner: Any = cell if isinstance(item, Message) else cell.actor
+                name = "table" if owner is cell else "_table"
+                swaps.put(owner, name, SubstituteTable(getattr(owner, name), made))
                 goes_on = original(cell, 1)
-            finally:
-                if cell.table is own:
-                    cell.table = table
         else:
             goes_on = original(cell, 1)
         turn = cell.more.turn if cell.more is not None else None
@@ -80,7 +80,7 @@ class Watched:
 
 
 class SubstituteTable(Table):
-    """A cell's table for the length of one turn: whatever is handled is handled by the substitutes."""
+    """A table for the length of one turn: the handlers of messages are substituted."""
 
     def __init__(self, table: Table, substitutes: list[Substitute]) -> None:
         super().__init__()
@@ -88,8 +88,9 @@ class SubstituteTable(Table):
 
     def __getitem__(self, kind: type) -> Handler:
         handler = self._table[kind]
-        for substitute in self._substitutes:
-            handler = substitute(handler)
+        if issubclass(kind, Message):
+            for substitute in self._substitutes:
+                handler = substitute(handler)
         return handler
 
     def __contains__(self, kind: object) -> bool:
