@@ -1,8 +1,8 @@
 """The idle barrier: wait until nothing can happen any more by itself, instead of sleeping and hoping.
 
-Idle means: no actor is on the run queue, every task of the loop waits for something that nobody here is about to do, and
-each actor process has handled what it was sent and said what it had to say. What is left then needs time to pass (a
-timer, a deadline) or something from outside.
+Idle means: no actor is on the run queue, every task of the loop waits for something that nobody here is about to do,
+and each actor process has handled what it was sent and said what it had to say. What is left then needs time to pass
+(a timer, a deadline) or something from outside.
 """
 
 from __future__ import annotations
@@ -92,16 +92,16 @@ def _could_go_on(task: asyncio.Task[Any]) -> bool:
 
 async def _hear(system: ActorSystem) -> bool:
     """One round trip through each actor process. Returns whether anything moved, or may have."""
-    workers = list(system._workers.by_cell.values())
     moved = bool(_waiting(system))
-    for worker in workers:
-        before = worker.page[1] if not worker.connection.is_open else await _ping(worker)
-        moved = moved or before
+    for worker in list(system._workers.by_cell.values()):
+        moved |= await _ping(worker)
     return moved or bool(_busy(system.node))
 
 
 async def _ping(worker: Worker) -> bool:
     """Everything the process said before its answer has been taken in when this returns. Whether it said anything."""
+    if not worker.connection.is_open:
+        return True  # It has ended, and what follows from that is still to come.
     counter = FrameCounter(worker)
     try:
         key, answered = worker.acceptance()

@@ -24,9 +24,9 @@ def damaged(value: Any, draw: random.Random) -> Any:
         case float():
             return -value if value else 1.0
         case str():
-            return _one_changed(value, draw, lambda one: chr(ord(one) ^ 1)) if value else "\x00"
+            return "".join(map(chr, _one_flipped([ord(one) for one in value], draw)))
         case bytes():
-            return bytes(_one_changed(list(value), draw, lambda one: one ^ 1)) if value else b"\x00"
+            return bytes(_one_flipped(list(value), draw))
         case msgspec.Struct():
             return _damaged_struct(value, draw)
         case list() | tuple():
@@ -37,10 +37,12 @@ def damaged(value: Any, draw: random.Random) -> Any:
             return value
 
 
-def _one_changed(value: Any, draw: random.Random, change: Any) -> Any:
-    index = draw.randrange(len(value))
-    middle = change(value[index])
-    return value[:index] + (middle if isinstance(value, str) else [middle]) + value[index + 1 :]
+def _one_flipped(codes: list[int], draw: random.Random) -> list[int]:
+    """The lowest bit of one of the codes is flipped; without any there is one now."""
+    if not codes:
+        return [0]
+    index = draw.randrange(len(codes))
+    return [*codes[:index], codes[index] ^ 1, *codes[index + 1 :]]
 
 
 def _one_damaged(parts: list[Any], draw: random.Random) -> list[Any]:

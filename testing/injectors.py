@@ -64,7 +64,8 @@ class Admission:
     def __init__(self, strikes: Strikes, original: Any) -> None:
         self._strikes, self._original = strikes, original
         self._held: deque[tuple[Cell, Any]] = deque()  # by a reordering: they come after the next message
-        self._late: dict[asyncio.TimerHandle, tuple[Cell, Any]] = {}
+        self._late: dict[int, tuple[Cell, Any]] = {}
+        self._last = 0
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`."""
@@ -90,12 +91,14 @@ class Admission:
             self._admit_late(*self._held.popleft())
 
     def _delay(self, cell: Cell, item: Any) -> None:
-        def come() -> None:
-            del self._late[handle]
-            self._admit_late(cell, item)
+        self._last += 1
+        self._late[self._last] = cell, item
+        cell.node.loop.call_later(self._strikes.seconds, self._come, self._last)
 
-        handle = cell.node.loop.call_later(self._strikes.seconds, come)
-        self._late[handle] = cell, item
+    def _come(self, key: int) -> None:
+        waiting = self._late.pop(key, None)  # None: the faults have ended meanwhile.
+        if waiting is not None:
+            self._admit_late(*waiting)
 
     def _corrupt(self, item: Any) -> Any:
         message = damaged(message_of(item), self._strikes.draw)
@@ -117,8 +120,7 @@ class Admission:
     def end(self) -> None:
         """What is still on its way arrives now."""
         late, self._late = self._late, {}
-        for handle, waiting in late.items():
-            handle.cancel()
+        for waiting in late.values():
             self._admit_late(*waiting)
         while self._held:
             self._admit_late(*self._held.popleft())

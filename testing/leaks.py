@@ -43,7 +43,7 @@ class Leaks:
         return [repr(task) for task in self._new_tasks()]
 
     def _new_tasks(self) -> set[asyncio.Task[object]]:
-        return asyncio.all_tasks() - self._tasks - {asyncio.current_task()}  # type: ignore[arg-type]
+        return asyncio.all_tasks() - self._tasks - {asyncio.current_task()}
 
     def processes(self) -> list[str]:
         """Child processes that did not end in time; they are killed."""

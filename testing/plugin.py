@@ -8,21 +8,39 @@ before coverage begins to measure.
 from __future__ import annotations
 
 import asyncio
+import importlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import pytest
-
-try:
-    import pytest_asyncio
-except ImportError:  # The plugin is loaded wherever holdfast is installed; only its fixtures need pytest-asyncio.
-    pytest_asyncio = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
     from .guarded import Guard, GuardedSystem
     from .probes import Probe
 
     ActorSystems = Callable[..., Awaitable[GuardedSystem]]
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def async_fixture(function: Function) -> Function:
+    """A fixture by pytest-asyncio. The plugin is loaded wherever holdfast is installed; only its fixtures need that."""
+    try:
+        made = importlib.import_module("pytest_asyncio").fixture
+    except ImportError:
+        made = _missing
+    return cast("Function", made(function))
+
+
+def _missing(function: Callable[..., Any]) -> Any:
+    """In place of an async fixture, where there is no pytest-asyncio."""
+
+    @pytest.fixture(name=function.__name__)
+    def missing() -> None:
+        pytest.fail("the fixtures of holdfast need pytest-asyncio: pip install 'holdfast[testing]'", pytrace=False)
+
+    return missing
+
 
 LOOPS = ("uvloop", "asyncio")
 EXPECTABLE = ("dead_letters", "crashes", "leaks", "sends")
@@ -116,48 +134,40 @@ class Wanted:
             system.expect_sends()
 
 
-if pytest_asyncio is not None:
+@async_fixture
+async def actor_guard(request: pytest.FixtureRequest) -> AsyncIterator[Guard]:
+    """The systems of one test, and the look at what they leave."""
+    from .guarded import Guard
 
-    @pytest_asyncio.fixture
-    async def actor_guard(request: pytest.FixtureRequest) -> AsyncIterator[Guard]:
-        """The systems of one test, and the look at what they leave."""
-        from .guarded import Guard
+    guard = Guard(leaks=not Wanted(request).leaks)
+    yield guard
+    await guard.close()
 
-        guard = Guard(leaks=not Wanted(request).leaks)
-        yield guard
-        await guard.close()
 
-    @pytest.fixture
-    def actor_systems(actor_guard: Guard, request: pytest.FixtureRequest) -> ActorSystems:
-        """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
-        from .guarded import GuardedSystem
+@pytest.fixture
+def actor_systems(actor_guard: Guard, request: pytest.FixtureRequest) -> ActorSystems:
+    """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
+    from .guarded import GuardedSystem
 
-        wanted = Wanted(request)
+    wanted = Wanted(request)
 
-        async def start(name: str = "app", **options: Any) -> GuardedSystem:
-            system = await actor_guard.start(GuardedSystem(name, **{**wanted.options, **options}))
-            wanted.tell(system)
-            return system
+    async def start(name: str = "app", **options: Any) -> GuardedSystem:
+        system = await actor_guard.start(GuardedSystem(name, **{**wanted.options, **options}))
+        wanted.tell(system)
+        return system
 
-        return start
+    return start
 
-    @pytest_asyncio.fixture
-    async def actor_system(actor_systems: ActorSystems) -> GuardedSystem:
-        """A running system of the test's own, on the test's loop; it ends with the test."""
-        return await actor_systems()
 
-    @pytest.fixture
-    def probe(actor_system: GuardedSystem) -> Probe:
-        """A probe in `actor_system`."""
-        from .probes import probe
+@async_fixture
+async def actor_system(actor_systems: ActorSystems) -> GuardedSystem:
+    """A running system of the test's own, on the test's loop; it ends with the test."""
+    return await actor_systems()
 
-        return probe(actor_system)
 
-else:
+@pytest.fixture
+def probe(actor_system: GuardedSystem) -> Probe:
+    """A probe in `actor_system`."""
+    from .probes import probe
 
-    @pytest.fixture
-    def actor_system() -> None:
-        """A running system; needs pytest-asyncio."""
-        pytest.fail("the fixtures of holdfast need pytest-asyncio: pip install 'holdfast[testing]'", pytrace=False)
-
-    actor_systems = probe = actor_system
+    return probe(actor_system)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeVar, cast, overload
@@ -66,6 +67,7 @@ class Exit(NamedTuple):
 
 
 Heard = Received | Down | Exit
+S = TypeVar("S", Down, Exit)
 
 
 class Anything(Table):
@@ -212,7 +214,7 @@ class Probe:
         Raises:
             Unexpected: something else came, or nothing within `timeout` seconds.
         """
-        return cast("Down", await self._signal(Down, "DOWN", ref, reason, timeout))
+        return await self._signal(Down, "DOWN", ref, reason, timeout)
 
     async def expect_exit(
         self, ref: ActorRef[Any], reason: ExitReason | type[ExitReason] | None = None, *, timeout: float = TIMEOUT
@@ -222,12 +224,12 @@ class Probe:
         Raises:
             Unexpected: something else came, or nothing within `timeout` seconds.
         """
-        return cast("Exit", await self._signal(Exit, "EXIT", ref, reason, timeout))
+        return await self._signal(Exit, "EXIT", ref, reason, timeout)
 
-    async def _signal(self, kind: type[Any], word: str, ref: ActorRef[Any], reason: Any, timeout: float) -> Heard:
+    async def _signal(self, kind: type[S], word: str, ref: ActorRef[Any], reason: Any, timeout: float) -> S:
         name = f"{word} of {ref.path}" + ("" if reason is None else f" for {_reason_name(reason)}")
         heard = await self._next(name, timeout)
-        if not isinstance(heard, kind) or heard.ref != ref or not _has_reason(heard, reason):  # type: ignore[union-attr]
+        if not isinstance(heard, kind) or heard.ref != ref or not _has_reason(heard, reason):
             raise self._unexpected(name, heard)
         return heard
 
@@ -279,7 +281,7 @@ class Probe:
         """Ask from the probe; the reply comes back here, not into the probe."""
         return self._context().run(ref.ask, message, timeout)
 
-    def _context(self) -> Any:
+    def _context(self) -> contextvars.Context:
         ctx = self.ref._cell.ctx
         if ctx is None:
             raise HoldfastError(f"{self.path} has stopped")

@@ -1,8 +1,8 @@
 """Checks of what is sent, in tests only: each message has the types it declares, and nobody mutates it afterwards.
 
-A message is shared by its sender and its receivers, and in process nothing copies it: a list in it that is changed after
-the send changes under the receiver's hands (and not for one in another process). So it is encoded when it is sent, and
-again when its turn is over.
+A message is shared by its sender and its receivers, and in process nothing copies it: a list in it that is changed
+after the send changes under the receiver's hands (and not for one in another process). So it is encoded when it is
+sent, and again when its turn is over.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from ..actors.node import Node, message_of
 from ..actors.ref import ActorRef, current
 from .swaps import Swaps
 from .turns import TurnWatcher, watch_turns
-
 
 MOST = 10_000
 """Messages on their way that are kept for the comparison; of more, the oldest are forgotten."""

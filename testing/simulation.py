@@ -127,7 +127,7 @@ def simulate(
 
     fixtures = [parameter for name, parameter in wanted.items() if name not in own]
     run.__signature__ = inspect.Signature(fixtures)  # type: ignore[attr-defined]  # what pytest looks for fixtures in
-    del run.__wrapped__  # type: ignore[attr-defined]  # else pytest-asyncio and checkers see the async function
+    del run.__wrapped__  # else pytest-asyncio and checkers see the async function
     return run
 
 
@@ -159,7 +159,8 @@ def run_seed(
 
 
 async def _run(test: Any, simulation: Simulation, faults: Faults, own: set[str], options: dict[str, Any]) -> None:
-    system = GuardedSystem(**{"seed": simulation.seed, **options})
+    options = {"seed": simulation.seed, **options}
+    system = GuardedSystem(**options)
     try:
         async with system:
             simulation.install(system)

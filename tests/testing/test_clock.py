@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from holdfast.testing.clock import NothingToWaitFor, VirtualClockLoop, virtual as virtual_loop
+from holdfast.testing.clock import NothingToWaitFor, VirtualClockLoop
+from holdfast.testing.clock import virtual as virtual_loop
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 

@@ -1,4 +1,4 @@
-"""The pytest plugin, seen from outside: each test here runs a small test suite of a user's in a directory of its own."""
+"""The pytest plugin, seen from outside: each test runs a small test suite of a user's in a directory of its own."""
 
 import sys
 
@@ -301,10 +301,10 @@ def test_without_pytest_asyncio_the_plugin_loads_and_its_fixtures_say_what_they_
     pytester: pytest.Pytester,
 ) -> None:
     pytester.makeconftest(CONFTEST)
-    pytester.makepyfile("def test_a(actor_system): pass\ndef test_b(): pass")
+    pytester.makepyfile(test_them="def test_a(actor_system): pass\ndef test_b(): pass")
+    pytester.makepyfile(pytest_asyncio="raise ImportError('as if it were not installed')")
     script = pytester.makepyfile(
-        run_it="import sys\nsys.modules['pytest_asyncio'] = None\nimport pytest\n"
-        "sys.exit(pytest.main(['-p', 'no:asyncio', '-p', 'no:cacheprovider']))"
+        run_it="import pytest, sys; sys.exit(pytest.main(['-p', 'no:asyncio', '-p', 'no:cacheprovider', 'test_them.py']))"
     )
     done = pytester.runpython(script)
     done.assert_outcomes(passed=1, errors=1)
@@ -315,6 +315,7 @@ def test_loading_the_plugin_imports_no_other_module_of_testing(pytester: pytest.
     done = pytester.run(
         sys.executable,
         "-c",
-        "import sys, holdfast.testing.plugin; print(sorted(m for m in sys.modules if m.startswith('holdfast.testing')))",
+        "import sys, holdfast.testing.plugin\n"
+        "print(sorted(name for name in sys.modules if name.startswith('holdfast.testing')))",
     )
     assert done.outlines == ["['holdfast.testing', 'holdfast.testing.plugin']"]

@@ -1,4 +1,4 @@
-"""Deterministic simulation: the same seed gives the same run, another one another order, and a failure names its seed."""
+"""Deterministic simulation: a seed gives the same run each time, another one another; a failure names its seed."""
 
 import asyncio
 
