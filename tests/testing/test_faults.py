@@ -96,8 +96,9 @@ async def test_the_end_puts_everything_back(counter: Ref, faults: Faults) -> Non
     cell = counter._cell
     admit, table = cell.admit, cell.table
     run_turns = loop.run_turns
-    for at, odds in (("admit", {"drop": 1.0}), ("turn begin", {"crash": 1.0}), ("reply", {"drop": 1.0})):
-        faults.on(counter, at=at, **odds)
+    faults.on(counter, at="admit", drop=1.0)
+    faults.on(counter, at="turn begin", crash=1.0)
+    faults.on(counter, at="reply", drop=1.0)
     faults.end()
     faults.end()
     assert (cell.admit, cell.table, loop.run_turns) == (admit, table, run_turns)
@@ -302,7 +303,8 @@ async def test_frame_crash_and_corrupt_lose_nothing_of_a_recorded_actor(
 ) -> None:
     actor_system.expect_crashes()
     ref = await in_process(actor_system, recovery=hf.hybrid())
-    async with faults.on(ref, at=at, **{kind: 1.0}, after=2, times=1) as strikes:
+    odds: Any = {kind: 1.0}
+    async with faults.on(ref, at=at, after=2, times=1, **odds) as strikes:
         assert [await ref.ask(Add(1), 60.0) for _ in range(5)] == [1, 2, 3, 4, 5]
         assert len(strikes.struck) == 1
     assert ref._cell.life == 2
@@ -335,7 +337,8 @@ async def test_frame_delay_keeps_the_order(actor_system: GuardedSystem, faults: 
 async def test_process_start_is_tried_again(actor_system: GuardedSystem, faults: Faults, kind: str) -> None:
     actor_system.expect_crashes()
     ref = await in_process(actor_system)
-    async with faults.on(actor_system, at="process start", **{kind: 1.0}, seconds=0.05, times=1) as strikes:
+    odds: Any = {kind: 1.0}
+    async with faults.on(actor_system, at="process start", seconds=0.05, times=1, **odds) as strikes:
         ref.kill()
         assert await ref.ask(Add(2), timeout=60.0) == 2
         assert len(strikes.struck) == 1

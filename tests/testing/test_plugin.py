@@ -304,7 +304,8 @@ def test_without_pytest_asyncio_the_plugin_loads_and_its_fixtures_say_what_they_
     pytester.makepyfile(test_them="def test_a(actor_system): pass\ndef test_b(): pass")
     pytester.makepyfile(pytest_asyncio="raise ImportError('as if it were not installed')")
     script = pytester.makepyfile(
-        run_it="import pytest, sys; sys.exit(pytest.main(['-p', 'no:asyncio', '-p', 'no:cacheprovider', 'test_them.py']))"
+        run_it="import pytest, sys\n"
+        "sys.exit(pytest.main(['-p', 'no:asyncio', '-p', 'no:cacheprovider', 'test_them.py']))"
     )
     done = pytester.runpython(script)
     done.assert_outcomes(passed=1, errors=1)
