@@ -18,8 +18,9 @@ from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
 from ..actors import loop as run_loop
-from ..actors.cell import Cell
+from ..actors.cell import NEXT_URGENT, Cell
 from ..actors.node import message_of
+from ..checkpoint.life import Fed
 from .clock import virtual
 from .faults import Faults
 from .guarded import GuardedSystem
@@ -86,8 +87,19 @@ class Simulation(TurnWatcher):
         return self._ticks
 
     def begins(self, cell: Cell, item: Any) -> None:
-        message = message_of(item)
-        self.trace.append((cell.path, type(item if message is None else message).__name__))
+        self.trace.append((cell.path, _told(cell, item)))
+
+
+def _told(cell: Cell, item: Any) -> str:
+    """What a turn handles, in a word or two."""
+    if item is NEXT_URGENT:
+        commands = cell.more.urgent if cell.more is not None else None
+        item = commands[0] if commands else item
+    elif isinstance(item, Fed):
+        feed = item.feed
+        return feed.name.rpartition(":")[2] or feed.kind
+    message = message_of(item)
+    return type(item if message is None else message).__name__
 
 
 def simulate(

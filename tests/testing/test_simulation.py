@@ -218,6 +218,38 @@ def test_two_actors_that_never_come_to_rest_do_not_stop_the_clock() -> None:
     echo()
 
 
+class Hop(hf.Message):
+    left: int
+    to: hf.ActorRef
+
+
+class Hopper(hf.Actor):
+    @hf.on(Hop)
+    def hop(self, message: Hop) -> None:
+        if message.left:
+            message.to.tell(Hop(message.left - 1, self.ctx.ref))
+
+
+def test_where_the_run_loop_pauses_is_the_seeds_too() -> None:
+    """A long run is cut into slices, between which the tasks of the program go on: not where the machine wants it."""
+
+    def pauses(seed: int) -> list[int]:
+        seen: list[int] = []
+
+        async def run(system: GuardedSystem, simulation: Simulation) -> None:
+            one, other = (system.spawn(hf.start(Hopper)) for _ in range(2))
+            one.tell(Hop(3000, other))
+            while len(simulation.trace) < 3000:
+                await asyncio.sleep(0)
+                seen.append(len(simulation.trace))
+
+        run_seed(run, seed, {"system", "simulation"}, {})
+        return seen
+
+    assert pauses(1) == pauses(1) != pauses(2)
+    assert len(pauses(1)) > 5
+
+
 def test_a_run_that_cannot_go_on_names_its_seed() -> None:
     async def stuck(system: GuardedSystem) -> None:
         await asyncio.Event().wait()
