@@ -47,8 +47,8 @@ async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
     """Wait until nothing is queued and nothing that runs could go on.
 
     Args:
-        system: a running one. Its actors in processes of their own are asked for a round trip each; of a whole subtree
-            in a process only the turns of its supervisor are known.
+        system: a running one. Its actors in processes of their own are asked for a round trip each; of a subtree in a
+            process only the turns of its supervisor are known, and what an actor there tells itself is not.
         timeout: seconds on the loop's clock, > 0. Turns that wait for time or for the outside are not waited for here,
             but those in other processes are: nobody sees from here what they wait for.
 

@@ -159,7 +159,6 @@ class FaultyReply:
         ask = self._ask
         match self._strikes.next(reply):
             case "drop":
-                ask.started = True
                 return
             case "delay":
                 ask.future = self._real  # The next time it is the reply itself.
@@ -285,6 +284,7 @@ class FrameFaults:
         self._strikes, self._cell = strikes, cell
         self._held: deque[Callable[[], None]] = deque()  # by a delay: order is kept, so all that follows waits too
         self._handle: asyncio.TimerHandle | None = None
+        self._struck_down: Worker | None = None  # it ends, but not in this instant: nothing more strikes it
         self.swaps = Swaps()
 
     def install(self, worker: Worker) -> None:
@@ -310,7 +310,8 @@ class FrameFaults:
 
     def _pass(self, worker: Worker, frame: Any, go: Callable[[], None]) -> None:
         """One frame passes, or what becomes of it."""
-        kind = self._strikes.next(frame) if isinstance(frame, CARRIERS) else None
+        counts = isinstance(frame, CARRIERS) and worker is not self._struck_down
+        kind = self._strikes.next(frame) if counts else None
         if kind == "delay" and self._handle is None:
             self._handle = self._cell.node.loop.call_later(self._strikes.seconds, self.let_go)
         if self._handle is not None:
@@ -321,10 +322,12 @@ class FrameFaults:
             if self._strikes.at == "frame out":
                 worker.connection._forget_names(frame)
         elif kind == "corrupt":
+            self._struck_down = worker
             self._corrupt(worker)
         else:
             go()
             if kind == "crash":
+                self._struck_down = worker
                 worker.connection.flush()
                 worker.forked.kill(signal.SIGKILL)
 

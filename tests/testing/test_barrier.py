@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 import holdfast as hf
-from holdfast.testing import GuardedSystem, NotIdle, Probe, advance, idle
+from holdfast.testing import Faults, GuardedSystem, NotIdle, Probe, advance, idle
 from tests.testing.players import Add, Counter, Linger, Tell, Total
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
@@ -87,6 +87,16 @@ async def test_processes_have_handled_everything_and_said_what_they_had_to_say(
     assert probe.waiting == (Add(1),) * 3
     assert [cell.more.outlet is not None for cell in actor_system._workers.by_cell if cell.more] == [True, True]
     assert [await ref.ask(Total()) for ref in far] == [1, 3]
+
+
+async def test_what_a_process_has_said_and_is_still_on_its_way_is_waited_for(
+    actor_system: GuardedSystem, probe: Probe
+) -> None:
+    far = await actor_system.start(hf.child("far", hf.start(Counter), isolation="process"))
+    async with Faults(1).on(far, at="frame in", delay=1.0, seconds=0.05, times=1):
+        far.tell(Tell(probe.ref))
+        await idle(actor_system)
+        assert probe.waiting == (Add(1),)
 
 
 async def test_a_process_that_dies_meanwhile_is_no_hindrance(actor_system: GuardedSystem, probe: Probe) -> None:

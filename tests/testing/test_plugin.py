@@ -213,6 +213,23 @@ async def test_mutates(actor_system):
     )
 
 
+def test_a_message_that_several_get_is_compared_after_each_turn(suite) -> None:
+    result = suite("""
+class Reader(hf.Actor):
+    @hf.on(Many)
+    def read(self, message):
+        pass
+
+async def test_mutates(actor_system):
+    message = Many([1])
+    for kind in (Reader, Counter):
+        actor_system.spawn(hf.start(kind), kind.__name__).tell(message)
+    await actor_system.node.settled()
+""")
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines(["*from the test to /app/Counter: sent Many(items=[[]1])*"])
+
+
 def test_a_message_that_is_mutated_by_its_sender_is_found(suite) -> None:
     result = suite("""
 class Reader(hf.Actor):

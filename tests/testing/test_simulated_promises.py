@@ -1,6 +1,6 @@
 """What is promised of messages and supervisors, under many orders and faults: each seed is another run.
 
-Actors in processes of their own are killed in `tests/checkpoint/test_campaign.py`; here all is in one process and exact.
+Actors in processes of their own are killed in `tests/checkpoint/test_campaign.py`; here all is in one process, exactly.
 """
 
 import asyncio

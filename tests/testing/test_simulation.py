@@ -142,6 +142,22 @@ def test_an_order_that_never_comes_in_production_comes_in_simulation() -> None:
     assert firsts == {"/app/a", "/app/b", "/app/c"}
 
 
+def test_one_turn_and_the_next_actor_is_drawn() -> None:
+    """In production an actor with a full mailbox handles many messages before the next one runs."""
+
+    async def run(system: GuardedSystem) -> None:
+        for name in "ab":
+            log = system.spawn(hf.start(Log), name)
+            for _ in range(4):
+                log.tell(Note(name))
+        await idle(system)
+
+    orders = {"".join(path[-1] for path, what in run_seed(run, seed, {"system"}, {}).trace if what == "Note")
+              for seed in range(30)}  # fmt: skip
+    assert any(order not in ("aaaabbbb", "bbbbaaaa") for order in orders)
+    assert len(orders) > 10
+
+
 @simulate(seeds=5)
 async def test_it_is_a_decorator_for_tests(system: GuardedSystem, simulation: Simulation, tmp_path) -> None:
     """And other fixtures still come."""
