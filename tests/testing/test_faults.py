@@ -330,7 +330,7 @@ async def test_frame_delay_keeps_the_order(actor_system: GuardedSystem, faults: 
     ref = await in_process(actor_system)
     async with faults.on(ref, at=at, delay=1.0, seconds=0.05, times=1) as strikes:
         began = now()
-        replies = [ref.ask(Add(1), 60.0) for _ in range(3)]
+        replies = [ref.ask(Linger(0.005), 60.0) for _ in range(3)]  # They arrive one by one, in the same buffer.
         assert [await reply for reply in replies] == [1, 2, 3]
         assert now() - began >= 0.05
     assert len(strikes.struck) == 1

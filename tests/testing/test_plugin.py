@@ -137,8 +137,15 @@ async def test_crashes(actor_system):
 
 def test_what_is_queued_when_the_test_ends_is_no_dead_letter(suite) -> None:
     suite("""
+class Slow(hf.Actor):
+    @hf.on(Add)
+    async def add(self, message):
+        await asyncio.sleep(0.05)
+
 async def test_does_not_wait(actor_system):
-    actor_system.spawn(hf.start(Counter)).tell(Add(1))
+    slow = actor_system.spawn(hf.start(Slow))
+    for _ in range(3):
+        slow.tell(Add(1))
 """).assert_outcomes(passed=1)
 
 

@@ -146,6 +146,9 @@ def test_one_turn_and_the_next_actor_is_drawn() -> None:
     """In production an actor with a full mailbox handles many messages before the next one runs."""
 
     async def run(system: GuardedSystem) -> None:
+        quick = system.spawn(hf.start(Log), "quick")
+        for _ in range(10):
+            await quick.ask(Read())  # The run loop lengthens what it lets one actor do, while all are quick.
         for name in "ab":
             log = system.spawn(hf.start(Log), name)
             for _ in range(4):
