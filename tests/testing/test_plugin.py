@@ -1,5 +1,6 @@
 """The pytest plugin, seen from outside: each test runs a small test suite of a user's in a directory of its own."""
 
+import os
 import sys
 
 import pytest
@@ -319,6 +320,24 @@ async def test_process(actor_system):
         holdfast_loops="asyncio",
     )
     result.assert_outcomes(passed=1)
+
+
+def test_the_entry_point_and_a_conftest_that_names_the_plugin_go_together(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it is once the package is installed; where it is already, this changes nothing."""
+    installed = pytester.mkdir("installed")
+    metadata = installed / "holdfast_plugin-1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: holdfast-plugin\nVersion: 1\n")
+    (metadata / "entry_points.txt").write_text("[pytest11]\nholdfast = holdfast.testing.plugin\n")
+    monkeypatch.setenv("PYTHONPATH", f"{installed}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    pytester.makeconftest(CONFTEST)
+    pytester.makepyfile("import pytest\n@pytest.mark.asyncio\nasync def test_it(probe): assert probe.waiting == ()")
+    done = pytester.runpytest_subprocess("-p", "no:cacheprovider", "--trace-config")
+    done.assert_outcomes(passed=1)
+    registered = [line for line in done.outlines if "PLUGIN registered" in line and "holdfast.testing.plugin" in line]
+    assert len(registered) == 1
 
 
 def test_without_pytest_asyncio_the_plugin_loads_and_its_fixtures_say_what_they_need(
