@@ -15,7 +15,7 @@ from hypothesis import given, settings
 
 import holdfast as hf
 from holdfast.supervision.spec import AutoShutdown, Restart, Strategy
-from holdfast.testing.clock import virtual_loop_factory
+from holdfast.testing.clock import virtual
 
 STRATEGIES: tuple[Strategy, ...] = ("one_for_one", "one_for_all", "rest_for_one")
 RESTARTS: tuple[Restart, ...] = ("permanent", "transient", "temporary")
@@ -220,7 +220,7 @@ steps = st.lists(st.tuples(st.sampled_from(ACTIONS), st.integers(0, 30), st.inte
 @given(shape=shapes, steps=steps)
 @settings(max_examples=150)
 def test_a_tree_behaves_as_the_model_says(shape: Shape, steps: list[tuple[Action, int, int]]) -> None:
-    with asyncio.Runner(loop_factory=virtual_loop_factory) as runner:
+    with asyncio.Runner(loop_factory=virtual) as runner:
         runner.run(live(dataclasses.replace(shape, restart="temporary", wants_significant=False), steps))
 
 
