@@ -77,7 +77,7 @@ class HomeBound:
                 return False
             case "drop_oldest":
                 self._drop(keep=self.capacity - 1)
-            case "latest":
+            case _:  # the latest only
                 self._drop(keep=0)
         return True
 

@@ -23,6 +23,7 @@ from .records import (
     FAILED,
     REPLY,
     Answer,
+    Begin,
     Feed,
     Go,
     Live,
@@ -32,6 +33,7 @@ from .records import (
     Restore,
     Snapshot,
     SnapshotNow,
+    Started,
     ToHome,
     ToLife,
     TurnEnd,
@@ -135,6 +137,8 @@ class Life:
             case Restore():
                 self._has_state = True
                 self._state.append(record.data)
+            case Begin() | Started():
+                pass  # for whoever begins lives
 
     def _take(self, feed: Feed) -> None:
         cell = self.cell

@@ -48,6 +48,7 @@ from .records import (
     START,
     STASHED,
     Answer,
+    Closed,
     Go,
     Live,
     Out,
@@ -60,6 +61,7 @@ from .records import (
     ToLife,
     TurnEnd,
     Unsaved,
+    Wanted,
     pieces,
 )
 from .saved import cut, load
@@ -391,6 +393,8 @@ class Switch:
                     self._pipe_done(record)
                 case Unsaved():
                     self.node.emit(SnapshotFailed(self.path, record.problem))
+                case Wanted() | Closed():
+                    pass  # for whoever begins lives
         except ReplayDiverged as error:
             self.diverged = error
             self.node.emit(RecoveryFailed(self.path, str(error)))
