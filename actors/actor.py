@@ -135,6 +135,11 @@ class Actor:
     def on_recovered(self) -> Any:
         """State and messages are back; called before new messages are let in."""
 
+    async def _stop_children(self) -> None:
+        """The life ends: its children go first, newest first."""
+        for child in reversed(list((self.ctx.cell.children or {}).values())):
+            await child.node.stop_child(child)
+
 
 def _check(cls: type, name: str, handler: Any, kind: type) -> None:
     """Refuse a handler whose message annotation contradicts `@on`, when the class is made."""

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from .context import ActorContext
     from .control.calls import Call
     from .control.tap import Tap
+    from .errors import StartFailed
     from .loop import Suspended
     from .mailbox import Bound
     from .node import Node
@@ -103,6 +104,7 @@ class More:
         "outlet",
         "reason",
         "start",
+        "start_error",
         "starting",
         "stash",
         "suspended",
@@ -127,6 +129,7 @@ class More:
         self.outlet: Any = None  # the way into another process (process.remote.Outlet)
         self.reason: ExitReason = SHUTDOWN
         self.start: Start[Any] | None = None
+        self.start_error: StartFailed | None = None  # why `on_start` of this life failed; told when it has ended
         self.starting: asyncio.Future[None] | None = None  # whoever waits for `on_start` of this life waits for it
         self.stash: deque[Any] | None = None
         self.suspended = False

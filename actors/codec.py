@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 MAX_BYTES = 16 * 1024 * 1024
 """The largest message, in bytes of payload."""
 
-REF, ARRAY, EXTENSIONS = 1, 2, (1, 2)
+REF, ARRAY, PACKED, EXTENSIONS = 1, 2, 3, (1, 2, 3)
 
 Raw = msgspec.Raw
 
@@ -46,6 +46,25 @@ class Parcel:
 
     def __repr__(self) -> str:
         return f"<Parcel {self.name} {len(self.body)} bytes>"
+
+
+class Packable(Protocol):
+    """A value that makes its own bytes; they come out as `Packed`, which nobody opens by accident."""
+
+    def packed(self) -> bytes: ...
+
+
+class Packed:
+    """A value that came packed. Whoever it is for decides whether its sender may have it opened."""
+
+    __slots__ = ("data",)
+
+    def __init__(self, data: bytes) -> None:
+        self.data = data
+
+    def packed(self) -> bytes:
+        """As it came."""
+        return self.data
 
 
 class Codec:
@@ -132,6 +151,8 @@ class Codec:
             return ActorRef[Any](self._cell_at(str(data, "utf-8")))
         if code == ARRAY:
             return decode_array(data)
+        if code == PACKED:
+            return Packed(bytes(data))
         raise msgspec.ValidationError(f"unknown extension {code}")
 
     # -- errors -----------------------------------------------------------------------------------------------------
@@ -165,6 +186,9 @@ def encode_special(value: Any) -> Any:
     """Refs and arrays as extensions; anything else is refused by name."""
     if isinstance(value, ActorRef):
         return msgspec.msgpack.Ext(REF, value.path.encode())
+    if hasattr(value, "packed"):
+        packable: Packable = value
+        return msgspec.msgpack.Ext(PACKED, packable.packed())
     numpy = sys.modules.get("numpy")
     if numpy is not None:
         if isinstance(value, numpy.ndarray):
@@ -178,9 +202,14 @@ def encode_array(array: Any) -> bytes:
     """dtype, shape and the elements in C order, in one copy."""
     if array.dtype.hasobject:
         raise TypeError("a numpy array of objects cannot be sent")
-    head = msgspec.msgpack.encode((array.dtype.str if array.dtype.names is None else array.dtype.descr, array.shape))
     elements = array.reshape(-1).view("u1") if array.flags.c_contiguous else array.tobytes()
-    return b"".join((len(head).to_bytes(4, "little"), head, elements))
+    return b"".join((array_head(array), elements))
+
+
+def array_head(array: Any) -> bytes:
+    """What stands before the elements."""
+    head = msgspec.msgpack.encode((array.dtype.str if array.dtype.names is None else array.dtype.descr, array.shape))
+    return len(head).to_bytes(4, "little") + head
 
 
 def decode_array(data: memoryview) -> Any:

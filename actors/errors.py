@@ -14,12 +14,16 @@ HoldfastError
 ├── Quarantined          the message ended its actor's process again and again
 ├── ReplayDiverged       a replayed turn released something else than before
 ├── StartFailed          an actor could not be started
+│   └── StartIgnored     it did not want to be started, which is no failure
+├── Ignore               raised by an actor that does not want to be started
 ├── ControlFailed        an order to a live actor could not be carried out; the actor is as before
 │   └── NotSuspended     the order is for suspended actors only
 ├── NameTaken            a living actor has this name already
 ├── NoSuchActor          nobody lives at this address
 ├── WrongActor           another class lives at this address
 ├── SpecError            a child specification is not valid
+├── UnsavableValue       a value that no snapshot can hold
+├── DamagedValue         saved bytes that cannot be read
 ├── ProcessUnavailable   no OS process could be had
 ├── TreeFailed           the root supervisor gave up
 └── Refusal              a handler's typed "no" (`message.py`)
@@ -197,6 +201,30 @@ class StartFailed(HoldfastError):
         return f"{self.actor} could not be started: {self.reason}"
 
 
+class StartIgnored(StartFailed):
+    """An actor did not want to be started (it raised `Ignore`): to a supervisor that is no failure."""
+
+    def __init__(self, actor: str, reason: str = "") -> None:
+        super().__init__(actor, reason)
+
+    def __str__(self) -> str:
+        return f"{self.actor} does not want to be started{f': {self.reason}' if self.reason else ''}"
+
+
+class Ignore(HoldfastError):
+    """Raised in an actor's `__init__` or `on_start`: do not start me, and that is no failure.
+
+    Its supervisor keeps the spec of a permanent or transient child, without a life, and drops that of a temporary one.
+    """
+
+    def __init__(self, why: str = "") -> None:
+        super().__init__(why)
+        self.why = why
+
+    def __str__(self) -> str:
+        return self.why or "not to be started"
+
+
 class ControlFailed(HoldfastError):
     """An order to a live actor could not be carried out; the actor goes on as before."""
 
@@ -258,6 +286,31 @@ class SpecError(HoldfastError):
 
     def __str__(self) -> str:
         return f"{self.where}: {self.problem}"
+
+
+class UnsavableValue(HoldfastError):
+    """A value that no snapshot can hold: `where` is the path to it, `problem` what sits there."""
+
+    def __init__(self, where: str, problem: str) -> None:
+        super().__init__(where, problem)
+        self.where, self.problem = where, problem
+
+    def __str__(self) -> str:
+        return (
+            f"{self.where}: {self.problem} cannot be saved; make it a key variable of a supported type, "
+            "name it with a leading underscore, or define get_state/set_state"
+        )
+
+
+class DamagedValue(HoldfastError):
+    """Saved bytes that cannot be read: cut short, altered, of another format, or of a class that is no longer there."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(problem)
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return f"a saved value cannot be read: {self.problem}; use an older one"
 
 
 class ProcessUnavailable(HoldfastError):

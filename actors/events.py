@@ -60,6 +60,31 @@ class ChildRestarted(Event, frozen=True, eq=False):
     attempt: int
 
 
+class ChildTerminated(Event, frozen=True, eq=False):
+    """A child ended by itself: told of every end of a permanent child, and of abnormal ends of the others."""
+
+    reason: ExitReason
+
+
+class ChildStartFailed(Event, frozen=True, eq=False):
+    """A supervisor could not start a child; `reason` is its exit reason in words."""
+
+    reason: str
+
+
+class ShutdownError(Event, frozen=True, eq=False):
+    """A child that was told to stop ended for another reason than it was told; the shutdown went on."""
+
+    reason: ExitReason
+
+
+class AutoShutdown(Event, frozen=True, eq=False):
+    """A supervisor ends because its significant children have."""
+
+    child: str
+    reason: ExitReason
+
+
 class SupervisorGaveUp(Event, frozen=True, eq=False):
     """A supervisor reached its restart intensity."""
 

@@ -9,16 +9,16 @@ from __future__ import annotations
 import asyncio
 import contextvars
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from . import exits, links, mailbox
 from .actor import Actor
 from .cell import DOWN, ENDING, GONE, RUNNING, Cell
 from .context import ActorContext
-from .errors import AskFailed, StartFailed, remote_crash
+from .errors import AskFailed, Ignore, StartFailed, StartIgnored, remote_crash
 from .events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
-from .exits import KILLED, SHUTDOWN, ExitReason
+from .exits import KILLED, NORMAL, SHUTDOWN, ExitReason
 from .mail import LEAVE, Ask, Item
 from .message import Refusal
 from .ref import current
@@ -71,8 +71,9 @@ class LocalHost:
         mailbox.queue_of(cell).append(item)
         cell.schedule()
 
-    def offer(self, cell: Cell, item: Any) -> None:
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         cell.admit(cell, item)
+        return None
 
     def control(self, cell: Cell, call: Call) -> None:
         if call.is_urgent:
@@ -122,7 +123,7 @@ def begin(
         None if the life is up now; else a future that ends with `on_start` (StartFailed if that raises).
 
     Raises:
-        StartFailed: `__init__` raised.
+        StartFailed: `__init__` raised. StartIgnored: it raised `Ignore`.
     """
     cell.life += 1
     build(cell, start, context_type)
@@ -160,9 +161,11 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
         if cell.more is not None:
             _undo(cell)
         cell.actor = cell.ctx = None
-        reason = exits.crash(error)
+        reason = NORMAL if isinstance(error, Ignore) else exits.crash(error)
         if cell.more is not None:
             cell.more.reason = reason
+        if isinstance(error, Ignore):
+            raise StartIgnored(cell.path, error.why) from error
         raise StartFailed(cell.path, str(reason)) from error
     if cell.more is not None and cell.more.tap is not None:
         cell.more.tap.attach()
@@ -207,8 +210,12 @@ class FirstTurn(Item):
             self.started.set_result(None)
 
     def undelivered(self, cell: Cell, reason: str) -> None:
+        self.fail_start(StartFailed(cell.path, reason))
+
+    def fail_start(self, error: StartFailed) -> None:
+        """Whoever waits for the start hears of it."""
         if not self.started.done():
-            self.started.set_exception(StartFailed(cell.path, reason))
+            self.started.set_exception(error)
             self.started.exception()  # Seen: if nobody waits for it, asyncio need not complain.
 
 
@@ -248,16 +255,28 @@ class Kill(Item):
 
 def crash(cell: Cell, item: Any, error: BaseException) -> None:
     """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
+    if isinstance(error, Ignore) and isinstance(item, FirstTurn):  # No crash: it does not want to live.
+        start_fails(cell, item, StartIgnored(cell.path, error.why))
+        finish(cell, NORMAL)
+        return
     reason = exits.crash(error)
     fail = getattr(item, "fail", None)
     if fail is not None:
         fail(remote_crash(error))
     elif isinstance(item, FirstTurn):
-        item.undelivered(cell, str(reason))
+        start_fails(cell, item, StartFailed(cell.path, str(reason)))
     node = cell.node
     if node.watched:
         node.emit(ActorCrashed(cell.path, cell.life, reason, item))
     finish(cell, reason)
+
+
+def start_fails(cell: Cell, item: FirstTurn, error: StartFailed) -> None:
+    """`on_start` has failed: who waits hears of it when the life is over, for only then can the next one begin."""
+    if cell.more is None:
+        item.fail_start(error)
+    else:
+        cell.more.start_error = error
 
 
 def killed(cell: Cell) -> None:
@@ -295,11 +314,10 @@ def _wind_down(cell: Cell, reason: ExitReason, farewell: Any) -> None:
 
 
 async def _farewell(cell: Cell, reason: ExitReason) -> None:
-    """Stop the children, newest first, then say good-bye."""
-    for child in reversed(list((cell.children or {}).values())):
-        await child.node.stop_child(child)
+    """Stop the children, then say good-bye."""
     actor = cell.actor
     assert actor is not None
+    await actor._stop_children()
     try:
         result = actor.on_stop(reason)
         if asyncio.iscoroutine(result):
@@ -342,19 +360,21 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     """The life is over: undo what it had, tell who wants to know, and pass the address on."""
     cell.state = DOWN
     cell.scheduled = True
-    ctx = cell.ctx
+    more, ctx = cell.more, cell.ctx
+    if more is not None:
+        more.reason = reason
     if ctx is not None:
         ctx.close()
     actor = cell.actor
     if actor is not None and type(actor).on_undelivered is not Actor.on_undelivered:
         cell.extra().last = actor  # It may yet be handed what was queued.
     cell.actor = cell.ctx = cell.context = None
-    more = cell.more
     if more is not None:
-        more.reason = reason
         starting, more.starting = more.starting, None
+        error, more.start_error = more.start_error, None
         if starting is not None and not starting.done():
-            starting.set_exception(StartFailed(cell.path, str(reason)))
+            starting.set_exception(error or StartFailed(cell.path, str(reason)))
+            starting.exception()  # Seen: a supervisor may have given up this start meanwhile.
         _undo(cell)
     if cell.spec is not None and cell.parent is not None:
         if more is not None:

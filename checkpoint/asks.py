@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ..actors.cell import Cell
 from ..actors.codec import Parcel
-from ..actors.errors import BadMessage
-from ..actors.mail import ReplyHandle
+from ..actors.errors import AskTimeout, BadMessage, HoldfastError
+from ..actors.mail import Ask, ReplyHandle
 from ..actors.process.relay import RelayedAsk
 from .inputs import Batch
-from .records import REPLY, Answer, Out
+from .records import REPLY, Answer, Out, Outcome
 
 if TYPE_CHECKING:
     from .switch import Switch
+
+
+ACCEPTED = Answer(REPLY, "", msgspec.msgpack.encode(None))
 
 
 class Over:
@@ -75,4 +80,71 @@ class SwitchAsk(RelayedAsk, eq=False):
         if not self.is_over:
             self.is_over = True
             self.future = OVER  # Not itself any more: a cycle would keep the message until the next collection.
-            self.switch.outcome(self.turn, self.k, answer, batch)
+            self.switch.calls.outcome(self.turn, self.k, answer, batch)
+
+
+def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:
+    """Hand an encoded outcome to whoever asks from outside recorded turns."""
+    if isinstance(ask, RelayedAsk):
+        if answer.kind == REPLY:
+            ask.answer_raw(answer.body)
+        else:
+            ask.fail_raw(answer.kind, answer.name, answer.body)
+        return
+    codec = home.node.codec
+    if answer.kind != REPLY:
+        ask.fail(codec.decode_error(answer.kind, answer.name, answer.body))
+        return
+    try:
+        reply = codec.decode_reply(type(ask.message), answer.body)
+    except msgspec.DecodeError as error:
+        ask.fail(HoldfastError(f"the reply of {home.path} does not fit its type: {error}"))
+    else:
+        ask.answer(reply)
+
+
+class Calls:
+    """What the turns of one home have asked and sent, and wait for."""
+
+    def __init__(self, home: Switch) -> None:
+        self._home = home
+        self.asks: dict[tuple[int, int], SwitchAsk] = {}
+        self.sends: set[tuple[int, int]] = set()  # whose receivers have no room yet
+        self.outcomes: dict[tuple[int, int], Answer] = {}  # since the last snapshot
+
+    def join(self, verb: str, turn: int, k: int) -> None:
+        """An ask or send that was made before the crash: answered from the journal, or when its pending call is."""
+        answer = self.outcomes.get((turn, k))
+        if answer is None and verb == "send":
+            answer = None if (turn, k) in self.sends else ACCEPTED
+        elif answer is None and (turn, k) not in self.asks:
+            # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
+            answer = Answer(*self._home.node.codec.encode_error(AskTimeout("(unknown since the restart)", 0.0, None)))
+        if answer is not None and self._home.port is not None:
+            self._home.port.to_life(Outcome(turn, k, answer))
+
+    def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
+        """An ask of ours has its outcome: journal it, then tell the turn that waits."""
+        own = batch if batch is not None else Batch()
+        self.asks.pop((turn, k), None)
+        if turn > self._home.state_turn:  # Else it will not be replayed.
+            self.outcomes[turn, k] = answer
+            entry = ("got", turn, k, answer.kind, answer.name, answer.body)
+            own.add(self._home.path, entry, self._home.positions_of(turn))
+        own.after.append(lambda: self._tell(turn, k, answer))
+        if batch is None:
+            own.commit(self._home.journal)
+
+    def accepted(self, turn: int, k: int) -> None:
+        """A `send` of ours was accepted. (Not journaled: under replay it is accepted unless it still waits.)"""
+        self.sends.discard((turn, k))
+        self._tell(turn, k, ACCEPTED)
+
+    def refused(self, turn: int, k: int, error: HoldfastError, batch: Batch | None = None) -> None:
+        """A `send` of ours was not."""
+        self.sends.discard((turn, k))
+        self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), batch)
+
+    def _tell(self, turn: int, k: int, answer: Answer) -> None:
+        if self._home.port is not None:
+            self._home.port.to_life(Outcome(turn, k, answer))

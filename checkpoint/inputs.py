@@ -5,40 +5,37 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 
+import msgspec
+
 from ..actors.mail import Ask
 from .journal import Entry, Journal
 from .records import TICK, Feed
 
+OVERHEAD = 200
+"""Bytes an input is counted with besides its payload."""
 EXPIRED = 1e-9
 """A deadline that has passed. (Asks forget theirs when they expire.)"""
 
 
-class Input:
-    """One journaled input."""
+NO_POSITIONS: list[int] = []
+"""Of an input that is nowhere in a journal. Never added to: those that are get a list of their own."""
 
-    __slots__ = (
-        "ask",
-        "body",
-        "chain",
-        "deliveries",
-        "id",
-        "kind",
-        "name",
-        "origin",
-        "positions",
-        "sender",
-        "time",
-        "turn",
-    )
 
-    def __init__(self, id: int, kind: str, name: str, body: bytes, when: float, sender: str | None) -> None:
-        self.id, self.kind, self.name, self.body, self.time, self.sender = id, kind, name, body, when, sender
-        self.ask: Ask | None = None
-        self.chain: tuple[tuple[str, int], ...] = ()
-        self.turn = 0  # the turn that ended it
-        self.deliveries = 0  # deaths of the process in this very turn
-        self.origin = ""  # the timer or pipe it comes from
-        self.positions: list[int] = []
+class Input(msgspec.Struct, gc=False, eq=False):
+    """One journaled input. (Not seen by the garbage collector: there can be many, and nothing here refers back.)"""
+
+    id: int
+    kind: str
+    name: str
+    body: bytes
+    time: float
+    sender: str | None
+    ask: Ask | None = None
+    chain: tuple[tuple[str, int], ...] = ()
+    turn: int = 0  # the turn that ended it
+    deliveries: int = 0  # deaths of the process in this very turn
+    origin: str = ""  # the timer or pipe it comes from
+    positions: list[int] = NO_POSITIONS
 
     def feed(self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False) -> Feed:
         """As the life gets it; what has begun is finished whatever its deadline."""
@@ -51,13 +48,12 @@ class Input:
         )  # fmt: skip
 
 
-class Turn:
+class Turn(msgspec.Struct, gc=False, eq=False):
     """One ended turn since the last snapshot."""
 
-    __slots__ = ("digests", "input", "status")
-
-    def __init__(self, source: Input, status: str, digests: list[int]) -> None:
-        self.input, self.status, self.digests = source, status, digests
+    input: Input
+    status: str
+    digests: list[int]
 
 
 class TimerState:

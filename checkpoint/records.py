@@ -7,8 +7,12 @@ reports each turn's outputs and outcome. Payloads stay encoded in between.
 from __future__ import annotations
 
 import zlib
+from typing import Any
 
 import msgspec
+
+from ..actors.mailbox import Bounded
+from .method import Method
 
 # Kinds of inputs: every call into user code that may change state.
 MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
@@ -98,7 +102,27 @@ class Restore(msgspec.Struct, array_like=True, tag=5):
     data: bytes
 
 
-ToLife = Feed | Outcome | Go | SnapshotNow | Restore
+class Begin(msgspec.Struct, array_like=True, tag=6):
+    """The life that was wanted as `number` begins now, as the `life`th at its address, with the state that came before.
+
+    `slot` is its place on the page that outlives the process.
+    """
+
+    number: int
+    life: int
+    turn: int
+    stash: list[int]
+    slot: int
+
+
+class Started(msgspec.Struct, array_like=True, tag=7):
+    """The start that was wanted as `number` has come to its end: a good one, or (`problem`) not."""
+
+    number: int
+    problem: str = ""
+
+
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------
@@ -157,7 +181,24 @@ class Unsaved(msgspec.Struct, array_like=True, tag=16):
     problem: str
 
 
-ToHome = Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved
+class Wanted(msgspec.Struct, array_like=True, tag=17):
+    """A supervisor in another process wants to start a recorded child, whose home is at the root."""
+
+    number: int
+    kind: str
+    topics: list[str]
+    method: Method
+    bound: Bounded | None
+
+
+class Closed(msgspec.Struct, array_like=True, tag=18):
+    """The life that was wanted as `number` is over, or its start is given up."""
+
+    number: int
+    reason: dict[str, Any]
+
+
+ToHome = Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed
 
 PIECE = 4 * 1024 * 1024
 """Bytes of state per record, so that a large state does not hold up everything else."""

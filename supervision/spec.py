@@ -2,36 +2,56 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
+import inspect
 from collections.abc import Iterable, Mapping
 from typing import Any, Literal, TypeGuard, get_args
 
 from ..actors.actor import Actor, Start
 from ..actors.cell import Cell
 from ..actors.errors import SpecError, type_name
-from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.events import ShutdownError
+from ..actors.exits import KILLED, SHUTDOWN, ExitReason
 from ..actors.mailbox import Bounded
 from ..actors.process.limits import Limits
 from ..actors.process.recipe import pack_recipe
 from ..actors.values import UnsavableValue
 from .backoff import Backoff
+from .decisions import is_as_told
+from .rules import Rule
 
 Restart = Literal["permanent", "transient", "temporary"]
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one"]
+AutoShutdown = Literal["never", "any_significant", "all_significant"]
 Isolation = Literal["task", "process"]
 Shutdown = float | Literal["brutal_kill", "infinity"]
+
+NAMELESS = "*"
+"""The id of a spec without one: a dynamic supervisor makes one up at each start."""
+PATIENCE = 5.0
+"""Seconds a child may take to stop in good order when its spec does not say; a supervisor takes what it needs."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Flags:
-    """A supervisor's own settings: strategy, and at most `intensity` restarts within `period` seconds."""
+    """A supervisor's own settings: strategy, and at most `intensity` restarts within `period` seconds.
+
+    `auto_shutdown` says whether it ends with its significant children; `max_children` is for dynamic ones.
+    """
 
     strategy: Strategy = "one_for_one"
     intensity: int = 1
     period: float = 5.0
+    auto_shutdown: AutoShutdown = "never"
+    max_children: int | None = None
 
     def __post_init__(self) -> None:
         _choose("supervisor", "strategy", self.strategy, Strategy)
+        _choose("supervisor", "auto_shutdown", self.auto_shutdown, AutoShutdown)
+        most = self.max_children
+        if most is not None and (not isinstance(most, int) or isinstance(most, bool) or most < 0):
+            raise SpecError("supervisor", f"max_children must be a whole number >= 0 or None, not {most!r}")
         if not isinstance(self.intensity, int) or isinstance(self.intensity, bool) or self.intensity < 0:
             raise SpecError("supervisor", f"intensity must be a whole number >= 0, not {self.intensity!r}")
         if not _number(self.period) or not 0 < self.period < float("inf"):
@@ -53,6 +73,8 @@ class ChildSpec:
     limits: Limits | None = None
     bindings: Mapping[str, str] = dataclasses.field(default_factory=dict[str, str])
     is_supervisor: bool = False
+    significant: bool = False
+    rules: tuple[Rule, ...] = ()
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"
@@ -61,13 +83,24 @@ class ChildSpec:
         if not isinstance(self.start, Start) or not issubclass(self.start.kind, Actor):
             raise SpecError(where, f"start must come from start(Class, ...), not be {self.start!r}")
         try:
-            self.start.check()
+            if self.id == NAMELESS:  # Of a template: the rest of the arguments comes with each start.
+                inspect.signature(self.start.kind).bind_partial(*self.start.args, **self.start.kwargs)
+            else:
+                self.start.check()
         except TypeError as error:
             raise SpecError(where, f"start({type_name(self.start.kind)}, ...): {error}") from error
         _choose(where, "restart", self.restart, Restart)
         _choose(where, "isolation", self.isolation, Isolation)
-        if self.shutdown not in ("brutal_kill", "infinity") and not (_number(self.shutdown) and self.shutdown >= 0):
+        if self.shutdown not in ("brutal_kill", "infinity") and not (
+            _number(self.shutdown) and 0 <= self.shutdown < float("inf")
+        ):
             raise SpecError(where, f"shutdown must be seconds >= 0, 'brutal_kill' or 'infinity', not {self.shutdown!r}")
+        if not isinstance(self.significant, bool):
+            raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
+        if self.significant and self.restart == "permanent":
+            raise SpecError(where, "a permanent child cannot be significant: it never ends; make it transient")
+        if not all(isinstance(one, Rule) for one in self.rules):
+            raise SpecError(where, f"rules must come from rule(reason, action), not be {self.rules!r}")
         _of_kind(where, "mailbox", self.mailbox, Bounded, "bounded(...)")
         _of_kind(where, "backoff", self.backoff, Backoff, "Backoff(...)")
         _of_kind(where, "limits", self.limits, Limits, "Limits(...)")
@@ -84,10 +117,6 @@ class ChildSpec:
                     where, f"recovery must be a method such as hybrid(...) or left out, not {self.recovery!r}"
                 )
             self.recovery.check(where, self.start.kind)
-            if self.recovery.records and self.mailbox is not None:
-                raise SpecError(
-                    where, "mailbox=bounded(...) does not go with recovery yet: its journal_limit bounds what waits"
-                )
         if self.isolation == "process":
             try:
                 pack_recipe(self.start, where)
@@ -96,52 +125,74 @@ class ChildSpec:
 
     async def stop(self, cell: Cell, reason: ExitReason = SHUTDOWN) -> ExitReason:
         """Stop the child as its spec says: ask, wait, kill. Returns the reason it ended with."""
+        gone = self.begin_stop(cell, reason)
+        if isinstance(self.shutdown, str):
+            ended = await gone
+        else:
+            timer = cell.node.loop.call_later(self.shutdown, cell.kill)
+            try:
+                ended = await gone
+            finally:
+                timer.cancel()
+        self.judge(cell, reason, ended)
+        return ended
+
+    def begin_stop(self, cell: Cell, reason: ExitReason = SHUTDOWN) -> asyncio.Future[ExitReason]:
+        """Tell the child to stop, or kill it if its spec says so; whoever calls keeps the time."""
         gone = cell.ended()
         if self.shutdown == "brutal_kill":
             cell.kill()
-            return await gone
-        cell.request_stop(reason)
-        if self.shutdown == "infinity":
-            return await gone
-        timer = cell.node.loop.call_later(float(self.shutdown), cell.kill)
-        try:
-            return await gone
-        finally:
-            timer.cancel()
+        else:
+            cell.request_stop(reason)
+        return gone
+
+    def judge(self, cell: Cell, told: ExitReason, ended: ExitReason) -> None:
+        """Report a child that was told to stop and ended for another reason."""
+        expected = KILLED if self.shutdown == "brutal_kill" else told
+        if not is_as_told(self.restart, expected, ended):
+            cell.node.emit(ShutdownError(cell.path, ended))
 
 
 def child(
-    id: str,
+    id: str | None,
     start: Start[Any],
     *,
     restart: Restart = "permanent",
-    shutdown: Shutdown = 5.0,
+    shutdown: Shutdown | None = None,
     isolation: Isolation = "task",
     recovery: Any = None,
     mailbox: Bounded | None = None,
     backoff: Backoff | None = None,
     limits: Limits | None = None,
     bindings: Mapping[str, str] | None = None,
+    significant: bool = False,
+    rules: Iterable[Rule] = (),
 ) -> ChildSpec:
     """A child spec.
 
     Args:
-        id: the last part of the address, unique among siblings.
+        id: the last part of the address, unique among siblings; None lets a dynamic supervisor make one up.
         start: the recipe, from `start(Class, ...)`.
         restart: "permanent" always, "transient" after an abnormal end, "temporary" never.
-        shutdown: seconds for an orderly stop before the kill, "brutal_kill" or "infinity".
+        shutdown: seconds for an orderly stop before the kill, "brutal_kill" or "infinity"; if left out 5 seconds, and
+            "infinity" for a supervisor.
         isolation: "task" in this process, "process" in an OS process of its own.
         recovery: `fresh()` (the default), `hybrid(...)`: what comes back after a crash.
         mailbox: `bounded(...)`; unbounded if left out.
         backoff: waits before restarts; none if left out.
         limits: of the OS process.
         bindings: port name to address, bound at each start.
+        significant: its end by itself can end its supervisor (`auto_shutdown`); not for permanent children.
+        rules: from `rule(...)`; the first that fits an end decides, then `restart`.
 
     Raises:
         SpecError: naming the child, the option, and what it may be.
     """
+    is_supervisor = isinstance(start, Start) and bool(getattr(start.kind, "_supervises", False))
+    if shutdown is None:
+        shutdown = "infinity" if is_supervisor else PATIENCE
     return ChildSpec(
-        id,
+        NAMELESS if id is None else id,
         start,
         restart,
         shutdown,
@@ -151,20 +202,90 @@ def child(
         backoff,
         limits,
         dict(bindings) if isinstance(bindings, Mapping) else bindings or {},
+        is_supervisor,
+        significant,
+        tuple(rules),
     )
 
 
-def check_ids(where: str, children: Iterable[ChildSpec]) -> tuple[ChildSpec, ...]:
-    """The children, if each is a spec and no id comes twice."""
+@dataclasses.dataclass(frozen=True, slots=True, init=False)
+class Plan:
+    """What a supervisor's `init` returns: its children in start order, and its flags. Checked when it is made.
+
+    Raises:
+        SpecError: naming the option, or the child, and what it may be.
+    """
+
+    children: tuple[ChildSpec, ...]
+    flags: Flags
+
+    def __init__(
+        self,
+        children: Iterable[ChildSpec] = (),
+        *,
+        strategy: Strategy = "one_for_one",
+        intensity: int = 1,
+        period: float = 5.0,
+        auto_shutdown: AutoShutdown = "never",
+        max_children: int | None = None,
+    ) -> None:
+        flags = Flags(strategy, intensity, period, auto_shutdown, max_children)
+        object.__setattr__(self, "flags", flags)
+        object.__setattr__(self, "children", checked("supervisor", children, auto_shutdown, nameless=True))
+
+    @classmethod
+    def of(cls, flags: Flags, children: Iterable[ChildSpec]) -> Plan:
+        """A plan from flags that are there already."""
+        return cls(children, **{field.name: getattr(flags, field.name) for field in dataclasses.fields(flags)})
+
+
+def check_children(children: Iterable[ChildSpec], auto_shutdown: AutoShutdown | None = None) -> None:
+    """Check child specs as a supervisor would, without starting anything.
+
+    Args:
+        children: the specs.
+        auto_shutdown: that of the supervisor; None leaves out whether significant children go with it.
+
+    Raises:
+        SpecError: naming the child and what is wrong.
+    """
+    if auto_shutdown is not None:
+        _choose("check_children", "auto_shutdown", auto_shutdown, AutoShutdown)
+    checked("check_children", children, auto_shutdown)
+
+
+def checked(
+    where: str, children: Iterable[ChildSpec], auto_shutdown: AutoShutdown | None, *, nameless: bool = False
+) -> tuple[ChildSpec, ...]:
+    """The children, if each is a spec, no id comes twice, and significant ones fit their supervisor.
+
+    Raises:
+        SpecError: naming the child and what is wrong.
+    """
+    if isinstance(children, (str, bytes, ChildSpec)) or not isinstance(children, Iterable):
+        raise SpecError(where, f"children must be a list of child specs, not {children!r}")
     specs = tuple(children)
     seen: set[str] = set()
     for spec in specs:
-        if not isinstance(spec, ChildSpec):
-            raise SpecError(where, f"children must come from child(...) or supervisor(...), not be {spec!r}")
+        check_spec(where, spec, auto_shutdown, nameless=nameless)
         if spec.id in seen:
             raise SpecError(where, f"two children have the id {spec.id!r}")
         seen.add(spec.id)
     return specs
+
+
+def check_spec(where: str, spec: object, auto_shutdown: AutoShutdown | None, *, nameless: bool = False) -> None:
+    """Whether a supervisor can take this child.
+
+    Raises:
+        SpecError: it is no spec, has no id, or is significant where nothing can follow from that.
+    """
+    if not isinstance(spec, ChildSpec):
+        raise SpecError(where, f"children must come from child(...) or supervisor(...), not be {spec!r}")
+    if spec.id == NAMELESS and not nameless:
+        raise SpecError(where, "only children of a dynamic supervisor can go without an id")
+    if spec.significant and auto_shutdown == "never":
+        raise SpecError(where, f"child {spec.id!r} is significant, but auto_shutdown is 'never'")
 
 
 def _of_kind(where: str, name: str, value: object, kind: type, form: str) -> None:

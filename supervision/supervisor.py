@@ -1,187 +1,120 @@
 """The supervisor: an actor that starts its children in order, restarts them by its strategy, and stops them.
 
-It decides in pure functions (`decisions.py`, `intensity.py`) and acts here.
+It decides in pure functions (`decisions.py`, `intensity.py`) and acts here. The rules are those of Erlang/OTP's
+`supervisor`; `docs/supervision.md` has them as tables.
 """
 
 from __future__ import annotations
 
 import asyncio
-import dataclasses
-import random
-from collections.abc import Callable, Coroutine, Iterable
-from typing import Any
+import functools
+from collections import deque
+from collections.abc import Coroutine
+from typing import Any, ClassVar
 
 from ..actors import lives
-from ..actors.actor import Actor, Start, on
+from ..actors.actor import Actor, on
 from ..actors.cell import DOWN, GONE, Cell
-from ..actors.errors import HoldfastError, NoSuchActor, SpecError, StartFailed
-from ..actors.events import ChildRestarted, SupervisorGaveUp
+from ..actors.errors import HoldfastError, NoSuchActor, SpecError, StartFailed, StartIgnored
+from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
 from ..actors.exits import SHUTDOWN, ExitReason, unpack_exit
 from ..actors.mail import Item, ReplyHandle
-from ..actors.message import Message, Refusal
-from ..actors.process.limits import Limits
-from .decisions import affected, is_restarted
+from .admin import (
+    AlreadyPresent,
+    AlreadyStarted,
+    Boxed,
+    ChangeSupervisor,
+    ChildBusy,
+    ChildCounts,
+    ChildInfo,
+    CountChildren,
+    DeleteChild,
+    GetChildSpec,
+    NoSuchChild,
+    RestartChild,
+    StartChild,
+    TerminateChild,
+    WhichChildren,
+    opened,
+)
+from .change import check_place, new_plan, succession
+from .children import RECOVERING, RESTARTING, STOPPED, UP, Child, Retry, Row, StartOver
+from .decisions import affected, decide, is_reported
 from .intensity import admit_restart
-from .spec import ChildSpec, Flags, Isolation, Restart, Shutdown, Strategy, check_ids
-
-# What a child may be in, as `which_children` tells it.
-STOPPED = "stopped"
-UP = "running"
-RESTARTING = "restarting"
-RECOVERING = "recovering"
-
-
-class AlreadyStarted(Refusal):
-    """A child of this id runs already, or is being restarted."""
-
-    id: str
-
-
-class AlreadyPresent(Refusal):
-    """A child of this id is known, but not running: restart or delete it."""
-
-    id: str
-
-
-class ChildBusy(Refusal):
-    """The child runs or is being restarted: terminate it first."""
-
-    id: str
-
-
-class NoSuchChild(Refusal):
-    """The supervisor has no child of this id."""
-
-    id: str
-
-
-class StartChild(Message[Any]):
-    """Start one more child; the reply is its ref."""
-
-    spec: Any
-
-
-class TerminateChild(Message[None]):
-    """Stop a child by its spec; the spec stays, unless it is temporary.
-
-    `reason` is what `pack_exit` gives; None is SHUTDOWN.
-    """
-
-    id: str
-    reason: dict[str, Any] | None = None
-
-
-class RestartChild(Message[Any]):
-    """Start a stopped child again; the reply is its ref."""
-
-    id: str
-
-
-class DeleteChild(Message[None]):
-    """Forget a stopped child."""
-
-    id: str
-
-
-class ChildInfo(Message[None]):
-    """One child, as `WhichChildren` tells it: id, state, address."""
-
-    id: str
-    state: str
-    path: str
-    is_supervisor: bool
-
-
-class WhichChildren(Message[list[ChildInfo]]):
-    """All children, in start order."""
-
-
-@dataclasses.dataclass(slots=True)
-class Child:
-    """A child as its supervisor sees it."""
-
-    spec: ChildSpec
-    cell: Cell | None = None
-    state: str = STOPPED
-    ignored_life: int = 0  # the end of this life is known already: its start failed, or we stopped it
-    attempts: int = 0  # restarts in a row without a healthy life
-    up_since: float = 0.0
-    retry: int = 0  # the number of the retry that counts; stale ones are dropped
-    up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
-
-
-class Retry(Item):
-    """A restart that is due: after a failed attempt, or a back-off. Other requests are served before it."""
-
-    __slots__ = ("child", "number", "reason")
-
-    def __init__(self, child: Child, number: int, reason: ExitReason) -> None:
-        self.child, self.number, self.reason = child, number, reason
-
-    @staticmethod
-    def run(actor: Any, item: Any) -> object:
-        return actor.retry(item.child, item.number, item.reason)
-
-
-class StartOver(Item):
-    """A child's start, waited for outside the supervisor's turn, has come to its end."""
-
-    __slots__ = ("child", "up")
-
-    def __init__(self, child: Child, up: asyncio.Future[None]) -> None:
-        self.child, self.up = child, up
-
-    @staticmethod
-    def run(actor: Any, item: Any) -> object:
-        return actor.start_over(item.child, item.up)
+from .spec import ChildSpec, Flags, Plan, check_spec
 
 
 class Supervisor(Actor):
-    """Keeps its children alive. Built by `supervisor(...)`."""
+    """Keeps its children alive. Built by `supervisor(...)`, or derived from, with an `init` that returns a `Plan`."""
 
-    def __init__(self, flags: Flags, children: tuple[ChildSpec, ...]) -> None:
-        self._flags = flags
-        self._children: dict[str, Child] = {spec.id: Child(spec) for spec in children}
-        self._restarts: tuple[float, ...] = ()
-        self._rng = random.Random()
+    _supervises: ClassVar[bool] = True
+    _is_dynamic: ClassVar[bool] = False
+
+    _flags: Flags
+    _children: dict[str, Child]
+    _restarts: tuple[float, ...]
+
+    def __init__(self, flags: Flags | None = None, children: tuple[ChildSpec, ...] = ()) -> None:
+        self._given = Plan.of(flags or Flags(), children)
+
+    def init(self) -> Plan:
+        """Flags and children, asked for at each start and at a `ChangeSupervisor()`. May raise `Ignore`."""
+        return self._given
 
     # -- start ------------------------------------------------------------------------------------------------------
 
     async def on_start(self, restored: bool) -> None:
         """Start the children left to right; if one fails, the others are stopped in reverse and so do we."""
+        self.ctx.trap_exits = True  # Only our own parent can end us: the end of a stranger that is linked is no order.
+        self._begin(new_plan(self))
         for one in list(self._children.values()):
             await self._start(one)
 
-    async def _start(self, one: Child) -> None:
-        """Start a child and wait until it is up.
+    def _begin(self, plan: Plan) -> None:
+        """Take up the plan of this start."""
+        self._flags = plan.flags
+        self._children = {spec.id: Child(spec) for spec in plan.children}
+        self._restarts = ()
+
+    async def _start(self, one: Child) -> bool:
+        """Start a child and wait until it is up. False: it did not want to be.
 
         Raises:
-            StartFailed: naming the child and why.
+            StartFailed, or another HoldfastError: naming the child and why.
         """
-        up = self._launch(one)
-        if up is not None:
-            try:
-                await up
-            except asyncio.CancelledError as error:
-                task = asyncio.current_task()
-                if task is not None and task.cancelling():
-                    raise  # It is our own turn that is killed.
-                raise StartFailed(f"{self.ctx.path}/{one.spec.id}", "it was killed while it started") from error
+        try:
+            up = self._launch(one)
+            if up is not None:
+                await self._wait(one, up)
+        except StartIgnored:
+            self._ignored(one)
+            return False
+        except HoldfastError as error:
+            self._start_failed(one, error)
+            raise
         self._is_up(one)
+        return True
+
+    async def _wait(self, one: Child, up: asyncio.Future[None]) -> None:
+        try:
+            await up
+        except asyncio.CancelledError as error:
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise  # It is our own turn that is killed.
+            raise StartFailed(f"{self.ctx.path}/{one.spec.id}", "it was killed while it started") from error
 
     def _launch(self, one: Child) -> asyncio.Future[None] | None:
-        """Begin a life of the child; a future if it takes longer than this turn."""
+        """Begin a life of the child; a future if it takes longer than this turn.
+
+        Raises:
+            StartFailed, StartIgnored: at once. NameTaken: somebody else lives at its address.
+        """
         cell = one.cell
         if cell is None or cell.state is GONE:
             cell = one.cell = self._new_cell(one.spec)
             one.ignored_life = 0  # A new address counts its lives anew.
-        try:
-            up = cell.host.start(cell)
-        except StartFailed:
-            one.ignored_life = cell.life
-            one.state = STOPPED
-            raise
-        return up
+        return cell.host.start(cell)
 
     def _new_cell(self, spec: ChildSpec) -> Cell:
         own = self.ctx.cell
@@ -204,7 +137,24 @@ class Supervisor(Actor):
 
     def _is_up(self, one: Child) -> None:
         one.state = UP
+        one.row = None
         one.up_since = self.ctx.cell.node.loop.time()
+
+    def _start_failed(self, one: Child, error: HoldfastError) -> None:
+        one.state, one.row = STOPPED, None
+        if one.cell is not None:
+            one.ignored_life = one.cell.life
+        node = self.ctx.cell.node
+        if node.watched:
+            reason = error.reason if isinstance(error, StartFailed) else str(error)
+            node.emit(ChildStartFailed(f"{self.ctx.path}/{one.spec.id}", reason))
+
+    def _ignored(self, one: Child) -> None:
+        """It did not want to be started, which is no failure: the spec stays, that of a temporary child does not."""
+        one.row = None
+        if one.cell is not None:
+            one.ignored_life = one.cell.life
+        self._give_up_address(one, "it did not want to be started")
 
     # -- a child has ended ------------------------------------------------------------------------------------------
 
@@ -215,18 +165,21 @@ class Supervisor(Actor):
             lives.retire(cell, reason)
             return None
         if life <= one.ignored_life or one.state != UP:
-            return None  # We stopped it, or its start failed: that is told by who waits for the start.
-        if one.up is not None:
-            if not has_succeeded(one.up):
-                return None  # It ended while it started: `start_over` hears of that, and it counts once.
-            one.up = None
-        if not is_restarted(one.spec.restart, reason):
+            return None  # We stopped it, or it ended while it started: that is told by who waits for the start.
+        spec, node = one.spec, self.ctx.cell.node
+        if node.watched and is_reported(spec.restart, reason):
+            node.emit(ChildTerminated(cell.path, reason))
+        action = decide(spec.restart, spec.rules, reason)
+        if action == "escalate":
+            self._give_up(one, reason, reason)
+        elif action == "stop":
             self._give_up_address(one, reason)
-            return None
-        if one.spec.backoff is not None:
+            self._end_with_significant(one, reason)
+        elif spec.backoff is not None:
             self._later(one, reason)
-            return None
-        return self._restart(one, reason)
+        else:
+            return self._restart(one, reason)
+        return None
 
     def _give_up_address(self, one: Child, reason: object) -> None:
         """The child is not restarted: its address goes, its spec too if it is temporary."""
@@ -234,7 +187,22 @@ class Supervisor(Actor):
         if one.cell is not None:
             lives.retire(one.cell, reason)
         if one.spec.restart == "temporary":
-            self._children.pop(one.spec.id, None)
+            self._forget(one)
+
+    def _forget(self, one: Child) -> None:
+        """The spec goes: the one way out of the list of children."""
+        self._children.pop(one.spec.id, None)
+
+    def _end_with_significant(self, one: Child, reason: ExitReason) -> None:
+        """A child has ended by itself for good: if it was significant, that may be the end of us."""
+        flags = self._flags
+        if not one.spec.significant or flags.auto_shutdown == "never":
+            return
+        left = (other.spec.significant and other.state != STOPPED for other in self._children.values())
+        if flags.auto_shutdown == "all_significant" and any(left):
+            return
+        self.ctx.cell.node.emit(AutoShutdown(self.ctx.path, one.spec.id, reason))
+        self.ctx.stop(SHUTDOWN)
 
     def _later(self, one: Child, reason: ExitReason) -> None:
         """Restart after the back-off; meanwhile everybody else is served."""
@@ -243,7 +211,7 @@ class Supervisor(Actor):
         loop = self.ctx.cell.node.loop
         if one.state == UP and loop.time() - one.up_since >= backoff.reset_after:
             one.attempts = 0
-        delay = backoff.delay(one.attempts, self._rng)
+        delay = backoff.delay(one.attempts, self.ctx.random)
         one.attempts += 1
         one.state = RESTARTING
         one.retry += 1
@@ -253,7 +221,7 @@ class Supervisor(Actor):
         if not self.ctx.closed:
             self.ctx.cell.push(item)
 
-    def retry(self, one: Child, number: int, reason: ExitReason) -> Coroutine[Any, Any, None] | None:
+    def _retry(self, one: Child, number: int, reason: ExitReason) -> Coroutine[Any, Any, None] | None:
         """A restart is due, unless the child was stopped or started meanwhile."""
         if number != one.retry or one.state != RESTARTING:
             return None
@@ -261,96 +229,109 @@ class Supervisor(Actor):
 
     def _restart(self, one: Child, reason: ExitReason) -> Coroutine[Any, Any, None] | None:
         """One attempt by the strategy, counted; gives up when there were too many."""
-        node = self.ctx.cell.node
-        window = admit_restart(
-            self._restarts, node.loop.time(), intensity=self._flags.intensity, period=self._flags.period
-        )
+        node, flags = self.ctx.cell.node, self._flags
+        window = admit_restart(self._restarts, node.loop.time(), intensity=flags.intensity, period=flags.period)
         if window is None:
-            self._give_up(one, reason)
+            self._give_up(one, reason, SHUTDOWN)
             return None
         self._restarts = window
         if node.watched:
             node.emit(ChildRestarted(f"{self.ctx.path}/{one.spec.id}", reason, len(window)))
-        if self._flags.strategy == "one_for_one":
-            self._restart_one(one, reason)
+        if flags.strategy == "one_for_one":
+            self._start_row(Row(deque([one]), reason))
             return None
         return self._restart_group(one, reason)
 
-    def _give_up(self, one: Child, reason: ExitReason) -> None:
-        node = self.ctx.cell.node
+    def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
+        """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
         one.state = STOPPED
-        node.emit(SupervisorGaveUp(self.ctx.path, one.spec.id, reason))
-        self.ctx.stop(SHUTDOWN)
-
-    def _restart_one(self, one: Child, reason: ExitReason) -> None:
-        """Start it again; if that takes longer, wait for it outside our turn."""
-        one.state = RESTARTING
-        try:
-            up = self._launch(one)
-        except StartFailed:
-            self._try_again(one, reason)
-            return
-        if up is None:
-            self._is_up(one)
-            return
-        if one.spec.recovery is not None:
-            one.state = RECOVERING
-        one.up = up
-        up.add_done_callback(lambda done: self._post(StartOver(one, done)))
-
-    def start_over(self, one: Child, up: asyncio.Future[None]) -> Coroutine[Any, Any, None] | None:
-        """A restart has come to its end, unless the child was stopped meanwhile or has ended again."""
-        cell = one.cell
-        if one.up is not up or cell is None:
-            return None
-        one.up = None
-        if has_succeeded(up):
-            self._is_up(one)
-            if cell.state is not DOWN:
-                return None
-            life = cell.life  # It ended before we heard that it was up, and so its end was not heard.
-            more = self.child_exited(cell, life, cell.extra().reason)
-            one.ignored_life = life
-            return more
-        one.ignored_life = cell.life
-        self._try_again(one, cell.extra().reason)
-        return None
-
-    def _try_again(self, one: Child, reason: ExitReason) -> None:
-        """A start attempt failed: the next goes through our own mailbox, so that we answer in between."""
-        one.state = RESTARTING
-        if one.spec.backoff is not None:
-            self._later(one, reason)
-            return
-        one.retry += 1
-        self.ctx.cell.push(Retry(one, one.retry, reason))
+        self.ctx.cell.node.emit(SupervisorGaveUp(self.ctx.path, one.spec.id, reason))
+        self.ctx.stop(told)
 
     async def _restart_group(self, failed: Child, reason: ExitReason) -> None:
         """one_for_all and rest_for_one: stop the others newest first, then start all of them in order."""
         order = list(self._children.values())
         group = affected(self._flags.strategy, order, order.index(failed))
-        failed.state = RESTARTING
         for one in reversed(group):
             if one is not failed and one.state != STOPPED:
                 await self._stop(one)
                 if one.spec.restart == "temporary":
                     self._give_up_address(one, SHUTDOWN)
-        for one in group:
-            if one.spec.id not in self._children:
-                continue
+        self._start_row(Row(deque(one for one in group if one.spec.id in self._children), reason))
+
+    def _start_row(self, row: Row) -> None:
+        """Start the children of a row; if one takes longer, its siblings wait for it, and we do not (`_start_over`)."""
+        for one in row.waiting:
+            one.state, one.row = RESTARTING, row
+        self._go_on(row)
+
+    def _go_on(self, row: Row) -> None:
+        while row.waiting:
+            one = row.waiting.popleft()
+            if one.row is not row:
+                continue  # Stopped by hand meanwhile.
             try:
-                await self._start(one)
-            except StartFailed:
-                if one.cell is not None:
-                    one.ignored_life = one.cell.life
-                self._try_again(one, reason)  # Of the group, it is the one that does not run.
+                up = self._launch(one)
+            except StartIgnored:
+                self._ignored(one)
+            except HoldfastError as error:
+                self._attempt_failed(one, error, row)
                 return
+            else:
+                if up is not None:
+                    if one.spec.recovery is not None:
+                        one.state = RECOVERING
+                    one.up = up
+                    up.add_done_callback(functools.partial(self._started, one))
+                    return
+                self._is_up(one)
+
+    def _started(self, one: Child, up: asyncio.Future[None]) -> None:
+        self._post(StartOver(one, up))
+
+    def _attempt_failed(self, one: Child, error: HoldfastError, row: Row) -> None:
+        """A child of the row did not start: the others are stopped, or stay up, until it is tried again."""
+        for other in row.waiting:
+            if other.row is row:
+                other.state, other.row = STOPPED, None
+        self._start_failed(one, error)
+        one.state = RESTARTING
+        if one.spec.backoff is not None:
+            self._later(one, row.reason)
+            return
+        one.retry += 1
+        self.ctx.cell.push(Retry(one, one.retry, row.reason))  # Through our own mailbox: we answer in between.
+
+    def _start_over(self, one: Child, up: asyncio.Future[None]) -> Coroutine[Any, Any, None] | None:
+        """A restart has come to its end, unless the child was stopped meanwhile."""
+        cell, row = one.cell, one.row
+        if one.up is not up or cell is None or row is None:
+            return None
+        one.up = None
+        error = StartFailed(cell.path, "it was killed while it started") if up.cancelled() else up.exception()
+        if isinstance(error, StartIgnored):
+            self._ignored(one)
+        elif error is not None:
+            failure = error if isinstance(error, HoldfastError) else StartFailed(cell.path, str(error))
+            self._attempt_failed(one, failure, row)
+            return None
+        else:
+            self._is_up(one)
+        self._go_on(row)
+        if one.state != UP or cell.state is not DOWN:
+            return None
+        life = cell.life  # It ended before we heard that it was up: its end in our queue is passed over.
+        more = self.child_exited(cell, life, cell.extra().reason)
+        one.ignored_life = life
+        return more
+
+    # -- stopping ---------------------------------------------------------------------------------------------------
 
     async def _stop(self, one: Child, reason: ExitReason = SHUTDOWN) -> None:
         """Stop a child as its spec says; its address and queue stay."""
         cell = one.cell
         one.retry += 1
-        one.state = STOPPED
+        one.state, one.row = STOPPED, None
         starting, one.up = one.up, None
         if cell is None or cell.state is GONE:
             return
@@ -360,69 +341,130 @@ class Supervisor(Actor):
         elif starting is not None:
             cell.kill()
 
+    async def _stop_children(self) -> None:
+        """We end: the children go in reverse start order, which need not be the order in which their addresses came."""
+        below = list((self.ctx.cell.children or {}).values())
+        children: dict[str, Child] = self.__dict__.get("_children", {})
+        living = set(below)
+        ours = [one.cell for one in children.values() if one.cell is not None and one.cell in living]
+        places = set(ours)
+        for cell in reversed(below):  # Others may live below us too: each keeps its place.
+            child = ours.pop() if cell in places else cell
+            await child.node.stop_child(child)
+
     # -- administration ---------------------------------------------------------------------------------------------
 
     @on(StartChild)
-    async def start_child(self, message: StartChild) -> Any:
+    async def _start_child(self, message: StartChild) -> Any:
         """Add and start a child."""
-        spec = message.spec
-        if not isinstance(spec, ChildSpec):
-            return self._fail(SpecError("StartChild", f"takes child(...) or supervisor(...), not {spec!r}"))
-        known = self._children.get(spec.id)
-        if known is not None:
-            raise AlreadyPresent(spec.id) if known.state == STOPPED else AlreadyStarted(spec.id)
+        try:
+            spec = self._spec_in(message)
+        except HoldfastError as error:
+            return self._fail(error)
+        self._check_free(spec)
         one = self._children[spec.id] = Child(spec)
         try:
-            await self._start(one)
+            return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:
-            self._children.pop(spec.id, None)
+            self._forget(one)
             if one.cell is not None:
-                one.ignored_life = one.cell.life
                 lives.retire(one.cell, "it could not be started")
             return self._fail(error)
-        assert one.cell is not None
-        return one.cell.ref
+
+    def _check_free(self, spec: ChildSpec) -> None:
+        """Refuse a child whose id is known."""
+        known = self._children.get(spec.id)
+        if known is not None:
+            if known.is_running and known.cell is not None:
+                raise AlreadyStarted(spec.id, known.cell.ref)
+            raise AlreadyPresent(spec.id)
+
+    def _spec_in(self, message: StartChild) -> ChildSpec:
+        """The spec that a StartChild means, if we can take it."""
+        own = self.ctx.cell
+        spec = opened(message.spec, own.node)
+        if not isinstance(spec, ChildSpec):
+            raise SpecError("StartChild", f"takes child(...) or supervisor(...), not {spec!r}")
+        check_spec("StartChild", spec, self._flags.auto_shutdown)
+        check_place("StartChild", (spec,), own.node)
+        return spec
 
     @on(TerminateChild)
-    async def terminate_child(self, message: TerminateChild) -> None:
+    async def _terminate_child(self, message: TerminateChild) -> None:
         """Stop a child; a pending restart is void."""
         one = self._child(message.id)
+        row = one.row if one.up is not None else None
         reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
         await self._stop(one, reason)
         self._give_up_address(one, reason)
+        if row is not None:  # Its later siblings have waited for it.
+            self._go_on(row)
 
     @on(RestartChild)
-    async def restart_child(self, message: RestartChild) -> Any:
+    async def _restart_child(self, message: RestartChild) -> Any:
         """Start a stopped child again."""
         one = self._child(message.id)
         if one.state != STOPPED:
-            raise ChildBusy(message.id)
+            raise ChildBusy(message.id, one.state)
         try:
-            await self._start(one)
+            return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:
             self._give_up_address(one, "it could not be started")
             return self._fail(error)
-        assert one.cell is not None
-        return one.cell.ref
 
     @on(DeleteChild)
-    def delete_child(self, message: DeleteChild) -> None:
+    def _delete_child(self, message: DeleteChild) -> None:
         """Forget a stopped child's spec."""
         one = self._child(message.id)
         if one.state != STOPPED:
-            raise ChildBusy(message.id)
-        del self._children[message.id]
+            raise ChildBusy(message.id, one.state)
+        self._forget(one)
         if one.cell is not None:
             lives.retire(one.cell, "it was deleted")
 
     @on(WhichChildren, readonly=True)
-    def which_children(self, message: WhichChildren) -> list[ChildInfo]:
+    def _which_children(self, message: WhichChildren) -> list[ChildInfo]:
         """What there is, in start order."""
         own = self.ctx.path
         return [
             ChildInfo(one.spec.id, one.state, f"{own}/{one.spec.id}", one.spec.is_supervisor)
             for one in self._children.values()
         ]
+
+    @on(CountChildren, readonly=True)
+    def _count_children(self, message: CountChildren) -> ChildCounts:
+        """How many there are."""
+        children = self._children.values()
+        supervisors = sum(one.spec.is_supervisor for one in children)
+        active = sum(one.is_running for one in children)
+        return ChildCounts(len(children), active, supervisors, len(children) - supervisors)
+
+    @on(GetChildSpec, readonly=True)
+    def _get_child_spec(self, message: GetChildSpec) -> Any:
+        """One child's spec."""
+        spec = self._child(message.id).spec
+        return spec if self.ctx.cell.node.uplink is None else Boxed(spec)
+
+    @on(ChangeSupervisor)
+    def _change(self, message: ChangeSupervisor) -> Any:
+        """Take new flags and specs; nothing is started or stopped, and nothing changes if they are not valid."""
+        try:
+            plan = new_plan(self, message)
+            self._take(plan)
+        except StartIgnored:
+            return None
+        except HoldfastError as error:
+            return self._fail(error)
+        return None
+
+    def _take(self, plan: Plan) -> None:
+        """Follow another plan from now on; raises SpecError if that cannot be."""
+        children = succession(self, self._children, plan)
+        self._flags, self._children = plan.flags, children
+
+    def _specs(self) -> tuple[ChildSpec, ...]:
+        """The specs as they are now."""
+        return tuple(one.spec for one in self._children.values())
 
     def _child(self, name: str) -> Child:
         one = self._children.get(name)
@@ -435,55 +477,3 @@ class Supervisor(Actor):
         handle = self.ctx.reply_handle()
         handle.fail(error)
         return handle
-
-
-def has_succeeded(up: asyncio.Future[None]) -> bool:
-    """Whether a start has come to its end, and a good one."""
-    return up.done() and not up.cancelled() and up.exception() is None
-
-
-def holds(specs: Iterable[ChildSpec], wanted: Callable[[ChildSpec], bool]) -> bool:
-    """Whether one of the children, or of theirs, is as wanted."""
-    return any(wanted(spec) or (spec.is_supervisor and holds(spec.start.args[1], wanted)) for spec in specs)
-
-
-def supervisor(
-    name: str,
-    *,
-    strategy: Strategy = "one_for_one",
-    intensity: int = 1,
-    period: float = 5.0,
-    children: Iterable[ChildSpec] = (),
-    restart: Restart = "permanent",
-    shutdown: Shutdown = "infinity",
-    isolation: Isolation = "task",
-    limits: Limits | None = None,
-) -> ChildSpec:
-    """A supervisor with its children, as a spec: start it with `system.start`, or nest it in another one.
-
-    Args:
-        name: the last part of its address.
-        strategy: "one_for_one", "one_for_all" or "rest_for_one".
-        intensity: restarts allowed within `period` seconds; one more and it gives up.
-        period: seconds, > 0.
-        children: specs, in start order.
-        restart, shutdown: as a child of its own supervisor.
-        isolation: "process" puts the whole subtree into one OS process.
-        limits: of that process.
-
-    Raises:
-        SpecError: naming the option and what it may be.
-    """
-    specs = check_ids(f"supervisor {name!r}", children)
-    try:
-        flags = Flags(strategy, intensity, period)
-    except SpecError as error:
-        raise SpecError(f"supervisor {name!r}", error.problem) from None
-    start = Start(Supervisor, (flags, specs))
-    if isolation == "process":
-        where = f"supervisor {name!r}"
-        if holds(specs, lambda spec: spec.isolation == "process"):
-            raise SpecError(where, "a subtree in a process cannot hold process children: its own is theirs")
-        if holds(specs, lambda spec: spec.recovery is not None and spec.recovery.records):
-            raise SpecError(where, "a subtree in a process cannot hold recorded children yet: give them their own")
-    return ChildSpec(name, start, restart, shutdown, isolation, limits=limits, is_supervisor=True)

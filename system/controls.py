@@ -31,7 +31,8 @@ from ..actors.process.recipe import unpack_recipe
 from ..actors.process.relay import OutsideHost
 from ..actors.process.remote import ProcessHost
 from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
-from ..checkpoint.switch import Switch, switch_of
+from ..checkpoint.outputs import switch_of
+from ..checkpoint.switch import Switch
 from ..supervision.respec import respec
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import socket
 
 from ..actors.cell import Cell
 from ..actors.process import frames, guest
-from ..checkpoint.controller import RecordedGuest
+from ..checkpoint.guest import RecordedGuest
 from ..supervision.respec import respec
 
 
@@ -20,6 +20,7 @@ def prepare(host: guest.Guest) -> None:
     """Before the root's first frame: a recorded life may get its state before it is launched."""
     host.recovery = RecordedGuest(host)
     host.node.respec = respec
+    host.node.host_for = host.recovery.host_for
 
 
 def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:

@@ -7,7 +7,9 @@ from collections.abc import Callable
 from ..actors.errors import type_name
 from ..actors.events import (
     ActorCrashed,
+    AutoShutdown,
     ChildRestarted,
+    ChildStartFailed,
     DeadLetter,
     Event,
     HookFailed,
@@ -18,6 +20,7 @@ from ..actors.events import (
     ProcessDied,
     Recovered,
     RecoveryFailed,
+    ShutdownError,
     SnapshotFailed,
     SupervisorGaveUp,
 )
@@ -67,6 +70,9 @@ LEVELS: dict[type, str] = {
     LifeAbandoned: "error",
     DeadLetter: "warning",
     ChildRestarted: "warning",
+    ChildStartFailed: "error",
+    ShutdownError: "warning",
+    AutoShutdown: "info",
     SupervisorGaveUp: "error",
     ProcessDied: "warning",
     Recovered: "info",
@@ -82,6 +88,9 @@ NAMES: dict[type, str] = {
     LifeAbandoned: "life abandoned",
     DeadLetter: "dead letter",
     ChildRestarted: "child restarted",
+    ChildStartFailed: "child not started",
+    ShutdownError: "shutdown error",
+    AutoShutdown: "auto shutdown",
     SupervisorGaveUp: "supervisor gave up",
     ProcessDied: "process died",
     Recovered: "actor recovered",

@@ -24,11 +24,14 @@ from ..actors.process.workers import Workers
 from ..actors.ref import ActorRef, current
 from ..actors.topics import NOT_TAKEN
 from ..actors.watch import LoopWatch, check_limits
-from ..checkpoint.controller import Homes, RecordedProcessHost, TaskHost
+from ..checkpoint.controller import RecordedProcessHost, TaskHost
+from ..checkpoint.homes import Homes
 from ..checkpoint.stores import open_journal
+from ..checkpoint.subtree import SubtreeHost
+from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
-from ..supervision.supervisor import DeleteChild, NoSuchChild, StartChild, Supervisor, TerminateChild
+from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 
@@ -106,6 +109,7 @@ class ActorSystem(Controls):
         node.respec = respec
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
+        node.outside = self._homes.find
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
         self._body = asyncio.current_task()
@@ -162,6 +166,8 @@ class ActorSystem(Controls):
             self._workers.want(spec.start.kind.__module__)
             if spec.recovery is not None and spec.recovery.records:
                 return RecordedProcessHost(self._workers, spec.limits, self._homes, spec.recovery)
+            if spec.is_supervisor:
+                return SubtreeHost(self._workers, spec.limits, self._homes)
             return ProcessHost(self._workers, spec.limits)
         if spec.recovery is not None and spec.recovery.records:
             return TaskHost(self._homes, spec.recovery)
@@ -187,7 +193,7 @@ class ActorSystem(Controls):
         return self._node
 
     async def start(self, spec: ChildSpec) -> ActorRef[Any]:
-        """Start a child of the root, and wait until it is up.
+        """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
         Raises:
             StartFailed: naming the actor and why. AlreadyStarted, AlreadyPresent: the id is in use.

@@ -12,6 +12,8 @@ from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Any, TypeVar, TypeVarTuple
 
+from ..actors.errors import HoldfastError
+
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
@@ -31,6 +33,20 @@ class NothingToWaitFor(RuntimeError):
         return (
             f"nothing can happen any more at virtual time {self.now:g} s: every task waits for something that nobody "
             "will do (no timer is set, no callback is due, no file is watched, no thread is at work)"
+        )
+
+
+class RealTimeNeeded(HoldfastError):
+    """Another process was to be started or spoken to under the virtual clock."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(what)
+        self.what = what
+
+    def __str__(self) -> str:
+        return (
+            f"{self.what} cannot run under the virtual clock: another process has a clock of its own, and this one "
+            "would jump ahead of it. Use a real loop (uvloop or the stock one), or isolation='task'"
         )
 
 
@@ -67,8 +83,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     windows); `time.monotonic()` and `time.time()` do not.
 
     - Work in `run_in_executor` takes no virtual time: the loop really waits for it before it jumps.
-    - Files, sockets and processes are looked at, but the clock does not wait for them while a timer is set: what
-      belongs to another process is tested on a real loop.
+    - Files and sockets are looked at, but the clock does not wait for them while a timer is set.
+    - Another process has no virtual clock: actors in processes of their own, and subprocesses, are refused
+      (`RealTimeNeeded`); test them on a real loop.
     - When nothing can happen any more it raises `NothingToWaitFor` instead of hanging.
 
     >>> with asyncio.Runner(loop_factory=VirtualClockLoop) as runner:
@@ -94,6 +111,18 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
     def _job_done(self, _: object) -> None:
         self._virtual.jobs -= 1
 
+    async def connect_accepted_socket(self, *args: Any, **options: Any) -> Any:
+        """Refused: what is connected here speaks for another process."""
+        raise RealTimeNeeded("a connection to another process")
+
+    async def subprocess_exec(self, *args: Any, **options: Any) -> Any:
+        """Refused."""
+        raise RealTimeNeeded("a subprocess")
+
+    async def subprocess_shell(self, *args: Any, **options: Any) -> Any:
+        """Refused."""
+        raise RealTimeNeeded("a subprocess")
+
     async def shutdown_default_executor(self, *args: Any) -> None:
         """Join the threads of `run_in_executor`; that is a thread's work too."""
         self._virtual.jobs += 1
@@ -103,6 +132,25 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             self._virtual.jobs -= 1
 
 
-def virtual_loop_factory() -> VirtualClockLoop:
+def virtual() -> VirtualClockLoop:
     """A new loop whose clock begins at 0: for `asyncio.Runner(loop_factory=...)` and pytest-asyncio's factories."""
     return VirtualClockLoop()
+
+
+async def advance(seconds: float) -> None:
+    """Let the virtual clock go on by `seconds`, and everything happen that falls due in them.
+
+    Returns when no task could go on any more without more time. Timers fire in order, each at its own time.
+
+    Raises:
+        HoldfastError: the running loop has no virtual clock. ValueError: `seconds` is negative.
+    """
+    from .barrier import quiet
+
+    loop = asyncio.get_running_loop()
+    if not isinstance(loop, VirtualClockLoop):
+        raise HoldfastError("advance() needs the virtual clock: run this under holdfast.testing.virtual")
+    if not seconds >= 0:
+        raise ValueError(f"the clock goes forward: seconds must be >= 0, not {seconds!r}")
+    await asyncio.sleep(seconds)
+    await quiet()

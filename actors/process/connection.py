@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
+import os
 import socket
 import struct
+import sys
 from collections.abc import Callable
 from typing import Any, cast
 
 import msgspec
 
-from ..codec import MAX_BYTES, encode_special, too_large, unencodable
+from ..codec import ARRAY, MAX_BYTES, array_head, encode_special, too_large, unencodable
 from ..errors import BadMessage, HoldfastError, type_name
-from .frames import AnyFrame, Frame, Name
+from .frames import AnyFrame, Frame, Name, Run, Tell, tagged
 
 LENGTH = struct.Struct("<I")
 MAX_FRAME = MAX_BYTES + 64 * 1024
@@ -22,6 +25,12 @@ PIECE_BYTES = 64 * 1024
 """Frames from this size on are written by themselves instead of being copied together."""
 HIGH_BYTES = 4 * 1024 * 1024
 """Unsent bytes at which senders are told to wait."""
+
+RUN_BYTES = 32 * 1024
+"""Payload after which a run of messages is closed; a single one larger than an eighth of this is no part of a run."""
+LARGE_ARRAY = 64 * 1024
+"""Arrays from this size on are written from where they are instead of being copied into the frame."""
+_RUN = tagged(Run)
 
 _DECODER: msgspec.msgpack.Decoder[AnyFrame] = msgspec.msgpack.Decoder(AnyFrame)
 
@@ -53,7 +62,12 @@ class Connection(asyncio.BufferedProtocol):
         self.takers: dict[type[Frame], Callable[[Any], None]] = {}  # frames of these types do not go to `on_frame`
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
-        self._encoder = msgspec.msgpack.Encoder(enc_hook=encode_special)
+        self._encoder = msgspec.msgpack.Encoder(enc_hook=self._encode_special)
+        self._large: list[tuple[bytes, bytes, memoryview]] = []  # arrays of the frame in hand: mark, head, elements
+        self._marks = itertools.count(int.from_bytes(os.urandom(15), "big"))
+        self._run: list[bytes] = []  # messages that go out as one frame
+        self._run_bytes = 0
+        self._run_head = (0, 0, 0)  # address, type name, first number
         self._out: list[bytes] = []
         self._out_bytes = 0
         self._flushing = False
@@ -104,23 +118,98 @@ class Connection(asyncio.BufferedProtocol):
         """
         if not self.is_open:
             return
+        if self._run:
+            self._close_run()
         try:
             data = self._encoder.encode(frame)
         except Exception as error:  # Whatever a payload raises while it is encoded means that it cannot be.
+            self._large.clear()
             payload = getattr(frame, "body", None)
             self._forget_names(frame)
             raise BadMessage(actor, type_name(type(payload)), unencodable(payload, error)) from error
         size = len(data)
+        parts: list[Any] = [data]
+        if self._large:
+            parts = self._spliced(data)
+            size = sum(map(len, parts))
         if size > MAX_FRAME:
             payload = getattr(frame, "body", None)
             self._forget_names(frame)
             raise BadMessage(actor, type_name(type(payload)), too_large(payload, size))
         self._out.append(size.to_bytes(4, "little"))
-        self._out.append(data)
+        self._out += parts
         self._out_bytes += size
         if not self._flushing:
             self._flushing = True
             self._loop.call_soon(self.flush)
+
+    def tell(self, to: int, name: int, message: Any, number: int, actor: str) -> None:
+        """Queue a plain message; those of one type to one address go out as one frame.
+
+        Raises:
+            BadMessage: it cannot be coded or is too large; nothing is sent.
+        """
+        if not self.is_open:
+            return
+        run = self._run
+        if run and (self._run_bytes >= RUN_BYTES or self._run_head[:2] != (to, name)):
+            self._close_run()
+            run = self._run
+        try:
+            data = self._encoder.encode(message)
+        except Exception as error:
+            self._large.clear()
+            raise BadMessage(actor, type_name(type(message)), unencodable(message, error)) from error
+        size = len(data)
+        if size * 8 > RUN_BYTES or self._large:
+            self._large.clear()
+            self.send(Tell(to, name, message, number), actor)
+            return
+        if not run:
+            self._run_head = (to, name, number)
+            if not self._flushing:
+                self._flushing = True
+                self._loop.call_soon(self.flush)
+        run.append(data)
+        self._run_bytes += size
+
+    def _close_run(self) -> None:
+        """Queue the run as a frame."""
+        run, self._run = self._run, []
+        count = len(run)
+        array = (0xDC0000 | count).to_bytes(3, "big")
+        data = b"".join((_RUN, *map(self._encoder.encode, self._run_head), array, *run))
+        self._run_bytes = 0
+        self._out.append(len(data).to_bytes(4, "little"))
+        self._out.append(data)
+        self._out_bytes += len(data)
+
+    # -- large arrays -----------------------------------------------------------------------------------------------
+
+    def _encode_special(self, value: Any) -> Any:
+        """As the codec does it, but a large array is left out; a mark stands where it belongs."""
+        numpy = sys.modules.get("numpy")
+        if numpy is None or not isinstance(value, numpy.ndarray) or value.nbytes < LARGE_ARRAY:
+            return encode_special(value)
+        if not value.flags.c_contiguous or value.dtype.hasobject:
+            return encode_special(value)
+        mark = next(self._marks).to_bytes(16, "big")
+        head = array_head(value)
+        self._large.append((mark, head, memoryview(value.reshape(-1).view("u1"))))
+        return msgspec.msgpack.Ext(ARRAY, mark)
+
+    def _spliced(self, data: bytes) -> list[Any]:
+        """A frame in parts, with the arrays where their marks were. (MessagePack counts items, not their bytes.)"""
+        parts: list[Any] = []
+        large, self._large = self._large, []
+        begin = 0
+        for mark, head, elements in large:
+            at = data.index(mark, begin)
+            size = len(head) + len(elements)
+            parts += (data[begin : at - 2], b"\xc9" + size.to_bytes(4, "big") + bytes((ARRAY,)) + head, elements)
+            begin = at + len(mark)
+        parts.append(data[begin:])
+        return parts
 
     def _forget_names(self, frame: Frame) -> None:
         """Names that this frame would have introduced are still unknown to the peer."""
@@ -132,6 +221,8 @@ class Connection(asyncio.BufferedProtocol):
     def flush(self) -> None:
         """Write what is queued, now; otherwise that happens at the end of the loop tick."""
         self._flushing = False
+        if self._run:
+            self._close_run()
         transport, out = self._transport, self._out
         if transport is None or not self.is_open or self._paused or not out:
             return
@@ -143,7 +234,7 @@ class Connection(asyncio.BufferedProtocol):
 
     def room(self) -> asyncio.Future[None] | None:
         """None while the peer keeps up; else a future that ends when it does again."""
-        if not self._paused and self._out_bytes < HIGH_BYTES:
+        if not self._paused and self._out_bytes + self._run_bytes < HIGH_BYTES:
             return None
         future: asyncio.Future[None] = self._loop.create_future()
         self._waiters.append(future)

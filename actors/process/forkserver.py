@@ -1,6 +1,6 @@
 """The parent's side of the fork server: OS processes for actors, a few milliseconds each.
 
-`ForkServer` starts the server by exec (`zygote.py` says what it does there), sends it requests over a Unix socket and
+`ForkServer` starts the server by exec (`zygote.py` says what it does), sends it requests over a Unix socket and
 sees its death through a pidfd. It touches no signal handler of the program it runs in, SIGCHLD's neither.
 
 Source: the fork server of `multiprocessing`; the zygote of Android.
@@ -9,145 +9,24 @@ Source: the fork server of `multiprocessing`; the zygote of Android.
 from __future__ import annotations
 
 import asyncio
-import builtins
 import contextlib
-import importlib
 import json
-import mmap
 import os
-import select
 import signal
 import socket
 import subprocess
-import sys
-import sysconfig
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from ..errors import ProcessUnavailable
-from . import zygote
-from .zygote import HEADER, PAGE_BYTES, SERVER_VARIABLE, Config, Kind, receive
+from .boot import HEADER, Kind, receive
+from .forked import SOCKET_BYTES, Forked, ForkRequest, has_ended
+from .launch import check_can_start, inherited, server_command, server_config, server_environment
 
 FORK_SECONDS = 10.0  # a server that does not answer by then is stopped or stuck
 IMPORT_SECONDS = 120.0  # time for user modules to be imported
-SOCKET_BYTES = 2 * 1024 * 1024
 FORKS_IN_FLIGHT = 32  # each holds eight descriptors here, and four more on their way
 PACKETS_PER_TICK = 64
-
-# Without these, messages of a megabyte cost a page fault per page each time: 4 to 5 times slower.
-_MALLOC = {
-    "MALLOC_MMAP_THRESHOLD_": "67108864",
-    "MALLOC_TRIM_THRESHOLD_": "134217728",
-    "MALLOC_TOP_PAD_": "16777216",
-}
-# Native thread pools: their threads would not survive the fork, and bit-identical replay needs one thread.
-_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
-
-
-@dataclass(slots=True)
-class Forked:
-    """One actor process, seen from the root.
-
-    Who hands a descriptor on (to a transport that will close it) sets the field to -1; `close` closes what is left.
-
-    Attributes:
-        sock: our end of the socket pair, non-blocking.
-        page: 4096 bytes shared with the child; readable after its death, however it died.
-    """
-
-    pid: int
-    pidfd: int
-    sock: socket.socket
-    stdout_fd: int
-    stderr_fd: int
-    page: mmap.mmap
-
-    def kill(self, signum: int = signal.SIGKILL) -> None:
-        """Send a signal to this very process; nothing happens if it is dead already."""
-        if self.pidfd >= 0:
-            with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self.pidfd, signum)
-
-    def close(self) -> None:
-        """Give everything back; may be called twice. The process sees the end of its socket."""
-        self.sock.close()
-        for fd in (self.pidfd, self.stdout_fd, self.stderr_fd):
-            if fd >= 0:
-                os.close(fd)
-        self.pidfd = self.stdout_fd = self.stderr_fd = -1
-        self.page.close()
-
-
-def has_ended(pidfd: int) -> bool:
-    """Whether the process behind a pidfd is dead, now."""
-    poll = select.poll()
-    poll.register(pidfd, select.POLLIN)
-    return bool(poll.poll(0))
-
-
-class _Request:
-    """A fork that was asked for: our ends of everything, the child's ends until they are sent, and the outcome."""
-
-    def __init__(self, number: int, outcome: asyncio.Future[int]) -> None:
-        self.number = number
-        self.outcome = outcome  # the child's pid
-        self.pidfd = -1
-        self.status: int | None = None  # wait status, if it died before anybody had it
-        self.handed_over = False
-        self._child_fds: list[int] = []
-        with contextlib.ExitStack() as undo:
-            self.sock, theirs = socket.socketpair()
-            undo.callback(self.sock.close)
-            undo.callback(theirs.close)
-            self._set_up(self.sock, theirs)
-            self.stdout_fd, stdout = self._pipe(undo)
-            self.stderr_fd, stderr = self._pipe(undo)
-            page_fd = os.memfd_create("holdfast-page", os.MFD_CLOEXEC)
-            undo.callback(os.close, page_fd)
-            os.ftruncate(page_fd, PAGE_BYTES)
-            self.page = mmap.mmap(page_fd, PAGE_BYTES)
-            undo.pop_all()
-        self._child_fds = [theirs.detach(), stdout, stderr, page_fd]
-
-    @staticmethod
-    def _set_up(ours: socket.socket, theirs: socket.socket) -> None:
-        ours.setblocking(False)
-        for sock in (ours, theirs):
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, SOCKET_BYTES)
-
-    @staticmethod
-    def _pipe(undo: contextlib.ExitStack) -> tuple[int, int]:
-        out, into = os.pipe2(os.O_CLOEXEC)
-        undo.callback(os.close, out)
-        undo.callback(os.close, into)
-        os.set_blocking(out, False)  # our end only: a child's print() must not fail with EAGAIN
-        return out, into
-
-    def send(self, control: socket.socket) -> None:
-        """Ask the server; raises BlockingIOError if it must be tried again."""
-        if self._child_fds:  # otherwise nobody waits any more
-            socket.send_fds(control, [HEADER.pack(Kind.FORK, self.number, 0)], self._child_fds)
-            self._close_child_fds()
-
-    def _close_child_fds(self) -> None:
-        for fd in self._child_fds:
-            os.close(fd)
-        self._child_fds = []
-
-    def hand_over(self) -> Forked:
-        """The process, now the caller's."""
-        self.handed_over = True
-        return Forked(self.outcome.result(), self.pidfd, self.sock, self.stdout_fd, self.stderr_fd, self.page)
-
-    def abandon(self) -> None:
-        """Nobody wants it: kill what there may be, close everything."""
-        self._close_child_fds()
-        done = Forked(-1, self.pidfd, self.sock, self.stdout_fd, self.stderr_fd, self.page)
-        done.kill()
-        done.close()
-        self.pidfd = -1
 
 
 class ForkServer:
@@ -186,11 +65,11 @@ class ForkServer:
         self._stopping = False
         self._ended = asyncio.Event()
         self._slots = asyncio.Semaphore(FORKS_IN_FLIGHT)
-        self._outbox: deque[_Request | bytes] = deque()
+        self._outbox: deque[ForkRequest | bytes] = deque()
         self._loading = 0  # PRELOADs without an answer
         self._last_number = 0
-        self._requests: dict[int, _Request] = {}  # by number, unanswered
-        self._unclaimed: dict[int, _Request] = {}  # by pid, answered, `fork` has not resumed yet
+        self._requests: dict[int, ForkRequest] = {}  # by number, unanswered
+        self._unclaimed: dict[int, ForkRequest] = {}  # by pid, answered, `fork` has not resumed yet
         self._children: set[int] = set()  # pids that `fork` has returned
 
     @property
@@ -212,7 +91,7 @@ class ForkServer:
         Raises:
             ProcessUnavailable: not on Linux, no process to be had, or the entry point cannot be imported.
         """
-        _check_can_start()
+        check_can_start()
         if self._process is not None:
             raise ProcessUnavailable("a fork server is started once; make another one")
         self._loop = asyncio.get_running_loop()
@@ -235,15 +114,15 @@ class ForkServer:
         ours.setblocking(False)
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SOCKET_BYTES)
         with theirs:
-            config = json.dumps(_config(self._entry, self._preload)._asdict())
+            config = json.dumps(server_config(self._entry, self._preload)._asdict())
             ours.send(HEADER.pack(Kind.CONFIG, 0, 0) + config.encode())
             self._process = subprocess.Popen(
-                _command(theirs.fileno()),
+                server_command(theirs.fileno()),
                 stdin=subprocess.DEVNULL,
-                stdout=_inherited(1),
-                stderr=_inherited(2),
+                stdout=inherited(1),
+                stderr=inherited(2),
                 pass_fds=(theirs.fileno(),),
-                env={**_MALLOC, **_THREADS, **os.environ},
+                env=server_environment(),
                 start_new_session=True,  # a Ctrl-C in the terminal is the program's business
             )
         try:
@@ -332,7 +211,7 @@ class ForkServer:
         if self._control is None or not self._ready.done():
             raise ProcessUnavailable("the fork server does not run")
         self._last_number += 1
-        request = _Request(self._last_number, self._loop.create_future())
+        request = ForkRequest(self._last_number, self._loop.create_future())
         self._requests[request.number] = request
         try:
             self._post(request)
@@ -343,7 +222,7 @@ class ForkServer:
             self._requests.pop(request.number, None)
             self._claim(request)
 
-    def _claim(self, request: _Request) -> None:
+    def _claim(self, request: ForkRequest) -> None:
         """`fork` resumes: its caller has the process now, or nobody has."""
         outcome = request.outcome
         pid = outcome.result() if outcome.done() and not outcome.cancelled() and outcome.exception() is None else -1
@@ -367,7 +246,7 @@ class ForkServer:
 
     # --- the control socket
 
-    def _post(self, packet: _Request | bytes) -> None:
+    def _post(self, packet: ForkRequest | bytes) -> None:
         self._outbox.append(packet)
         if len(self._outbox) == 1:
             self._flush()
@@ -386,17 +265,17 @@ class ForkServer:
             return
         self._loop.remove_writer(control.fileno())
 
-    def _send(self, control: socket.socket, packet: _Request | bytes) -> None:
+    def _send(self, control: socket.socket, packet: ForkRequest | bytes) -> None:
         """One packet; a failure other than "not now" is the packet's own, and its sender is told."""
         try:
-            if isinstance(packet, _Request):
+            if isinstance(packet, ForkRequest):
                 packet.send(control)
             else:
                 control.send(packet)
         except BlockingIOError:
             raise
         except OSError as error:  # a dead server is told by its pidfd
-            if isinstance(packet, _Request) and not packet.outcome.done():
+            if isinstance(packet, ForkRequest) and not packet.outcome.done():
                 packet.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be reached: {error}"))
 
     def _on_readable(self) -> None:
@@ -468,67 +347,6 @@ class ForkServer:
         if pid in self._children:
             self._children.remove(pid)
             self._on_exit(pid, status)
-
-
-# --- what the server is told about this process
-
-
-def _check_can_start() -> None:
-    if not sys.platform.startswith("linux"):
-        raise ProcessUnavailable(f"actors in processes of their own need Linux (pidfd, memfd); this is {sys.platform}")
-    if os.environ.get(SERVER_VARIABLE) == str(os.getpid()):
-        raise ProcessUnavailable(
-            "this program is being imported by the fork server and must not start a system then; "
-            'put what it does under `if __name__ == "__main__":`'
-        )
-
-
-def _command(control_fd: int) -> list[str]:
-    # Our own flags (-O changes what `assert` means), and -P: the file's directory is no place to import from.
-    flags: list[str] = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
-    return [sys.executable, *flags, "-P", os.path.abspath(zygote.__file__), str(control_fd)]
-
-
-def _inherited(fd: int) -> int | None:
-    """Share a standard stream with the server, or give it /dev/null if a daemon has closed it."""
-    try:
-        os.fstat(fd)
-    except OSError:
-        return subprocess.DEVNULL
-    return None
-
-
-def _config(entry: str, preload: list[str]) -> Config:
-    package = __name__.partition(".")[0]
-    main, is_path = _program()
-    return Config(
-        parent=os.getpid(),
-        entry=entry,
-        preload=preload,
-        path=[directory or os.getcwd() for directory in sys.path],
-        argv=sys.argv,
-        package=package,
-        package_path=[os.path.abspath(path) for path in importlib.import_module(package).__path__],
-        main=main,
-        main_is_path=is_path,
-    )
-
-
-def _program() -> tuple[str, bool]:
-    """What `__main__` is: a module's name, or a path (then True), or "" if it cannot be imported a second time."""
-    module = sys.modules["__main__"]
-    if hasattr(sys, "ps1") or hasattr(builtins, "__IPYTHON__"):
-        return "", False
-    if module.__spec__ is not None:  # python -m name; a package's __main__.py seldom has a guard
-        name = module.__spec__.name
-        return ("", False) if name.rpartition(".")[2] == "__main__" else (name, False)
-    file = getattr(module, "__file__", None)
-    if file is None:  # python -c
-        return "", False
-    path = os.path.abspath(file)
-    if os.path.dirname(path) in {os.path.dirname(sys.executable), sysconfig.get_path("scripts")}:
-        return "", False  # a console script, such as pytest, defines no actors
-    return path, True
 
 
 def _cause(returncode: int | None) -> str:

@@ -6,6 +6,7 @@ a number from then on. `body` is a payload that whoever routes the frame does no
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -69,10 +70,11 @@ class Launch(Frame, tag=5):
 
 
 class Launched(Frame, tag=6):
-    """The actor is up, or (`problem`) is not."""
+    """The actor is up, or (`problem`) is not; `ignored`: it did not want to be."""
 
     id: int
     problem: str = ""
+    ignored: bool = False
 
 
 class Ended(Frame, tag=7):
@@ -119,6 +121,19 @@ class Record(Frame, tag=12):
     body: Raw
 
 
+class Run(Frame, tag=15):
+    """Messages of one type to one address, numbered from `first` on: stands for that many `Tell`s."""
+
+    to: int
+    name: int
+    first: int
+    bodies: Raw
+
+
+TakeRecord = Callable[[Record], None]
+"""Who takes the records for one address."""
+
+
 class Offer(Frame, tag=13):
     """A message whose acceptance is awaited under `id`, its handling is not."""
 
@@ -133,6 +148,27 @@ class Moved(Frame, tag=14):
     """The page has changed: told to a bounded mailbox only, at most once per loop tick."""
 
 
+def tagged(kind: type[Frame]) -> bytes:
+    """How a frame of this kind begins: an array, and its tag."""
+    tag = kind.__struct_config__.tag
+    assert isinstance(tag, int)
+    return bytes((0x90 | (len(kind.__struct_fields__) + 1), tag))
+
+
 AnyFrame = (
-    Tell | Ask | Reply | Failure | Launch | Launched | Ended | Command | Publish | Beat | Note | Record | Offer | Moved
+    Tell
+    | Ask
+    | Reply
+    | Failure
+    | Launch
+    | Launched
+    | Ended
+    | Command
+    | Publish
+    | Beat
+    | Note
+    | Record
+    | Offer
+    | Moved
+    | Run
 )

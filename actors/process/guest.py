@@ -10,12 +10,13 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
+import msgspec
 import uvloop
 
 from .. import exits, lives
 from ..cell import RUNNING, Cell
 from ..control.calls import obey_order
-from ..errors import HoldfastError, StartFailed
+from ..errors import HoldfastError, StartFailed, StartIgnored
 from ..events import ActorStarted, Event, event_data
 from ..exits import ExitReason, pack_exit
 from ..message import message_name
@@ -26,13 +27,15 @@ from .connection import BadFrame, Connection
 from .recipe import unpack_recipe
 from .relay import Arrived, OutsideHost, Peer, RelayedAsk, named, obey, text
 
+_BODIES = msgspec.msgpack.Decoder(list[frames.Raw])
+
 Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
 """Begins the life a launch frame asks for; the composition root gives one that knows recovery and supervision."""
 
 
 def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
     """Serve the root until its socket ends. Returns the exit code."""
-    page = memoryview(mmap.mmap(page_fd, mmap.PAGESIZE)).cast("Q")
+    page = memoryview(mmap.mmap(page_fd, 0)).cast("Q")
     os.close(page_fd)
     with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
         return runner.run(_serve(sock, page, launcher, prepare))
@@ -117,9 +120,9 @@ class Guest(Peer):
         super().__init__(Node("guest", loop))
         self.page: Any = page
         self.ended: asyncio.Future[int] = loop.create_future()
-        self.on_record: Callable[[frames.Record], None] | None = None
         self.recovery: Any = None  # the recovery method's side in this process, if it has one
         self._launcher = launcher
+        self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}
         self._host = OutsideHost(self)
@@ -130,13 +133,14 @@ class Guest(Peer):
         self.node.events.add_sink(self._on_event)
         self.takers: dict[type[frames.Frame], Callable[[Any], None]] = {
             frames.Tell: self._tell,
+            frames.Run: self._run,
             frames.Ask: self._ask,
             frames.Offer: lambda frame: self.on_offer([self._target(frame.to)], frame),
             frames.Reply: self.on_reply,
             frames.Failure: self.on_failure,
             frames.Launch: self._launch,
             frames.Command: lambda frame: self._command(self._target(frame.to), frame),
-            frames.Record: self._record,
+            frames.Record: self.on_record,
         }
 
     # -- the world outside ------------------------------------------------------------------------------------------
@@ -170,8 +174,10 @@ class Guest(Peer):
         """An address of this process is free."""
         root = self.node.root
         reason = cell.more.reason if cell.more is not None else exits.SHUTDOWN
+        with_parent = cell.parent is not None and cell.parent.state is not RUNNING
         if root is not None:
-            self.command(root, "gone", {"path": cell.path, "reason": pack_exit(reason)})
+            data = {"path": cell.path, "reason": pack_exit(reason), "with_parent": with_parent}
+            self.command(root, "gone", data)
 
     def _tell_born(self, path: str) -> None:
         """A life has begun at an address below ours."""
@@ -201,7 +207,7 @@ class Guest(Peer):
         """The hot path in: a plain message to our own actor, of a type it has had before."""
         route = self.routes.get((frame.to, frame.name))
         if route is not None and frame.sender is None:
-            cell, decode = route
+            cell, decode, _ = route
             try:
                 message = decode(frame.body)
             except Exception:
@@ -211,11 +217,31 @@ class Guest(Peer):
                 return
         self.on_tell(self._target(frame.to), frame, self.page if frame.number else None)
 
+    def _run(self, frame: frames.Run) -> None:
+        """Many such messages: decoded in one call."""
+        route = self.routes.get((frame.to, frame.name))
+        number, page = frame.first, self.page
+        if route is not None:
+            cell, _, decode = route
+            try:
+                messages = decode(frame.bodies)
+            except Exception:
+                route = None  # One of them: said below, with all names.
+            else:
+                admit = cell.admit
+                for message in messages:
+                    admit(cell, Arrived(message, None, number, page))
+                    number += 1
+                return
+        for body in _BODIES.decode(frame.bodies):
+            self._tell(frames.Tell(frame.to, frame.name, body, number))
+            number += 1
+
     def _ask(self, frame: frames.Ask) -> None:
         """The same for an ask that no turn waits for."""
         route = self.routes.get((frame.to, frame.name))
         if route is not None and frame.sender is None and not frame.chain:
-            cell, decode = route
+            cell, decode, _ = route
             try:
                 message = decode(frame.body)
             except Exception:
@@ -226,10 +252,6 @@ class Guest(Peer):
                 cell.admit(cell, ask)
                 return
         self.on_ask(self._target(frame.to), frame, self.page if frame.number else None)
-
-    def _record(self, frame: frames.Record) -> None:
-        if self.on_record is not None:
-            self.on_record(frame)
 
     def _target(self, to: frames.Name) -> Cell:
         """The cell at an address of this process."""
@@ -258,22 +280,25 @@ class Guest(Peer):
                 self._beat(float(limits["beat"]))
             up = self._launcher(self, cell, frame)
         except Exception as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
-            self._launched(frame.id, error.reason if isinstance(error, StartFailed) else str(exits.crash(error)))
+            self._launched(frame.id, error)
             return
         if up is None:
-            self._launched(frame.id, "")
+            self._launched(frame.id, None)
         else:
-            up.add_done_callback(lambda done: self._on_up(frame.id, done))
+            self._starting = frame.id, up
+            up.add_done_callback(lambda done: self._on_up())
 
-    def _on_up(self, key: int, done: asyncio.Future[None]) -> None:
-        error = done.exception()
+    def _on_up(self) -> None:
+        """Tell how the start went, once; it may be over before the loop calls back."""
+        if self._starting is not None and self._starting[1].done():
+            (key, done), self._starting = self._starting, None
+            self._launched(key, done.exception())
+
+    def _launched(self, key: int, error: BaseException | None) -> None:
         if isinstance(error, StartFailed):
-            self._launched(key, error.reason)
+            self.connection.send(frames.Launched(key, error.reason, isinstance(error, StartIgnored)))
         else:
-            self._launched(key, "" if error is None else str(error))
-
-    def _launched(self, key: int, problem: str) -> None:
-        self.connection.send(frames.Launched(key, problem))
+            self.connection.send(frames.Launched(key, "" if error is None else str(exits.crash(error))))
 
     def _command(self, cell: Cell, frame: frames.Command) -> None:
         if frame.verb == "bind":
@@ -287,6 +312,7 @@ class Guest(Peer):
 
     def report_end(self, cell: Cell, reason: ExitReason | None) -> None:
         """The process's own actor has ended: tell why, and end with it."""
+        self._on_up()
         told = pack_exit(reason if reason is not None else exits.SHUTDOWN)
         self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
         self.connection.close()

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from .. import links, lives
 from ..actor import Actor, Start
-from ..cell import RUNNING, Cell
+from ..cell import RUNNING, Cell, Host
 from ..codec import Parcel
 from ..exits import ExitReason
 from .connection import BadFrame
@@ -33,16 +33,34 @@ class Inner:
         """
         cell = self._cells.get(path)
         if cell is None:
-            above, _, name = path.rpartition("/")
-            parent = home if above == home.path else self._cells.get(above)
-            if parent is None:
-                raise BadFrame(f"{path} is not below {home.path}")
-            cell = self._cells[path] = self._node.cell_below(parent, name, self._host)
+            cell = self._node.cell_below(*self._place(home, path), self._host)
+            self._cells[path] = cell
             cell.state, cell.admit = RUNNING, self._admit
         cell.life = life
-        known = loaded(kind, Actor)
-        if known is not None:
-            cell.extra().start, cell.table = Start(known), known._table
+        know(cell, kind)
+
+    def homed(self, home: Cell, path: str, cell: Cell | None, host: Host) -> Cell:
+        """An address below `home` whose own home is here: its cell outlives the process.
+
+        Raises:
+            BadFrame: that address is not for this process to give.
+        """
+        parent, name = self._place(home, path)
+        if cell is None:
+            cell = self._node.cell_below(parent, name, host)
+        elif cell.parent is not parent:  # Those above it ended with their process, and are new.
+            cell.parent = parent
+            parent.children = {**(parent.children or {}), name: cell}
+        self._cells[path] = cell
+        return cell
+
+    def _place(self, home: Cell, path: str) -> tuple[Cell, str]:
+        """The cell above an address, and its name there."""
+        above, _, name = path.rpartition("/")
+        parent = home if above == home.path else self._cells.get(above)
+        if parent is None:
+            raise BadFrame(f"{path} is not below {home.path}")
+        return parent, name
 
     def _admit(self, cell: Cell, item: Any) -> None:
         """The mailbox of a stand-in: the class is known here, so it is known what it handles."""
@@ -50,11 +68,13 @@ class Inner:
             cell.require(item)
         self._host.admit(cell, item)
 
-    def gone(self, path: str, reason: ExitReason) -> None:
-        """The address is free."""
+    def gone(self, path: str, reason: ExitReason, *, with_parent: bool = False) -> None:
+        """The address is free; `with_parent`: because its supervisor has ended."""
         cell = self._cells.pop(path, None)
         if cell is None:
             return
+        if cell.host is not self._host:
+            cell.host.told(cell, "gone", {"with_parent": with_parent})
         more = cell.extra()
         more.reason = reason
         for topic in list(more.topics):
@@ -64,6 +84,14 @@ class Inner:
         lives.tell_enders(more, reason)
 
     def close(self, reason: ExitReason) -> None:
-        """The process is gone: children go before their parents."""
-        for path in reversed(list(self._cells)):
-            self.gone(path, reason)
+        """The process is gone: children go before their parents; who is homed here stays."""
+        for path, cell in reversed(list(self._cells.items())):
+            if cell.host is self._host:
+                self.gone(path, reason)
+
+
+def know(cell: Cell, kind: str) -> None:
+    """Have a stand-in refuse what its class does not handle, if that is loaded here."""
+    known = loaded(kind, Actor)
+    if known is not None:
+        cell.extra().start, cell.table = Start(known), known._table

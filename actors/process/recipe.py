@@ -42,6 +42,24 @@ def pack_recipe(start: Start[Any], where: str) -> bytes:
     return encode_value(_lower(start, where), where=f"{where}: start({start.kind.__name__}, ...)")
 
 
+def pack_data(value: object, where: str) -> bytes:
+    """A value with recipes somewhere in it, such as a child spec, as bytes.
+
+    Raises:
+        UnsavableValue, SpecError: as `pack_recipe`.
+    """
+    return encode_value(_lower(value, where), where=where)
+
+
+def unpack_data(data: bytes) -> Any:
+    """The value again. Imports the modules that define its classes: only for what the root has sent.
+
+    Raises:
+        SpecError: a class cannot be found. DamagedValue: these are no such bytes.
+    """
+    return _raise_up(decode_value(data))
+
+
 def unpack_recipe(data: bytes) -> Start[Any]:
     """The recipe again. Imports the module that defines the class.
 

@@ -28,6 +28,10 @@ Coroutine_ = types.CoroutineType
 NIL = msgspec.msgpack.encode(None)
 
 
+Route = tuple["Cell", Callable[[Any], Any], Callable[[Any], Any]]
+"""Where messages of one type go, and what decodes one of them, or a run."""
+
+
 class Peer:
     """One end of a connection, with the asks that wait for the other end."""
 
@@ -37,8 +41,10 @@ class Peer:
         self.codec: Codec = node.codec
         self.pending: dict[int, Ask] = {}
         self._last_id = 0
-        self.routes: dict[tuple[frames.Name, frames.Name], tuple[Cell, Callable[[Any], Any]]] = {}
+        self.routes: dict[tuple[frames.Name, frames.Name], Route] = {}
         self.kinds_out: dict[type, int] = {}
+        self.record_taker: Callable[[str], frames.TakeRecord] = no_records  # the recovery method's, by address
+        self._record_takers: dict[frames.Name, frames.TakeRecord] = {}
 
     # -- out --------------------------------------------------------------------------------------------------------
 
@@ -140,6 +146,14 @@ class Peer:
         else:
             ask.answer(reply)
 
+    def on_record(self, frame: frames.Record) -> None:
+        """Something for the recovery method at an address."""
+        take = self._record_takers.get(frame.to)
+        if take is None:
+            take = self.record_taker(self.connection.name_in(frame.to))
+            self._record_takers[self.connection.number_in(frame.to)] = take
+        take(frame)
+
     def on_failure(self, frame: frames.Failure) -> None:
         """The other side failed an ask of ours."""
         ask = self.pending.pop(frame.id, None)
@@ -153,7 +167,8 @@ class Peer:
         message = self.codec.message_in(cell, self.connection.name_in(frame.name), frame.body)
         if type(frame.name) is int and cell is self.node.root and not cell.host.takes_parcels:
             # Our own actor's class stays: so does the way in for this type.
-            self.routes[frame.to, frame.name] = cell, self.codec.decoder(type(message))
+            kind: Any = type(message)
+            self.routes[frame.to, frame.name] = cell, self.codec.decoder(kind), self.codec.decoder(list[kind])
         return message
 
     def _sender(self, name: frames.Name | None) -> Cell | None:
@@ -204,6 +219,11 @@ class Peer:
             if page is not None:
                 page[1] = frame.number
             ask.fail(error)
+
+
+def no_records(path: str) -> frames.TakeRecord:
+    """Nobody is recovered over this connection."""
+    raise BadFrame(f"a record for {path}, which is not recovered")
 
 
 class Accepted(Message[None]):

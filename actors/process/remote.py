@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any
 
 from .. import links, lives, mailbox
 from ..cell import DOWN, GONE, RUNNING, Cell
 from ..codec import Parcel
-from ..errors import AskFailed, BadMessage, HoldfastError, ProcessUnavailable, StartFailed
+from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
 from ..events import ActorStarted
 from ..exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..mail import Ask, Envelope, Item
@@ -60,7 +61,7 @@ class Outlet:
             worker.send_item(cell, self.path, item, number)
         else:  # A plain message of a type that was sent before: all names are numbers.
             connection = worker.connection
-            connection.send(frames.Tell(connection.name_out(self.path), name, item, number), self.path)
+            connection.tell(connection.name_out(self.path), name, item, number, self.path)  # type: ignore[arg-type]
         self.sent = number
         flight = self.flight
         flight.append((number, item))
@@ -217,19 +218,27 @@ class ProcessHost:
             if more.bound is not None:
                 more.bound = RemoteBound(more.bound)
                 cell.admit = admit_remote_bounded
+        return self.begin(cell, self._start(cell))
+
+    def begin(self, cell: Cell, start: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
+        """Run the start of a life outside the supervisor's turn."""
         self._stop_wanted = None
-        self._starting = cell.node.loop.create_task(self._start(cell), name=f"start of {cell.path}")
+        self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
         self._starting.add_done_callback(_seen)
         return self._starting
 
-    async def _start(self, cell: Cell) -> None:
-        more = cell.extra()
-        start = more.start
+    async def take(self, cell: Cell) -> tuple[Worker, bytes]:
+        """A process for the next life at `cell`, which is running from now on, and its recipe.
+
+        Raises:
+            StartFailed: there is none to be had, or the actor was stopped meanwhile.
+        """
+        start = cell.extra().start
         assert start is not None
         try:
             recipe = pack_recipe(start, cell.path)
             worker = await self._workers.take()
-        except ProcessUnavailable as error:
+        except HoldfastError as error:
             raise StartFailed(cell.path, str(error)) from error
         if cell.state is not DOWN:
             worker.kill(KILLED)
@@ -237,6 +246,13 @@ class ProcessHost:
         cell.life += 1
         cell.state = RUNNING
         worker.adopt(cell, self._limits, self.died)
+        return worker, recipe
+
+    async def _start(self, cell: Cell) -> None:
+        more = cell.extra()
+        start = more.start
+        assert start is not None
+        worker, recipe = await self.take(cell)
         for topic in start.kind._topics:
             cell.node.topics.subscribe(topic, cell)
         try:
@@ -396,8 +412,8 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_note(frame)
         case frames.Record():
             worker.on_record(frame)
-        case frames.Launch():
-            raise BadFrame("an actor process cannot launch actors here")
+        case frames.Launch() | frames.Run():
+            raise BadFrame(f"an actor process cannot send a {type(frame).__name__} here")
 
 
 def _target(node: Node, worker: Worker, to: frames.Name) -> Cell:
@@ -420,6 +436,7 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "born":
             worker.inner.born(cell, text(frame, "path"), text(frame, "kind"), int(frame.data.get("life", 0)))
         case "gone":
-            worker.inner.gone(text(frame, "path"), unpack_exit(frame.data.get("reason")))
+            reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
+            worker.inner.gone(text(frame, "path"), reason, with_parent=with_parent)
         case _:
             obey(node, cell, frame)

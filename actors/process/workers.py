@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING, Any
 from ..cell import Cell
 from ..control.calls import order, send_call
 from ..control.orders import Look
-from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed
+from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed, StartIgnored
 from ..events import TRACED, LogLine, ProcessDied, ProcessStarted
 from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpack_exit
 from ..mail import Ask
 from . import frames
 from .connection import Connection
-from .forkserver import Forked, ForkServer, has_ended
+from .forked import Forked, has_ended
+from .forkserver import ForkServer
 from .inner import Inner
 from .limits import Limits
 from .output import OutputReader
@@ -49,7 +50,6 @@ class Worker(Peer):
         self.targets: dict[int, Cell] = {}
         self.inner = Inner(self.node, self)
         self.cell: Cell | None = None
-        self.on_record: Callable[[frames.Record], None] = _no_records
         self._workers = workers
         self._died: Callable[[Cell, ExitReason], None] | None = None
         self._launches: dict[int, asyncio.Future[None]] = {}
@@ -74,7 +74,7 @@ class Worker(Peer):
         self.connection.takers = {
             frames.Reply: self.on_reply,
             frames.Failure: self.on_failure,
-            frames.Record: lambda frame: self.on_record(frame),
+            frames.Record: self.on_record,
         }
         await self.connection.open(forked.sock)
         for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
@@ -159,8 +159,9 @@ class Worker(Peer):
         up = self._launches.get(frame.id)
         if up is None or up.done():
             return
-        if frame.problem:
-            up.set_exception(StartFailed(self.cell.path if self.cell is not None else "", frame.problem))
+        if frame.ignored or frame.problem:
+            kind = StartIgnored if frame.ignored else StartFailed
+            up.set_exception(kind(self.cell.path if self.cell is not None else "", frame.problem))
         else:
             up.set_result(None)
 
@@ -268,10 +269,6 @@ class Worker(Peer):
                 return OutOfMemory("killed by the kernel")
             return Signal(number)
         return Exited(os.waitstatus_to_exitcode(status))
-
-
-def _no_records(frame: frames.Record) -> None:
-    """Nobody recovers the actor of this process."""
 
 
 def _seen(done: asyncio.Future[Any]) -> None:

@@ -6,7 +6,15 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.events import ActorCrashed, ActorStarted, ChildRestarted, DeadLetter, event_data, event_from
+from holdfast.actors.events import (
+    ActorCrashed,
+    ActorStarted,
+    ChildRestarted,
+    ChildTerminated,
+    DeadLetter,
+    event_data,
+    event_from,
+)
 
 
 class Do(hf.Message[Any]):
@@ -35,6 +43,7 @@ async def test_a_life_as_events(system: hf.ActorSystem) -> None:
     assert [(type(event), event.address) for event in events] == [
         (ActorStarted, "/t/one"),
         (ActorCrashed, "/t/one"),
+        (ChildTerminated, "/t/one"),
         (ChildRestarted, "/t/one"),
         (ActorStarted, "/t/one"),
         (DeadLetter, "/t/one"),

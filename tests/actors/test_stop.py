@@ -7,7 +7,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import HookFailed
-from holdfast.supervision.supervisor import AlreadyStarted
+from holdfast.supervision.admin import AlreadyStarted
 
 
 class Do(hf.Message[Any]):

@@ -16,9 +16,9 @@ if ROOT not in sys.path:
     sys.path.append(ROOT)
 
 
-@pytest.fixture(params=["task", "process"])
+@pytest.fixture(params=["task", "process", "subtree"])
 def isolation(request: pytest.FixtureRequest) -> str:
-    """The same class, unchanged, lives as a task and in a process of its own."""
+    """The same class, unchanged, lives as a task, in a process of its own, and below a supervisor that has one."""
     return str(request.param)
 
 
@@ -27,3 +27,9 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
     """A running system that allows many restarts; it stops when the test ends."""
     async with hf.ActorSystem("app", log=False, intensity=1000) as running:
         yield running
+
+
+@pytest.fixture
+def gate(tmp_path: Path) -> Path:
+    """Where a `Doer` stops, until it is let through."""
+    return tmp_path / "gate"

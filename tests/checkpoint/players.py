@@ -11,6 +11,19 @@ from typing import Any
 import holdfast as hf
 
 
+async def start(
+    system: hf.ActorSystem, isolation: str, name: str, recipe: hf.Start[Any], **options: Any
+) -> hf.ActorRef[Any]:
+    """Start an actor as a task, in a process, or below a supervisor that has a process ("subtree")."""
+    if isolation != "subtree":
+        return await system.start(hf.child(name, recipe, isolation=isolation, **options))  # type: ignore[arg-type]
+    spec = hf.supervisor(
+        f"of-{name}", children=[hf.child(name, recipe, **options)], isolation="process", intensity=1000
+    )
+    await system.start(spec)
+    return system.ref(f"/app/of-{name}/{name}", recipe.kind)
+
+
 class Note(hf.Message[int]):
     text: str
 

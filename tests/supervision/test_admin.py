@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.supervision.supervisor import (
+from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
     ChildBusy,
@@ -118,10 +118,10 @@ async def test_what_does_not_fit_is_refused_by_type_and_changes_nothing() -> Non
         top = await begin(system, kid("up"), kid("down"))
         await top.ask(TerminateChild("down"))
         refusals: list[tuple[hf.Message[Any], hf.Refusal]] = [
-            (StartChild(kid("up")), AlreadyStarted("up")),
+            (StartChild(kid("up")), AlreadyStarted("up", system.ref("/app/top/up", Kid))),
             (StartChild(kid("down")), AlreadyPresent("down")),
-            (RestartChild("up"), ChildBusy("up")),
-            (DeleteChild("up"), ChildBusy("up")),
+            (RestartChild("up"), ChildBusy("up", "running")),
+            (DeleteChild("up"), ChildBusy("up", "running")),
             (TerminateChild("nobody"), NoSuchChild("nobody")),
             (RestartChild("nobody"), NoSuchChild("nobody")),
             (DeleteChild("nobody"), NoSuchChild("nobody")),
@@ -268,7 +268,7 @@ async def test_the_supervisor_answers_while_children_back_off() -> None:
             system.ref(f"/app/top/{name}", Kid).tell(Boom())
         await system.node.settled()
         assert await states(top) == {"x": "restarting", "y": "restarting"}
-        with pytest.raises(AlreadyStarted):
+        with pytest.raises(AlreadyPresent):
             await top.ask(StartChild(kid("x")))
         with pytest.raises(ChildBusy):
             await top.ask(RestartChild("x"))
@@ -280,3 +280,42 @@ async def test_the_supervisor_answers_while_children_back_off() -> None:
         assert await states(top) == {"x": "restarting", "y": "stopped", "z": "running"}
         await asyncio.sleep(100.0)
         assert await states(top) == {"x": "running", "y": "stopped", "z": "running"}
+
+
+async def test_counts_are_of_specs_and_of_who_runs() -> None:
+    """otp.md 1.9: supervisors and workers count whether they run or not."""
+    async with hf.ActorSystem(log=False) as system:
+        top = await begin(system, kid("a"), kid("b"), hf.supervisor("c"), hf.dynamic("d"))
+        assert await top.ask(hf.CountChildren()) == hf.ChildCounts(specs=4, active=4, supervisors=2, workers=2)
+        for name in "bc":
+            await top.ask(TerminateChild(name))
+        assert await top.ask(hf.CountChildren()) == hf.ChildCounts(specs=4, active=2, supervisors=2, workers=2)
+
+
+async def test_a_spec_comes_back_with_its_defaults() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        spec = kid("a", restart="transient")
+        top = await begin(system, spec)
+        told = await top.ask(hf.GetChildSpec("a"))
+        assert told == spec
+        assert (told.restart, told.shutdown, told.is_supervisor) == ("transient", 5.0, False)
+        with pytest.raises(NoSuchChild):
+            await top.ask(hf.GetChildSpec("b"))
+
+
+async def test_a_name_taken_by_somebody_else_is_told_as_it_is() -> None:
+    """otp.md 1.9: a clash outside the supervisor's own list is passed through."""
+    async with hf.ActorSystem(log=False) as system:
+        system.spawn(hf.start(Kid), "x")
+        with pytest.raises(hf.NameTaken, match="/app/x"):
+            await system.start(kid("x"))
+        assert [info.id for info in await system._root_ref().ask(WhichChildren())] == []
+
+
+async def test_calls_to_a_supervisor_that_is_not_there_say_so() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        top = await begin(system)
+        await system.stop(top)
+        for call in (WhichChildren(), StartChild(kid("x")), TerminateChild("x")):
+            with pytest.raises(hf.ActorStopped):
+                await top.ask(call)

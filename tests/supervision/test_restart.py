@@ -7,7 +7,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import ChildRestarted, SupervisorGaveUp
-from holdfast.supervision.supervisor import ChildBusy, DeleteChild, RestartChild, TerminateChild, WhichChildren
+from holdfast.supervision.admin import ChildBusy, DeleteChild, RestartChild, TerminateChild, WhichChildren
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 Where = Literal["__init__", "on_start", "async on_start"]

@@ -7,7 +7,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import HookFailed, LifeAbandoned
-from holdfast.supervision.supervisor import StartChild, TerminateChild
+from holdfast.supervision.admin import StartChild, TerminateChild
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 

@@ -122,11 +122,7 @@ def test_start_takes_actor_classes_only() -> None:
         hf.start(int)  # type: ignore[type-var]
 
 
-def test_what_does_not_go_together_yet_is_refused_by_name() -> None:
-    recorded = hf.hybrid()
-    with pytest.raises(hf.SpecError, match=r"child 'a': mailbox=bounded\(...\) does not go with recovery"):
-        hf.child("a", hf.start(hf.Actor), recovery=recorded, mailbox=hf.bounded(3))
-    inner = hf.supervisor("inner", children=[hf.child("a", hf.start(hf.Actor), recovery=recorded)])
-    with pytest.raises(hf.SpecError, match="supervisor 'outer': a subtree in a process cannot hold recorded children"):
+def test_a_process_holds_no_processes() -> None:
+    inner = hf.supervisor("inner", children=[hf.child("a", hf.start(hf.Actor), isolation="process")])
+    with pytest.raises(hf.SpecError, match="supervisor 'outer': a subtree in a process cannot hold process children"):
         hf.supervisor("outer", children=[inner], isolation="process")
-    hf.child("a", hf.start(hf.Actor), recovery=hf.fresh(), mailbox=hf.bounded(3))

@@ -9,8 +9,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import ChildRestarted, SupervisorGaveUp
+from holdfast.supervision.admin import RestartChild, TerminateChild, WhichChildren
 from holdfast.supervision.spec import Restart, Strategy
-from holdfast.supervision.supervisor import RestartChild, TerminateChild, WhichChildren
 
 
 class Boom(hf.Message): ...

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 import holdfast as hf
-from holdfast.supervision.supervisor import AlreadyStarted
+from holdfast.supervision.admin import AlreadyStarted
 
 # The failure of a tree comes out of the whole `async with`, so a block cannot be a single statement.
 # ruff: noqa: PT012

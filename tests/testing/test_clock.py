@@ -6,7 +6,8 @@ import time
 
 import pytest
 
-from holdfast.testing.clock import NothingToWaitFor, VirtualClockLoop, virtual_loop_factory
+from holdfast.testing.clock import NothingToWaitFor, VirtualClockLoop
+from holdfast.testing.clock import virtual as virtual_loop
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -77,7 +78,7 @@ async def test_a_socket_is_waited_for_when_no_timer_is_set() -> None:
 
 def test_a_loop_that_would_hang_says_so() -> None:
     with (
-        asyncio.Runner(loop_factory=virtual_loop_factory) as runner,
+        asyncio.Runner(loop_factory=virtual_loop) as runner,
         pytest.raises(NothingToWaitFor, match="at virtual time 2 s"),
     ):
         runner.run(wait_for_nothing())
@@ -99,7 +100,7 @@ def test_a_thread_that_the_loop_does_not_know_may_still_wake_it() -> None:
         finally:
             thread.join()
 
-    with asyncio.Runner(loop_factory=virtual_loop_factory) as runner:
+    with asyncio.Runner(loop_factory=virtual_loop) as runner:
         assert runner.run(main()) == "woken"
 
 

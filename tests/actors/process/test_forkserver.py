@@ -22,7 +22,8 @@ import pytest
 
 from holdfast.actors.errors import HoldfastError, ProcessUnavailable
 from holdfast.actors.process import forkserver
-from holdfast.actors.process.forkserver import Forked, ForkServer
+from holdfast.actors.process.forked import Forked
+from holdfast.actors.process.forkserver import ForkServer
 
 SECONDS = 30.0
 

@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import ChildRestarted, ProcessDied, SupervisorGaveUp
-from holdfast.supervision.supervisor import WhichChildren
+from holdfast.supervision.admin import WhichChildren
 from tests.actors.process.players import (
     Account,
     Add,

@@ -1,0 +1,90 @@
+"""How the fork server is started: its command and environment, and what it is told about this process."""
+
+from __future__ import annotations
+
+import builtins
+import importlib
+import os
+import subprocess
+import sys
+import sysconfig
+
+from ..errors import ProcessUnavailable
+from . import boot
+from .boot import SERVER_VARIABLE, Config
+
+# Without these, messages of a megabyte cost a page fault per page each time: 4 to 5 times slower.
+_MALLOC = {
+    "MALLOC_MMAP_THRESHOLD_": "67108864",
+    "MALLOC_TRIM_THRESHOLD_": "134217728",
+    "MALLOC_TOP_PAD_": "16777216",
+}
+# Native thread pools: their threads would not survive the fork, and bit-identical replay needs one thread.
+_THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+def server_environment() -> dict[str, str]:
+    """Our environment; what the user has set stays as it is."""
+    return {**_MALLOC, **_THREADS, **os.environ}
+
+
+def check_can_start() -> None:
+    """Raise ProcessUnavailable where no fork server can or must be started."""
+    if not sys.platform.startswith("linux"):
+        raise ProcessUnavailable(f"actors in processes of their own need Linux (pidfd, memfd); this is {sys.platform}")
+    if os.environ.get(SERVER_VARIABLE) == str(os.getpid()):
+        raise ProcessUnavailable(
+            "this program is being imported by the fork server and must not start a system then; "
+            'put what it does under `if __name__ == "__main__":`'
+        )
+
+
+def server_command(control_fd: int) -> list[str]:
+    """What to exec."""
+    # Our own flags (-O changes what `assert` means), and -P: the file's directory is no place to import from.
+    flags: list[str] = subprocess._args_from_interpreter_flags()  # type: ignore[attr-defined]
+    return [sys.executable, *flags, "-P", os.path.abspath(boot.__file__), str(control_fd)]
+
+
+def inherited(fd: int) -> int | None:
+    """Share a standard stream with the server, or give it /dev/null if a daemon has closed it."""
+    try:
+        os.fstat(fd)
+    except OSError:
+        return subprocess.DEVNULL
+    return None
+
+
+def server_config(entry: str, preload: list[str]) -> Config:
+    """What the server must know of this process."""
+    package = __name__.partition(".")[0]
+    main, is_path = _program()
+    return Config(
+        parent=os.getpid(),
+        entry=entry,
+        preload=preload,
+        path=[directory or os.getcwd() for directory in sys.path],
+        argv=sys.argv,
+        server=f"{__package__}.zygote",
+        package=package,
+        package_path=[os.path.abspath(path) for path in importlib.import_module(package).__path__],
+        main=main,
+        main_is_path=is_path,
+    )
+
+
+def _program() -> tuple[str, bool]:
+    """What `__main__` is: a module's name, or a path (then True), or "" if it cannot be imported a second time."""
+    module = sys.modules["__main__"]
+    if hasattr(sys, "ps1") or hasattr(builtins, "__IPYTHON__"):
+        return "", False
+    if module.__spec__ is not None:  # python -m name; a package's __main__.py seldom has a guard
+        name = module.__spec__.name
+        return ("", False) if name.rpartition(".")[2] == "__main__" else (name, False)
+    file = getattr(module, "__file__", None)
+    if file is None:  # python -c
+        return "", False
+    path = os.path.abspath(file)
+    if os.path.dirname(path) in {os.path.dirname(sys.executable), sysconfig.get_path("scripts")}:
+        return "", False  # a console script, such as pytest, defines no actors
+    return path, True

@@ -1,0 +1,97 @@
+"""Values without a schema as bytes, for snapshots: each returns with its type, or is refused by name.
+
+A value is first lowered to a tree of what msgpack has types for: lists, dicts with scalars for keys, scalars. What is
+so already is left as it is. Anything else becomes a list that starts with a mark, which is an empty extension value;
+the mark's code is that of the type, and the rest of the list are the value's parts.
+
+The bytes: version, flag; with flag 0 a msgpack tree without marks; with flag 1 the length of the tree (8 bytes, big
+endian), the tree, and the raw buffers that its marks mention, in that order.
+
+`writing.py` lowers and packs, `reading.py` unpacks and makes again. What they both know of the types is in `forms.py`
+(the builtin ones), `classes.py` (those of users) and `arrays.py` (numpy's).
+"""
+
+from __future__ import annotations
+
+import hashlib
+
+from ..errors import DamagedValue, UnsavableValue
+from .forms import FORMAT, HEAD
+from .reading import Decoder, make_int, unpack
+from .writing import pieces
+
+__all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest"]
+
+
+def encode_value(value: object, *, where: str = "value") -> bytes:
+    """Save a value with the types of all that is in it.
+
+    What can change (a list, dict, array, dataclass ...) and is reached twice is one object again when read; only arrays
+    that overlap in memory become separate. Equal values may differ in bytes: compare their `state_digest`.
+
+    Args:
+        value: of the builtin types and those of collections, datetime (UTC, fixed offset, ZoneInfo), decimal,
+            fractions, uuid and pathlib; a random.Random; an Enum, dataclass, msgspec.Struct or NamedTuple whose class
+            can be imported; a numpy array or scalar of any dtype without objects, Generator or RandomState. A subclass
+            of one of these is another type.
+        where: the name of the value in errors.
+
+    Raises:
+        UnsavableValue: something in it is of another type, contains itself, or is nested deeper than about 300 levels.
+
+    >>> decode_value(encode_value({"seen": {(1, 2)}, 7: b"x"}))
+    {'seen': {(1, 2)}, 7: b'x'}
+    >>> encode_value({"x": [1, object()]}, where="balance")  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+    holdfast.actors.errors.UnsavableValue: balance['x'][1]: a value of type object cannot be saved; make it ...
+    """
+    return b"".join(pieces(value, where, canonical=False))
+
+
+def state_digest(value: object) -> bytes:
+    """Digest a value: 16 bytes (blake2b), the same in every process for values of equal types and contents.
+
+    The order of a dict counts; that of a set does not, nor whether two equal parts are one object. Only numpy's
+    longdouble is not covered: some of its bytes have no meaning.
+
+    Raises:
+        UnsavableValue: as `encode_value`.
+
+    >>> state_digest({"b", "a"}) == state_digest({"a", "b"}), state_digest([1]) == state_digest([True])
+    (True, False)
+    """
+    digest = hashlib.blake2b(digest_size=16)
+    for piece in pieces(value, "value", canonical=True):
+        digest.update(piece)
+    return digest.digest()
+
+
+def decode_value(data: bytes | memoryview) -> object:
+    """Read what `encode_value` wrote. Arrays are writable and own their memory.
+
+    Classes are found by importing their module, and must be of the kind that was saved. No `__init__` is called; only
+    a Struct has to be made by its constructor, after which its fields are set to what they were.
+
+    Raises:
+        DamagedValue: whatever is wrong with the bytes.
+
+    >>> decode_value(encode_value((1, 2.0, True, None)))
+    (1, 2.0, True, None)
+    >>> decode_value(b"")
+    Traceback (most recent call last):
+    holdfast.actors.errors.DamagedValue: a saved value cannot be read: it is cut short; use an older one
+    """
+    view = memoryview(data).cast("B")
+    if len(view) < 2:
+        raise DamagedValue("it is cut short")
+    if view[0] != FORMAT or view[1] > 1:
+        raise DamagedValue(f"it has format {view[0]}.{view[1]}, and only format {FORMAT} is known")
+    try:
+        if view[1] == 0:
+            return unpack(view[2:], ext_hook=make_int)
+        tree_bytes = HEAD.unpack_from(view)[2]
+        return Decoder(view[HEAD.size + tree_bytes :]).value(view[HEAD.size : HEAD.size + tree_bytes])
+    except (DamagedValue, MemoryError):  # Out of memory is no damage: the bytes may be good.
+        raise
+    except Exception as error:
+        raise DamagedValue(f"{type(error).__name__}: {error}") from error

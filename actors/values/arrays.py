@@ -1,0 +1,141 @@
+"""Arrays, scalars and generators of numpy, if the program has imported it."""
+
+from __future__ import annotations
+
+import math
+import re
+from typing import Any, Final, cast
+
+from ..errors import DamagedValue, UnsavableValue
+from .forms import ARRAY, BITS, GENERATOR, RANDOM_STATE, SEED, TEXT, Blob, Make
+
+_LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0, "SFC64": 0}
+# Of numbers, text, bytes, times. Other names mean objects, or (a time unit of 0 seconds) end the process.
+_DTYPE: Final = re.compile(r"[<>|=]([biufcSUV]\d{1,9}|[qQ]|[mM]8(\[([1-9]\d{0,8})?[a-zA-Z]+\])?)")
+
+
+def array_form(np: Any, kind: Any, x: Any, *, in_order: bool) -> list[Any] | None:
+    """A mark and the parts of `x`, or None if it is not one of numpy's; `in_order` keeps Fortran order."""
+    if kind is np.str_ or kind is np.bytes_:  # as an array it would lose the NULs at its end
+        return [TEXT, str.__str__(x) if kind is np.str_ else bytes(x)]
+    if kind is np.ndarray or (issubclass(kind, np.generic) and kind is x.dtype.type):
+        order = "F" if in_order and x.flags.f_contiguous and not x.flags.c_contiguous else "C"
+        if x.dtype.names:  # What happens to be between its fields is left out.
+            x, old = np.zeros_like(x), x
+            x[...] = old
+        flat = np.ascontiguousarray(x.T if order == "F" else x).reshape(-1)
+        dtype, blob = _dtype_parts(x.dtype), Blob(flat.view(np.uint8) if flat.nbytes else b"")
+        return [ARRAY, dtype, x.shape, order if kind is np.ndarray else "", blob]
+    if kind is np.random.Generator:
+        return [GENERATOR, x.bit_generator]
+    if kind is np.random.RandomState and (state := x.get_state(legacy=False))["bit_generator"] == "MT19937":
+        return [RANDOM_STATE, state]
+    if kind.__name__ in _LAST_POSITION and kind is getattr(np.random, kind.__name__):
+        return [BITS, x.state, x.seed_seq]
+    if kind is np.random.SeedSequence and _is_seed(x.entropy, x.spawn_key, x.pool_size):
+        return [SEED, x.entropy, x.spawn_key, x.pool_size, x.n_children_spawned]
+    return None
+
+
+def _numpy() -> Any:
+    import numpy as np
+
+    return np
+
+
+def _dtype_parts(dtype: Any) -> Any:
+    """A dtype as its name, [base, shape], or [fields, size, is aligned]."""
+    parts: Any = dtype.byteorder + dtype.char if dtype.char in "qQ" else dtype.str  # longlong is not int64
+    if dtype.names is not None:
+        fields = [[name, _dtype_parts(dtype[name]), *dtype.fields[name][1:]] for name in dtype.names]
+        parts = [fields, dtype.itemsize, dtype.isalignedstruct]
+    elif dtype.subdtype is not None:
+        parts = [_dtype_parts(dtype.base), dtype.shape]
+    try:
+        made = _make_dtype(parts)
+        if (made, made.type, made.metadata) == (dtype, dtype.type, dtype.metadata):
+            return parts
+    except (DamagedValue, TypeError, ValueError):  # of objects, or from another library
+        pass
+    raise UnsavableValue("", f"a numpy value of dtype {dtype}")
+
+
+def _make_dtype(parts: Any) -> Any:
+    np = _numpy()
+    if isinstance(parts, str):
+        if not _DTYPE.fullmatch(parts):
+            raise DamagedValue(f"it has an array of dtype {parts}")
+        dtype = np.dtype(parts)
+    elif len(parts) == 2:
+        base, shape = parts
+        dtype = np.dtype((_make_dtype(base), shape))
+    else:
+        fields, size, is_aligned = parts
+        columns = {
+            "names": [name for name, *_ in fields],
+            "formats": [_make_dtype(form) for _, form, *_ in fields],
+            "offsets": [offset for _, _, offset, *_ in fields],
+            "titles": [title[0] if title else None for _, _, _, *title in fields],
+        }
+        dtype = np.dtype({**columns, "itemsize": size}, align=is_aligned)
+    if dtype.hasobject:  # Numpy would take its bytes for addresses.
+        raise DamagedValue(f"it has an array of dtype {dtype}")
+    return dtype
+
+
+def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview) -> Any:
+    made = _make_dtype(dtype)
+    sizes = cast("tuple[int, ...]", shape if type(shape) is tuple else (-1,))
+    # Numpy would take a size of -1 for "as many as there are", and divide by the size of an item.
+    if min(sizes, default=0) < 0 or math.prod(sizes) * made.itemsize != len(data):
+        raise DamagedValue(f"it has {len(data)} bytes for an array of shape {shape} and dtype {made}")
+    array = _numpy().ndarray(shape, made, data, order=order or "C").copy(order or "C")
+    if array.shape != shape:
+        raise DamagedValue(f"it has an array of shape {shape}")
+    return array if order else array[()]
+
+
+def _make_text(text: str | bytes) -> Any:
+    kinds = {str: _numpy().str_, bytes: _numpy().bytes_}
+    return kinds[type(text)](text)
+
+
+def _make_bits(state: dict[str, Any], seed: Any) -> Any:
+    kind, position = state["bit_generator"], state.get("buffer_pos", state["state"].get("pos", 0))
+    if not 0 <= position <= _LAST_POSITION[kind]:  # Numpy does not check, and would read what is there.
+        raise DamagedValue(f"it has a {kind} at position {position}")
+    if not all(isinstance(words, int | _numpy().ndarray) for words in state["state"].values()):
+        raise DamagedValue(f"it has a {kind} without a state")
+    bits = getattr(_numpy().random, kind)(0 if seed is None else seed)
+    bits.state = state
+    return bits
+
+
+def _is_seed(entropy: Any, spawn_key: tuple[int, ...], pool_size: int) -> bool:
+    np = _numpy()
+    words: Any = entropy if type(entropy) in (list, tuple, np.ndarray) else [0 if entropy is None else entropy]
+    is_small = type(spawn_key) is tuple and pool_size <= 64  # Its time grows with the square of the pool.
+    return is_small and all(isinstance(word, int | np.integer) for word in (*words, *spawn_key))
+
+
+def _make_seed(entropy: Any, spawn_key: tuple[int, ...], pool_size: int, n_children: int) -> Any:
+    if not _is_seed(entropy, spawn_key, pool_size):
+        raise DamagedValue("it has a SeedSequence that is none")
+    make = _numpy().random.SeedSequence
+    return make(entropy, spawn_key=spawn_key, pool_size=pool_size, n_children_spawned=n_children)
+
+
+def _make_random_state(state: dict[str, Any]) -> Any:
+    made = _numpy().random.RandomState(_make_bits(state, None))
+    made.set_state(state)
+    return made
+
+
+MAKE_ARRAYS: Final[dict[int, Make]] = {
+    ARRAY.code: lambda parts: _make_array(*parts),
+    TEXT.code: lambda parts: _make_text(*parts),
+    BITS.code: lambda parts: _make_bits(*parts),
+    SEED.code: lambda parts: _make_seed(*parts),
+    GENERATOR.code: lambda parts: _numpy().random.Generator(*parts),
+    RANDOM_STATE.code: lambda parts: _make_random_state(*parts),
+}

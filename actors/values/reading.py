@@ -1,0 +1,145 @@
+"""Making values again from what was packed; nothing is trusted, nothing but what the marks say is made."""
+
+from __future__ import annotations
+
+import enum
+from collections import defaultdict
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final, cast
+
+import msgpack
+from msgpack import ExtType
+
+from ..errors import DamagedValue
+from .arrays import MAKE_ARRAYS
+from .classes import class_mark, find_class, is_factory, slots_of
+from .forms import (
+    AGAIN,
+    BUFFER,
+    DATACLASS,
+    DEFAULTDICT,
+    ENUM,
+    NAMED,
+    SHARED,
+    STRUCT,
+    TYPES,
+    Make,
+    Mark,
+    pairs,
+)
+
+
+def make_int(code: int, data: bytes) -> int:
+    """An int that msgpack has no type for."""
+    if code != 0:
+        raise DamagedValue(f"it has an extension value with code {code}")
+    return int.from_bytes(data, "big", signed=True)
+
+
+_MARKS: Final = {code: Mark(code) for code in range(1, 64)}
+unpack: Final = cast(
+    "Callable[..., Any]", partial(msgpack.unpackb, strict_map_key=False, unicode_errors="surrogatepass")
+)
+_MAKE: Final[dict[int, Make]] = {
+    **{code: make for code, _, _, make in TYPES},
+    **MAKE_ARRAYS,
+}
+
+
+class Decoder:
+    """What msgpack calls for each extension value and each list, inner ones first."""
+
+    def __init__(self, buffers: memoryview) -> None:
+        self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
+        self.open_marks = 0
+        self.shared: dict[int, object] = {}
+        self.classes: dict[str, tuple[Any, ExtType | None, dict[str, Any]]] = {}
+        self.make: dict[int, Make] = _MAKE | {
+            BUFFER.code: self.make_buffer,
+            SHARED.code: self.make_shared,
+            AGAIN.code: self.make_again,
+            DEFAULTDICT.code: self.make_defaultdict,
+            ENUM.code: self.make_enum,
+            DATACLASS.code: partial(self.make_record, DATACLASS),
+            STRUCT.code: partial(self.make_record, STRUCT),
+            NAMED.code: partial(self.make_record, NAMED),
+        }
+
+    def value(self, tree: memoryview) -> object:
+        value: object = unpack(tree, ext_hook=self.on_extension, list_hook=self.on_list)
+        if self.open_marks or self.buffers:
+            raise DamagedValue("it has something that belongs nowhere")
+        return value
+
+    def on_extension(self, code: int, data: bytes) -> int:
+        if code == 0:
+            return make_int(code, data)
+        if data:
+            raise DamagedValue(f"it has an extension value with code {code}")
+        self.open_marks += 1
+        return _MARKS[code]
+
+    def on_list(self, parts: list[Any]) -> Any:
+        if not parts or type(parts[0]) is not Mark:
+            return parts
+        self.open_marks -= 1
+        return self.make[parts.pop(0)](parts)
+
+    def make_buffer(self, parts: list[Any]) -> memoryview:
+        [n_bytes] = parts
+        if not 0 <= n_bytes <= len(self.buffers):
+            raise DamagedValue("it is cut short")
+        buffer, self.buffers = self.buffers[:n_bytes], self.buffers[n_bytes:]
+        return buffer
+
+    def make_shared(self, parts: list[Any]) -> object:
+        number, self.shared[number] = parts
+        return self.shared[number]
+
+    def make_again(self, parts: list[Any]) -> object:
+        [number] = parts
+        return self.shared[number]
+
+    def make_defaultdict(self, parts: list[Any]) -> object:
+        factory: Any = parts[0] and find_class(parts[0])
+        if factory is not None and not is_factory(factory):
+            raise DamagedValue(f"it has a defaultdict of {parts[0]}")
+        return defaultdict(factory, pairs(parts[1:]))
+
+    def find(self, mark: ExtType, name: str) -> tuple[Any, dict[str, Any]]:
+        if name not in self.classes:
+            kind = find_class(name)
+            self.classes[name] = kind, class_mark(kind), slots_of(kind)
+        kind, found, slots = self.classes[name]
+        if found is not mark:
+            raise DamagedValue(f"class {name} is of another kind now")
+        return kind, slots
+
+    def make_enum(self, parts: list[Any]) -> object:
+        name, member = parts
+        kind, _ = self.find(ENUM, name)
+        if isinstance(member, str):
+            return kind.__members__[member]
+        if issubclass(kind, enum.Flag):
+            return kind(member)
+        raise DamagedValue(f"{name} has no member {member!r}")
+
+    def make_record(self, mark: ExtType, parts: list[Any]) -> object:
+        name = parts[0]
+        kind, slots = self.find(mark, name)
+        attributes = pairs(parts[1:])
+        if mark is DATACLASS:
+            made: Any = object.__new__(kind)
+        elif mark is STRUCT:
+            made = kind(**{field: attributes[field] for field in kind.__struct_fields__ if field in attributes})
+        else:
+            made = tuple.__new__(kind, [attributes.pop(field) for field in kind._fields])
+        for attribute, slot in slots.items():
+            if attribute in attributes:
+                slot.__set__(made, attributes.pop(attribute))  # also where it is frozen
+        if attributes:
+            if not hasattr(made, "__dict__"):
+                raise DamagedValue(f"class {name} has no {', '.join(attributes)}")
+            made.__dict__.update(attributes)
+        return made

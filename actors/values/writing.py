@@ -1,0 +1,170 @@
+"""Lowering a value to a tree of what msgpack has types for, and packing it."""
+
+from __future__ import annotations
+
+import reprlib
+import sys
+from collections import defaultdict, deque
+from collections.abc import Callable, Sequence
+from datetime import date, time
+from typing import Any, Final, cast
+
+import msgpack
+from msgpack import ExtType
+
+from ..errors import UnsavableValue, type_name
+from .arrays import array_form
+from .classes import class_mark, class_name, class_parts, factory_name, slots_of
+from .forms import (
+    AGAIN,
+    BUFFER,
+    CHANGING,
+    DEFAULTDICT,
+    FORMAT,
+    HEAD,
+    KNOWN,
+    SCALARS,
+    SHARED,
+    Blob,
+    are_scalars,
+    can_change,
+    flat,
+    pairs,
+)
+
+HEAD_ALONE: Final = bytes((FORMAT, 0))
+TUPLE: Final = KNOWN[tuple][0]
+
+
+def pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
+    """The bytes of a value, in parts to be joined; `canonical` as in `_Encoder`."""
+    try:
+        encoder = _Encoder(canonical, shared=set())
+        tree = encoder.lowered(value)
+        while encoder.met_again and not canonical:
+            encoder = _Encoder(canonical, shared=encoder.shared | encoder.met_again)
+            tree = encoder.lowered(value)
+        packed = encoder.packed(tree, None)
+    except UnsavableValue as refusal:
+        path = refusal.where if len(refusal.where) < 200 else f"{refusal.where[:90]} ... {refusal.where[-90:]}"
+        raise UnsavableValue(where + path, refusal.problem) from None
+    except (RecursionError, ValueError) as error:
+        raise UnsavableValue(where, f"a value that is nested too deep or too large ({error})") from None
+    if not encoder.has_marks:
+        return [HEAD_ALONE, packed]
+    return [HEAD.pack(FORMAT, 1, len(packed)), packed, *encoder.blobs]
+
+
+class _Encoder:
+    """One walk through a value. `canonical`: the order of sets and arrays, and what is shared, leave no trace."""
+
+    def __init__(self, canonical: bool, shared: set[int]) -> None:
+        self.canonical = canonical
+        self.shared = shared  # the ids of what is known to be reached twice
+        self.met_again: set[int] = set()  # and of what turned out to be
+        self.numbers: dict[int, int] = {}  # of the shared ones that are in the tree already, by id
+        self.walked: dict[int, object] = {}  # by id: None while inside it, then itself, so that the id stays in use
+        self.classes: dict[type, tuple[ExtType, str, dict[str, Any]]] = {}
+        self.blobs: list[Any] = []
+        self.has_marks = False
+
+    def lowered(self, x: object) -> Any:
+        kind, key = type(x), id(x)
+        if kind in SCALARS:
+            return x
+        if kind not in CHANGING and not can_change(kind):
+            return self.inside(kind, x)
+        if key in self.walked:
+            if self.walked[key] is None:
+                raise UnsavableValue("", f"a {type_name(kind)} that contains itself")
+            if key in self.numbers:
+                return [AGAIN, self.numbers[key]]
+            self.met_again.add(key)
+            if not self.canonical:
+                return None  # This tree is thrown away: the next walk knows what is shared.
+        self.walked[key] = None
+        lowered = self.inside(kind, x)
+        self.walked[key] = x
+        if key in self.shared:
+            self.has_marks = True
+            self.numbers[key] = len(self.numbers)
+            return [SHARED, self.numbers[key], lowered]
+        return lowered
+
+    def inside(self, kind: type, x: Any) -> Any:
+        if kind is list:
+            return x if are_scalars(map(type, x)) else self.each(x, x)
+        if kind is dict and are_scalars(map(type, x)):
+            return x if are_scalars(map(type, x.values())) else pairs(self.each(x, [*flat(x)]))
+        if kind is tuple:  # as `form` would do it, only faster
+            self.has_marks = True
+            return [TUPLE, *(x if are_scalars(map(type, x)) else self.each(x, x))]
+        mark, *parts = self.form(kind, x)
+        return [mark, *(parts if are_scalars(map(type, parts)) else self.each(x, parts))]
+
+    def each(self, x: Any, parts: Sequence[Any]) -> list[Any]:
+        lowered: list[Any] = []
+        try:
+            for part in parts:
+                lowered.append(part if type(part) in SCALARS else self.lowered(part))  # noqa: PERF401 - its length is used below
+        except UnsavableValue as refusal:  # On its way out each level adds its step to the path.
+            refusal.where = _step(x, parts, len(lowered)) + refusal.where
+            raise
+        return lowered
+
+    def form(self, kind: type, x: Any) -> list[Any]:
+        """A mark and the parts of `x`."""
+        self.has_marks = True
+        if kind in KNOWN:
+            mark, parts = KNOWN[kind]
+            if self.canonical and (kind is set or kind is frozenset):
+                is_ordered = {*map(type, x)} in ({int}, {str})
+                return [mark, *sorted(x, key=None if is_ordered else _canonical)]
+            return [mark, *parts(x)]
+        if kind is defaultdict:
+            return [DEFAULTDICT, factory_name(x.default_factory), *flat(x)]
+        if kind not in self.classes:
+            if kind.__module__.startswith("numpy") and (np := sys.modules.get("numpy")):
+                form = array_form(np, kind, x, in_order=not self.canonical)
+                if form is not None:
+                    return form
+            if (mark := class_mark(kind)) is None:
+                raise UnsavableValue("", f"a value of type {type_name(kind)}")
+            self.classes[kind] = mark, class_name(kind), slots_of(kind)
+        mark, name, slots = self.classes[kind]
+        return [mark, name, *class_parts(x, slots)]
+
+    def packed(self, tree: object, unicode_errors: str | None) -> Any:
+        make = cast("Callable[..., Any]", msgpack.Packer)
+        packer = make(default=self.default, autoreset=False, buf_size=1024, unicode_errors=unicode_errors)
+        try:
+            packer.pack(tree)
+        except UnicodeEncodeError:  # A lone surrogate, as in file names that are not UTF-8: rare, so tried second.
+            self.blobs = []
+            return self.packed(tree, "surrogatepass")
+        return packer.getbuffer()
+
+    def default(self, x: Any) -> Any:
+        """What the packer packs in place of `x`, for which msgpack has no type."""
+        if type(x) is Blob:
+            self.blobs.append(x.buffer)
+            return [BUFFER, len(x.buffer)]
+        return ExtType(0, x.to_bytes(x.bit_length() // 8 + 1, "big", signed=True))
+
+
+def _canonical(x: object) -> bytes:
+    return b"".join(pieces(x, "{...}", canonical=True))
+
+
+def _step(x: Any, parts: Sequence[Any], index: int) -> str:
+    """The way from `x` to one of its parts, as a reader would write it."""
+    if isinstance(x, dict):
+        position = index - isinstance(x, defaultdict)  # which has its factory in front
+        return f"[{reprlib.repr(parts[index - 1])}]" if position % 2 else f".keys()[{position // 2}]"
+    if isinstance(x, (set, frozenset)):
+        return "{...}"
+    if isinstance(x, (date, time)):
+        return ".tzinfo"
+    if type(x) in (list, tuple, deque):
+        return f"[{index - (type(x) is deque)}]"
+    return f".{parts[index - 1]}" if index and isinstance(parts[index - 1], str) else ""

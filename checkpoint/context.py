@@ -1,0 +1,314 @@
+"""`self.ctx` of a recorded actor: what it does becomes an output of the turn in hand."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import random
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ..actors import mailbox
+from ..actors.cell import Cell
+from ..actors.context import ActorContext, StashError
+from ..actors.errors import ControlFailed, HoldfastError, remote_crash
+from ..actors.exits import NORMAL, ExitReason
+from ..actors.links import Monitor
+from ..actors.mail import ReplyHandle
+from ..actors.message import Message, message_name
+from ..actors.ref import ActorRef, current
+from .records import Feed, PipeDone
+from .turns import Fed
+
+if TYPE_CHECKING:
+    from ..actors.control.calls import Call
+    from .life import Life
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedReplyHandle(ReplyHandle[R]):
+    """The right to answer one ask of a recorded actor later; it may be kept in a key variable."""
+
+    id: int
+
+    def reply(self, value: R) -> None:
+        """Answer, from a turn of the same actor."""
+        life = _life_of_turn()
+        answer = life.answer_value(value)
+        life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
+
+    def fail(self, error: HoldfastError) -> None:
+        """Answer with a Refusal or another typed error, from a turn of the same actor."""
+        life = _life_of_turn()
+        answer = life.answer_error(error)
+        life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
+
+
+def _life_of_turn() -> Life:
+    ctx = current.get(None)
+    if not isinstance(ctx, RecordedContext) or not ctx.in_turn():
+        raise HoldfastError("a recorded actor answers later from one of its own turns")
+    return ctx.recorded
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedTimer:
+    """A handle on a timer of a recorded actor, whose clock runs at its home; it may be kept in a key variable."""
+
+    id: str
+
+    def cancel(self) -> None:
+        """The message does not come any more, not even one that is queued already."""
+        _life_of_turn().cancel_timer(self.id)
+
+
+class RecordedContext(ActorContext):
+    """`self.ctx` of a recorded actor: what it does becomes an output of the turn in hand."""
+
+    __slots__ = ("_drawn", "recorded")
+
+    may_fail_fast = False
+
+    recorded: Life
+    _drawn: int  # the turn that `_random` belongs to
+
+    def in_turn(self) -> bool:
+        """Whether this code runs in the turn in hand, not in a background task."""
+        if self.recorded.feed is None:
+            return False
+        try:
+            task = asyncio.current_task()
+        except RuntimeError:
+            return True
+        return task is None or task.get_name() == "holdfast runner"
+
+    def _outside(self) -> None:
+        """Hooks may send (at once, unrecorded); background tasks may not."""
+        self._alive()
+        if not self.recorded.in_hook:
+            raise HoldfastError(
+                f"{self.path}: background tasks of a recorded actor may not send; report with ctx.pipe_to_self()"
+            )
+
+    def now(self) -> float:
+        feed = self.recorded.feed
+        return self.cell.node.wall() if feed is None else feed.time
+
+    @property
+    def random(self) -> random.Random:
+        life = self.recorded
+        if self._random is None or self._drawn != life.turn:
+            self._drawn = life.turn
+            when = 0.0 if life.feed is None else life.feed.time
+            self._random = random.Random(f"{self.path}|{life.turn}|{when}")
+        return self._random
+
+    # -- sending ----------------------------------------------------------------------------------------------------
+
+    def tell(self, cell: Cell, message: Message[Any]) -> None:
+        if not self.in_turn():
+            self._outside()
+            super().tell(cell, message)
+            return
+        self._put("tell", cell, message)
+
+    async def send(self, cell: Cell, message: Message[Any]) -> None:
+        if not self.in_turn():
+            self._outside()
+            await super().send(cell, message)
+            return
+        life = self.recorded
+        k = self._put("send", cell, message)
+        accepted: asyncio.Future[None] = self.cell.node.loop.create_future()
+        life.asks[life.turn, k] = accepted, None
+        life.release()
+        await accepted
+
+    def _put(self, verb: str, cell: Cell, message: Message[Any], *, seconds: float = 0.0) -> int:
+        if type(message) not in cell.table:
+            cell.require(message)
+        body = self.cell.node.codec.encode(message, cell.path)
+        return self.recorded.put(verb, cell.path, message_name(type(message)), body, seconds=seconds)
+
+    def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
+        if not self.in_turn():
+            self._outside()
+            return super().ask(cell, message, timeout)
+        life = self.recorded
+        k = self._put("ask", cell, message, seconds=timeout)
+        future: asyncio.Future[R] = self.cell.node.loop.create_future()
+        life.asks[life.turn, k] = future, type(message)
+        life.release()
+        return future
+
+    def forward(self, to: ActorRef[Any]) -> None:
+        fed = self.item
+        if not self.in_turn() or not isinstance(fed, Fed):
+            raise HoldfastError(f"{self.path}: only a message in hand can be forwarded")
+        feed = fed.feed
+        self.recorded.put("forward", to.path, feed.name, feed.body)
+
+    def reply_handle(self) -> ReplyHandle[Any]:
+        feed = self.recorded.feed  # Its id even if nobody waits (any more): a replay must make the same handle.
+        return RecordedReplyHandle(feed.id if feed is not None else -1)
+
+    async def publish(self, topic: str, message: Message[Any]) -> None:
+        if not self.in_turn():
+            self._outside()
+            await super().publish(topic, message)
+            return
+        body = self.cell.node.codec.encode(message, topic)
+        self.recorded.put("publish", topic, message_name(type(message)), body)
+
+    async def flush(self) -> None:
+        self.recorded.release()
+
+    # -- later ------------------------------------------------------------------------------------------------------
+
+    def _timer(self, message: Message[Any], delay: float, interval: float) -> Any:
+        self.cell.require(message)
+        life = self.recorded
+        if not self.in_turn():
+            self._outside()
+        body = self.cell.node.codec.encode(message, self.path)
+        k = life.put(
+            "timer",
+            f"{life.turn}.{life.last_k + 1}",
+            message_name(type(message)),
+            body,
+            seconds=delay,
+            interval=interval,
+        )
+        return RecordedTimer(f"{life.turn}.{k}")
+
+    def tell_after(self, delay: float, message: Message[Any]) -> Any:
+        return self._timer(message, delay, 0.0)
+
+    def every(self, interval: float, message: Message[Any]) -> Any:
+        return self._timer(message, interval, interval)
+
+    def pipe_to_self(
+        self,
+        work: Awaitable[T],
+        then: Callable[[T], Message[Any]],
+        failed: Callable[[BaseException], Message[Any]] | None = None,
+    ) -> None:
+        life = self.recorded
+        if not self.in_turn():
+            self._outside()
+        feed = life.feed
+        k = life.put("pipe", "")
+        if feed is not None and k in feed.pipes:  # Its result was journaled before the crash: it will be fed.
+            if asyncio.iscoroutine(work):
+                work.close()
+            return
+        life.pipes += 1
+        tasks = self.cell.extra().tasks
+        task = self.cell.node.loop.create_task(
+            self._piped(life.turn, k, work, then, failed), name=f"pipe of {self.path}"
+        )
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+
+    async def _piped(self, turn: int, k: int, work: Any, then: Any, failed: Any) -> None:
+        try:
+            message = then(await work)
+        except asyncio.CancelledError:
+            raise
+        except BaseException as error:
+            if failed is None:  # Nobody takes the error: the actor crashes, once.
+                self._piped_back(PipeDone(turn, k, "", self.cell.node.codec.encode_error(remote_crash(error))[2]))
+                return
+            message = failed(error)
+        self._piped_back(
+            PipeDone(turn, k, message_name(type(message)), self.cell.node.codec.encode(message, self.path))
+        )
+
+    def _piped_back(self, record: PipeDone) -> None:
+        if not self.closed:
+            self.recorded.pipes -= 1
+            self.recorded.port.to_home(record)
+
+    # -- stash, links, subscriptions --------------------------------------------------------------------------------
+
+    def stash(self) -> None:
+        fed, life = self.item, self.recorded
+        if not isinstance(fed, Fed) or life.feed is None:
+            raise StashError(f"{self.path}: only a message can be stashed")
+        if fed.is_stashed:
+            raise StashError(f"{self.path}: this message is stashed already")
+        fed.is_stashed = True
+        life.stash.append(fed)
+
+    def unstash(self) -> None:
+        life = self.recorded
+        stash, life.stash = life.stash, []
+        again = [Fed(life, once_more(fed.feed), fed.message, fed.sender) for fed in stash]
+        if life.is_live:
+            mailbox.queue_of(self.cell).extendleft(reversed(again))
+            self.cell.schedule()
+        else:
+            life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
+
+    def monitor(self, other: ActorRef[Any]) -> Monitor:
+        self.recorded.put("monitor", other.path)
+        return RecordedMonitor(self.cell, other._cell, for_good=False)
+
+    def watch(self, other: ActorRef[Any]) -> Monitor:
+        self.recorded.put("watch", other.path)
+        return RecordedMonitor(self.cell, other._cell, for_good=True)
+
+    def link(self, other: ActorRef[Any]) -> None:
+        self.recorded.put("link", other.path)
+
+    def unlink(self, other: ActorRef[Any]) -> None:
+        self.recorded.put("unlink", other.path)
+
+    def subscribe(self, topic: str) -> None:
+        self.recorded.put("subscribe", topic)
+
+    def unsubscribe(self, topic: str) -> None:
+        self.recorded.put("unsubscribe", topic)
+
+    def postpones(self, call: Call) -> bool:
+        if self.recorded.is_live:
+            return False
+        self.recorded.postponed.append(call)
+        return True
+
+    def may_replace(self) -> None:
+        problem = self.recorded.may_replace()
+        if problem:
+            raise ControlFailed(self.path, "replace_state", problem)
+
+    def replaced(self) -> None:
+        self.recorded.replaced()
+
+    def stop(self, reason: ExitReason = NORMAL) -> None:
+        if self.recorded.is_live:
+            super().stop(reason)
+        else:  # A replayed turn: the life ends when it has caught up.
+            self.recorded.stop_wanted = reason
+
+    def close(self) -> None:
+        super().close()
+        self.recorded.close()
+
+
+class RecordedMonitor(Monitor):
+    """A handle on a watch that the home keeps."""
+
+    __slots__ = ()
+
+    def cancel(self) -> None:
+        """No further DOWN is admitted after the turn in hand."""
+        self.active = False
+        _life_of_turn().put("unwatch" if self.for_good else "demonitor", self.target.path)
+
+
+def once_more(feed: Feed) -> Feed:
+    """The same input, to be handled in a turn of its own."""
+    return Feed(feed.id, -1, feed.kind, feed.name, feed.body, feed.time, feed.sender, feed.is_ask, feed.chain)

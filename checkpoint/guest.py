@@ -1,0 +1,247 @@
+"""Recorded lives in an actor process: the process's own actor, or any below its supervisor."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, cast
+
+import msgspec
+
+from ..actors import exits, links, lives
+from ..actors.cell import DOWN, RUNNING, Cell, Host
+from ..actors.errors import StartFailed
+from ..actors.exits import ExitReason, pack_exit
+from ..actors.mail import Envelope, Item
+from ..actors.mailbox import Bounded
+from ..actors.message import message_name
+from ..actors.process import frames
+from ..actors.process.relay import send_signal
+from .life import Life
+from .method import Method
+from .records import Begin, Closed, Restore, Started, ToHome, ToLife, Wanted
+from .turns import StopRecorded
+
+if TYPE_CHECKING:
+    from ..actors.process.guest import Guest
+
+FROM_HOME: msgspec.msgpack.Decoder[ToLife] = msgspec.msgpack.Decoder(ToLife)
+
+
+class RecordedGuest:
+    """All recorded addresses of this process."""
+
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+        self._ports: dict[str, Port] = {}
+        guest.record_taker = self._taker
+
+    def _taker(self, path: str) -> frames.TakeRecord:
+        return self._port(path).take
+
+    def _port(self, path: str) -> Port:
+        port = self._ports.get(path)
+        if port is None:
+            port = self._ports[path] = Port(self._guest, path)
+        return port
+
+    def start(self, cell: Cell, options: dict[str, Any]) -> None:
+        """Begin the life that a launch asks for, of the process's own actor.
+
+        Raises:
+            StartFailed: `__init__` or the restoring raised.
+        """
+        port = self._port(cell.path)
+        life = Life(cell, port, float(options["interval"]), self._guest.page)
+        cell.host = OwnHost(self._guest, life)
+        port.begin(life, int(options["turn"]), list(options["stash"]))
+
+    def host_for(self, spec: Any) -> Host:
+        """Where a child below this process's supervisor is lived: here; if it is recorded, its home is at the root."""
+        if spec.recovery is not None and spec.recovery.records:
+            return InnerLifeHost(self._guest, spec.recovery, self._port)
+        return self._guest.node.here
+
+
+class Port:
+    """The way home of the lives at one address, and what comes from there."""
+
+    def __init__(self, guest: Guest, path: str) -> None:
+        self._guest, self._path = guest, path
+        self.life: Life | None = None
+        self._state: list[Restore] = []
+        self.on_begin: Callable[[Begin], None] | None = None
+        self.on_started: Callable[[Started], None] | None = None
+        self.on_closed: Callable[[], None] | None = None
+
+    def take(self, frame: frames.Record) -> None:
+        """A record from home."""
+        record = FROM_HOME.decode(frame.body)
+        match record:
+            case Restore():
+                self._state.append(record)
+            case Begin():
+                assert self.on_begin is not None
+                self.on_begin(record)
+                self._state.clear()
+            case Started():
+                assert self.on_started is not None
+                self.on_started(record)
+            case _:
+                if self.life is not None:
+                    self.life.from_home(record)
+
+    def begin(self, life: Life, turn: int, stash: list[int]) -> None:
+        """Begin a life with the state that has come.
+
+        Raises:
+            StartFailed: `__init__` or the restoring raised.
+        """
+        start = life.cell.extra().start
+        assert start is not None
+        state, self._state = self._state, []
+        for record in state:
+            life.from_home(record)
+        self.life = life
+        life.begin(start, turn, stash)
+
+    def to_home(self, record: ToHome) -> None:
+        connection = self._guest.connection
+        connection.send(frames.Record(connection.name_out(self._path), cast("Any", record)), self._path)
+
+    def closed(self) -> None:
+        self.life = None
+        if self.on_closed is not None:
+            self.on_closed()
+
+
+class LifeHost(lives.LocalHost):
+    """The host of a recorded life in this process."""
+
+    _life: Life | None
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        if cell.state is RUNNING and self._life is not None:
+            cell.urge(StopRecorded(self._life, reason))
+
+    def recovers(self, reason: ExitReason) -> bool:
+        return not reason.is_clean
+
+
+class OwnHost(LifeHost):
+    """The host of the process's own actor."""
+
+    def __init__(self, guest: Guest, life: Life) -> None:
+        self._guest, self._life = guest, life
+
+    def retired(self, cell: Cell) -> None:
+        if cell.queue:
+            cell.queue.clear()
+        self._guest.report_end(cell, cell.extra().reason)
+
+
+class InnerLifeHost(LifeHost):
+    """The host of a recorded child of a supervisor in this process: everything sent to it goes home first."""
+
+    takes_parcels = True
+
+    def __init__(self, guest: Guest, method: Method, port_of: Callable[[str], Port]) -> None:
+        self._guest, self._method, self._port_of = guest, method, port_of
+        self._life = None
+        self._port: Port | None = None
+        self._bound: Bounded | None = None
+        self._number = 0
+        self._up: asyncio.Future[None] | None = None
+
+    def start(self, cell: Cell) -> asyncio.Future[None]:
+        """Ask the home to bring the actor back."""
+        more = cell.extra()
+        start = more.start
+        assert start is not None
+        cell.table = start.kind._table
+        cell.admit = self._admit
+        if more.bound is not None:  # The home counts.
+            self._bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
+        self._number += 1
+        self._up = cell.node.loop.create_future()
+        port = self._port = self._port_of(cell.path)
+        port.on_begin = lambda record: self._begin(cell, record)
+        port.on_started = lambda record: self._started(cell, record)
+        port.on_closed = lambda: self._closed(cell)
+        kind = message_name(start.kind)
+        port.to_home(Wanted(self._number, kind, list(start.kind._topics), self._method, self._bound))
+        return self._up
+
+    def _begin(self, cell: Cell, record: Begin) -> None:
+        port, up = self._port, self._up
+        if record.number != self._number or up is None or up.done() or cell.state is not DOWN:
+            return
+        assert port is not None
+        cell.life = record.life - 1
+        page = self._guest.page[record.slot : record.slot + 1]
+        self._life = life = Life(cell, port, self._method.interval, page)
+        try:
+            port.begin(life, record.turn, record.stash)
+        except StartFailed as error:
+            port.life = None
+            self._fail(cell, error)
+            self._say_closed(cell)
+
+    def _started(self, cell: Cell, record: Started) -> None:
+        if record.number != self._number or self._up is None or self._up.done():
+            return
+        if not record.problem:
+            self._up.set_result(None)
+        elif cell.state is DOWN:
+            self._fail(cell, StartFailed(cell.path, record.problem))
+        else:  # Its replay diverged: the next life begins when this one is over.
+            cell.ended().add_done_callback(lambda _: self._fail(cell, StartFailed(cell.path, record.problem)))
+            cell.kill()
+
+    def _fail(self, cell: Cell, error: StartFailed) -> None:
+        if self._up is not None and not self._up.done():
+            self._up.set_exception(error)
+            self._up.exception()  # Nobody may be left to look.
+
+    def _closed(self, cell: Cell) -> None:
+        self._life = None
+        self._say_closed(cell)
+        self._fail(cell, StartFailed(cell.path, str(cell.extra().reason)))
+
+    def _say_closed(self, cell: Cell) -> None:
+        assert self._port is not None
+        self._port.to_home(Closed(self._number, pack_exit(cell.extra().reason)))
+
+    def kill(self, cell: Cell) -> None:
+        if cell.state is DOWN and self._up is not None and not self._up.done():
+            cell.extra().reason = exits.KILLED
+            self._say_closed(cell)
+            self._number += 1
+            self._fail(cell, StartFailed(cell.path, "it was stopped while it started"))
+        else:
+            super().kill(cell)
+
+    def retired(self, cell: Cell) -> None:
+        if cell.queue:
+            cell.queue.clear()  # Its home has these.
+        self._guest.tell_gone(cell)
+
+    def _admit(self, cell: Cell, item: Any) -> None:
+        """Stands in `cell.admit`: the home numbers and journals, and feeds it back."""
+        if not isinstance(item, Item) and type(item) not in cell.table:
+            cell.require(item)
+        self._guest.send_item(cell, cell.path, item, 0)
+
+    def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
+        message, sender = (item.message, item.sender) if isinstance(item, Envelope) else (item, None)
+        return self._guest.offer(cell.path, message, sender)
+
+    def push(self, cell: Cell, item: Item) -> None:
+        if isinstance(item, (links.Exit, links.Down)):
+            send_signal(self._guest, cell.path, item)
+        else:
+            super().push(cell, item)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        if verb in ("link", "unlink"):  # Its links are kept at home; what watches it from here is told here.
+            self._guest.command(cell, verb, data)

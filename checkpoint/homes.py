@@ -1,0 +1,182 @@
+"""The homes of a root, and the phases of a recovery: detect, isolate, restart, restore, replay, release."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from ..actors.cell import GONE, RUNNING, Cell
+from ..actors.errors import HoldfastError, StartFailed
+from ..actors.events import ActorStarted, Recovered, RecoveryFailed
+from ..actors.exits import ExitReason
+from .bound import HomeBound
+from .journal import Journal
+from .method import Method
+from .switch import Switch
+
+if TYPE_CHECKING:
+    from ..actors.node import Node
+
+ENDED = "it ended before it was live"
+
+
+class Homes:
+    """All recorded addresses of a root, and their journal. A home stays when its actor is stopped."""
+
+    def __init__(self, node: Node, journal: Journal) -> None:
+        self.node, self.journal = node, journal
+        self._switches: dict[str, Switch] = {}
+
+    def of(self, cell: Cell, method: Method) -> Switch:
+        """The home of an address; taken up from the store when it is first asked for."""
+        switch = self._switches.get(cell.path)
+        if switch is None:
+            switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self.journal)
+        switch.method = method
+        switch.cell = cell
+        more = cell.extra()
+        if more.bound is not None:
+            switch.bound, more.bound = HomeBound(switch, more.bound), None
+        cell.admit = switch.admit
+        more.outlet = switch
+        return switch
+
+    def find(self, path: str) -> Cell | None:
+        """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
+        switch = self._switches.get(path)
+        return None if switch is None or switch.cell is None or switch.cell.state is GONE else switch.cell
+
+    def erase(self, path: str) -> None:
+        """Forget all about an address."""
+        self._switches.pop(path, None)
+        self.journal.erase(path)
+
+    def close(self) -> None:
+        """Close the store."""
+        self.journal.close()
+
+
+class Clock:
+    """The phases of one recovery. (Clocks of loops are too coarse for this.)"""
+
+    __slots__ = ("_marks",)
+
+    def __init__(self) -> None:
+        self._marks: dict[str, float] = {}
+
+    def mark(self, phase: str, when: float | None = None) -> None:
+        """This phase is over now."""
+        self._marks[phase] = time.monotonic() if when is None else when
+
+    def phases(self, restore_seconds: float) -> dict[str, float]:
+        """Seconds by phase."""
+        spans: dict[str, float] = {}
+        before = self._marks.get("noticed")
+        for phase in ("detect", "isolate", "restart", "replay", "release"):
+            after = self._marks.get(phase)
+            if after is None:
+                continue
+            spans[phase] = max(0.0, after - before) if before is not None else 0.0
+            before = after
+        spans["restart"] = max(0.0, spans.get("restart", 0.0) - restore_seconds)
+        spans["restore"] = restore_seconds
+        return spans
+
+
+class HomeHost:
+    """What all hosts of recorded actors have in common: the home, and the clock of the recovery at hand."""
+
+    takes_parcels = True
+
+    def __init__(self, homes: Homes, method: Method) -> None:
+        self.homes, self.method = homes, method
+        self.switch: Switch | None = None
+        self.clock: Clock | None = None
+
+    def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
+        """A life is to begin: its home holds what comes. Returns the home, when it is live, and if it recovers."""
+        switch = self.switch = self.homes.of(cell, self.method)
+        self.clock = self.clock or Clock()
+        self.clock.mark("isolate")
+        return switch, switch.prepare(), not switch.is_new
+
+    def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
+        """Have the home admit what is published, also between two lives."""
+        assert self.switch is not None
+        for topic in (*topics, *self.switch.topics):
+            cell.node.topics.subscribe(topic, cell)
+
+    def over(self, cell: Cell, running: int, why: str, *, ordered: bool, noticed: float | None = None) -> None:
+        """A life has ended; the home keeps everything."""
+        switch = self.switch
+        if switch is None:
+            return
+        self.clock = Clock()
+        self.clock.mark("noticed", noticed)
+        self.clock.mark("detect")
+        switch.died(running, ordered=ordered)
+        cell.extra().topics.clear()  # These would be unsubscribed with the life.
+        if switch.live is not None and not switch.live.done():
+            switch.live.set_exception(StartFailed(cell.path, why))
+            switch.live.exception()  # Nobody may be left to look.
+
+    def recovers(self, reason: ExitReason) -> bool:
+        """Whether an end for this reason is followed by a recovery."""
+        return not reason.is_clean
+
+    def is_up(self, cell: Cell) -> bool:
+        """Whether the life takes messages now."""
+        return self.switch is not None and self.switch.is_released
+
+    def backlog(self, cell: Cell) -> int:
+        """Messages that wait."""
+        return 0 if self.switch is None else self.switch.backlog(self.running(cell))
+
+    def running(self, cell: Cell) -> int:
+        """The input in hand, -1 if none is known."""
+        return -1
+
+    def give_up(self, cell: Cell, topics: Iterable[str], *, restarting: bool) -> None:
+        """The address is free: it hears nothing more. `restarting`: it is its supervisor that has ended."""
+        if self.switch is None:
+            return
+        for topic in (*topics, *self.switch.topics):
+            cell.node.topics.unsubscribe(topic, cell)
+        self.switch.drop_all("it has stopped", keep_tells=restarting)
+
+    async def until_live(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
+        """Wait until a life has caught up, and tell of it.
+
+        Raises:
+            StartFailed: it did not.
+        """
+        node, clock, switch = cell.node, self.clock, self.switch
+        assert clock is not None
+        assert switch is not None
+        try:
+            restore_seconds = await live
+            clock.mark("replay", switch.live_at)
+        except HoldfastError as error:
+            node.emit(RecoveryFailed(cell.path, str(error)))
+            raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
+        except asyncio.CancelledError:
+            raise StartFailed(cell.path, "it was stopped while it started") from None
+        if node.watched:
+            node.emit(ActorStarted(cell.path, cell.life))
+        if recovering:
+            clock.mark("release")
+            if node.watched:
+                node.emit(Recovered(cell.path, cell.life, switch.replayed, clock.phases(restore_seconds)))
+
+
+def parent_ended(cell: Cell) -> bool:
+    """Whether it is the supervisor of a retired cell that has ended: both may be started again."""
+    return cell.parent is not None and cell.parent.state is not RUNNING
+
+
+def seen(start: asyncio.Task[None]) -> None:
+    """Look at the outcome of a start: perhaps nobody else does, when the system stops meanwhile."""
+    if not start.cancelled():
+        start.exception()

@@ -1,0 +1,117 @@
+"""What a home keeps in the store: the snapshot with what the home knew then, and the journal behind it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ..actors.errors import HoldfastError
+from .inputs import OVERHEAD, Input, Turn
+from .journal import Entry
+from .records import PIPE, STASHED, TICK, Answer, Snapshot
+from .timers import Saved
+
+if TYPE_CHECKING:
+    from .switch import Switch
+
+FORMAT = 1
+_META = tuple[int, int, int, list[int], dict[str, Saved], list[str], int, bytes]
+
+
+def cut(home: Switch, state: bytes, record: Snapshot) -> None:
+    """A snapshot is complete: keep it durably, then forget what it contains.
+
+    Raises:
+        HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
+    """
+    covered = [number for number in home.turns if number <= record.turn]
+    if home.journal.durable:
+        drop = [*home.dropped, *(position for number in covered for position in home.positions.get(number, ()))]
+        for number in covered:
+            source = home.turns[number].input
+            if source.id not in home.open:  # Else it is stashed, and not handled yet.
+                drop.extend(source.positions)
+        meta = (
+            FORMAT, record.turn, home.next_id, record.stash, home.timers.saved(), list(home.topics),
+            home.journal.epoch, state,
+        )  # fmt: skip
+        home.journal.cut(home.path, msgspec.msgpack.encode(meta), drop, turn=record.turn)
+    home.dropped.clear()
+    home.state, home.state_turn, home.stash = state, record.turn, record.stash
+    done = (home.turns.pop(number) for number in covered)
+    home.bytes -= sum(len(turn.input.body) + OVERHEAD for turn in done if turn.status != STASHED)
+    for known in (home.positions, home.pipes_done):
+        for number in [number for number in known if number <= record.turn]:
+            del known[number]
+    for key in [key for key in home.calls.outcomes if key[0] <= record.turn]:
+        del home.calls.outcomes[key]
+
+
+def load(home: Switch) -> None:
+    """Take up where the store left off."""
+    saved = home.journal.load(home.path)
+    timers: dict[str, Saved] = {}
+    if saved.snapshot is not None:
+        _, home.turn, home.next_id, home.stash, timers, topics, _, home.state = msgspec.msgpack.decode(
+            saved.snapshot, type=_META
+        )
+        home.state_turn = home.turn
+        home.topics = dict.fromkeys(topics)
+    for position, entry in saved.entries:
+        _reload(home, position, entry, timers)
+    for source in home.open.values():
+        home.bytes += len(source.body) + OVERHEAD
+    for turn in home.turns.values():
+        if turn.status != STASHED:
+            home.bytes += len(turn.input.body) + OVERHEAD
+    for key, (name, body, left, interval) in timers.items():
+        home.timers.start(key, name, body, max(0.0, left), interval)
+
+
+def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:
+    """One journal entry, read again in order."""
+    values: tuple[Any, ...] = entry
+    match values:
+        case ("in", key, kind, name, body, when, sender, origin):
+            source = home.open[key] = Input(key, kind, name, body, when, sender)
+            source.origin = origin
+            source.positions = [position]
+            home.next_id = max(home.next_id, key + 1)
+            if kind == TICK and origin in timers and not timers[origin][3]:
+                del timers[origin]
+            if kind == PIPE:
+                turn, k = map(int, origin.split("."))
+                home.pipes_done.setdefault(turn, set()).add(k)
+        case ("end", turn, key, status, digests):
+            if key not in home.open:
+                return
+            past = home.turns[turn] = Turn(home.open[key], status, list(digests))
+            home.positions_of(turn).append(position)
+            past.input.turn = home.turn = turn
+            home.partial, home.partial_id = [], -1
+            if status != STASHED:
+                del home.open[key]
+        case ("out", turn, key, digests):
+            home.positions_of(turn).append(position)
+            if turn > home.turn:
+                home.partial, home.partial_id = list(digests), key
+        case ("got", turn, k, kind, name, body):
+            home.positions_of(turn).append(position)
+            home.calls.outcomes[turn, k] = Answer(kind, name, body)
+        case ("drop", key):
+            dropped = home.open.pop(key, None)
+            home.dropped.extend((*(dropped.positions if dropped is not None else ()), position))
+        case ("op", turn, verb, key, name, body, seconds, interval):
+            home.positions_of(turn).append(position)
+            match verb:
+                case "timer":
+                    timers[key] = (name, body, seconds, interval)
+                case "cancel":
+                    timers.pop(key, None)
+                case "subscribe":
+                    home.topics[key] = None
+                case _:
+                    home.topics.pop(key, None)
+        case _:
+            raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")

@@ -1,0 +1,99 @@
+"""The SQLite file itself: its tables, how it is created and opened, and whether it is one of ours and whole."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import threading
+from pathlib import Path
+from typing import Final
+
+from ..journal import DamagedStore
+from .files import sync
+from .rows import crc_of
+
+_APPLICATION: Final = 0x486F6C64  # "Hold", in the file header
+_VERSION: Final = 1
+_TABLES: Final = {
+    "store": "one INTEGER PRIMARY KEY, epoch INTEGER, pid INTEGER, start TEXT, floor INTEGER, live INTEGER, "
+    "crc INTEGER",
+    "addresses": "id INTEGER PRIMARY KEY AUTOINCREMENT, path TEXT, removed INTEGER, removed_sum INTEGER, "
+    "floor INTEGER, kept TEXT, crc INTEGER",
+    "entries": "position INTEGER PRIMARY KEY, address INTEGER, chain INTEGER, kind TEXT, data BLOB, crc INTEGER",
+    "snapshots": "id INTEGER PRIMARY KEY AUTOINCREMENT, address INTEGER, turn INTEGER, epoch INTEGER, drops BLOB, "
+    "file TEXT, digest BLOB, data BLOB",
+    "notes": "key INTEGER PRIMARY KEY, name TEXT, value BLOB, crc INTEGER",
+}
+_SCHEMA: Final = [f"CREATE TABLE {name}({columns})" for name, columns in _TABLES.items()]
+_BUSY_SECONDS: Final = 0.25  # Nobody holds a lock for long, except a stopped process, and that one is looked up.
+
+
+def create_database(path: str, folder: str) -> None:
+    """Make the database in `folder` and link it into place: half a database is then never seen under its name."""
+    if os.path.exists(f"{path}-wal"):
+        raise DamagedStore(path, None, None, "the file is gone, but its -wal file is still there")
+    new = os.path.join(folder, f"new-{os.getpid()}-{threading.get_ident()}")
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(new)  # left by an earlier process with our pid
+    os.close(os.open(new, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600))  # SQLite gives -wal and -shm the same mode
+    with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as db:
+        db.execute("PRAGMA journal_mode = WAL")
+        db.execute(f"PRAGMA application_id = {_APPLICATION}")
+        db.execute(f"PRAGMA user_version = {_VERSION}")
+        for statement in _SCHEMA:
+            db.execute(statement)
+        db.execute("INSERT INTO store VALUES (1, 0, 0, '', 0, 0, ?)", (crc_of(0, 0, "", 0, 0),))
+    sync(new)
+    try:
+        os.link(new, path)
+        sync(os.path.dirname(path))
+    except (FileExistsError, FileNotFoundError):
+        pass  # Another opener was quicker, and as the owner it may have swept ours away.
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(new)
+
+
+def connect(path: str) -> sqlite3.Connection:
+    """Open one more connection to the database."""
+    db = sqlite3.connect(
+        f"{Path(path).as_uri()}?mode=rw",  # never create: see `create_database`
+        uri=True,
+        timeout=_BUSY_SECONDS,
+        isolation_level=None,
+        check_same_thread=False,
+    )
+    # A flipped bit may make a blob a text that is not UTF-8: leave it to the checksums.
+    db.text_factory = _text
+    db.execute("PRAGMA wal_autocheckpoint = 0")  # It would sync the disk within an append: see `Store._checkpoint`.
+    return db
+
+
+def refuse_foreign(db: sqlite3.Connection, path: str) -> None:
+    """Refuse a file that is not ours."""
+    (application,) = db.execute("PRAGMA application_id").fetchone()
+    (version,) = db.execute("PRAGMA user_version").fetchone()
+    (mode,) = db.execute("PRAGMA journal_mode").fetchone()
+    if application != _APPLICATION or mode != "wal":
+        raise DamagedStore(path, None, None, "this is not a holdfast store")
+    if version != _VERSION:
+        raise DamagedStore(path, None, None, f"its format is {version}, this holdfast reads {_VERSION}")
+    found = [sql for (sql,) in db.execute("SELECT sql FROM sqlite_master WHERE sql NOT NULL ORDER BY rowid")]
+    if [sql for sql in found if "sqlite_sequence" not in sql] != _SCHEMA:
+        raise DamagedStore(path, None, None, "its tables are not as they were created")
+
+
+def refuse_broken(db: sqlite3.Connection, path: str) -> None:
+    """Refuse a broken file before the first write to it."""
+    (verdict,) = db.execute("PRAGMA quick_check(1)").fetchone()
+    if verdict != "ok":
+        raise DamagedStore(path, None, None, str(verdict))
+
+
+def _text(data: bytes) -> str:
+    return data.decode(errors="surrogateescape")
+
+
+def result_code(error: Exception) -> int:
+    """Primary SQLite result code; 0 if SQLite itself did not object."""
+    return int(getattr(error, "sqlite_errorcode", 0)) & 0xFF

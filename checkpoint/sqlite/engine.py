@@ -1,0 +1,245 @@
+"""The journal in a SQLite file: what `Journal` promises, as transactions on an open store."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import zlib
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from typing import Final, Literal
+
+from ..journal import DamagedStore, Entry, Primitive, Saved, StaleEpoch, StoreFailed
+from .chains import MODULUS, Chain
+from .reading import ChainReader
+from .rows import CHUNK, check_entry, crc_of, entry_packer, pack_positions, row_crc, snapshot_digest, unpack_positions
+from .store import Store
+
+_INLINE_BYTES: Final = 1 << 20  # SQLite reads and writes larger blobs at less than half a file's speed.
+
+
+class SqliteJournal:
+    """A `Journal` in a SQLite file; one process at a time.
+
+    Args:
+        path: the database; created if missing, with mode 0600.
+        takeover: kill the process that has the store open, through its pidfd, and wait until it is dead.
+        synchronous: `"os"` survives the death of the process at any instant; a power loss may take the newest
+            appends, but leaves the store sound. `"fsync"` survives power loss too; each append then waits for the
+            disk, so call it in a worker thread, with as many entries as have gathered.
+
+    Raises:
+        StoreInUse: a live process, this one included, has it open.
+        DamagedStore: the file is damaged, or entries that were acknowledged are gone. Damage that concerns one address
+            only is raised when that address is used; the others work.
+        StoreFailed: the operating system refused.
+
+    All methods may be called from any thread. After an I/O error the journal refuses everything (T13: what a failed
+    fsync has left on the disk is unknown): open it again, which verifies it.
+    """
+
+    def __init__(
+        self, path: str | os.PathLike[str], *, takeover: bool = False, synchronous: Literal["os", "fsync"] = "os"
+    ) -> None:
+        if synchronous not in ("os", "fsync"):
+            raise ValueError(f"synchronous is 'os' or 'fsync', not {synchronous!r}")
+        if not hasattr(os, "pidfd_open"):
+            raise RuntimeError("the SQLite store needs Linux: it tells and ends other owners by pidfd")
+        self.durable = True
+        self.path = os.path.realpath(path)
+        self._pack = entry_packer()
+        self._store = store = Store(self.path, fsync=synchronous == "fsync")
+        with store.opening(takeover=takeover):
+            self._finish()
+            self.epoch = store.claim.epoch
+            self._reader = ChainReader(store.reader, self.path, store.files)
+
+    def _finish(self) -> None:
+        """Finish what an earlier owner began."""
+        store = self._store
+        while store.erased:
+            self._finish_erase(store.erased.pop())
+        store.files.remove_all_but(
+            {name for (name,) in store.db.execute("SELECT file FROM snapshots WHERE file NOT NULL")}
+        )
+
+    def close(self) -> None:
+        """Release the store and sync it; a second call does nothing."""
+        self._store.close()
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
+        """Append (address, entry) pairs in one transaction; see `Journal`.
+
+        Raises:
+            TypeError: an entry holds something else than primitives and tuples of them; nothing was written.
+            StaleEpoch, DamagedStore, StoreFailed: nothing was written.
+        """
+        if not entries:
+            return []
+        with self._store.lock:
+            packed: list[tuple[str, Primitive, bytes]] = []
+            size = 0
+            for address, entry in entries:
+                check_entry(entry)
+                data = self._pack(entry)
+                packed.append((address, entry[0], data))
+                size += len(data)
+            with self._store.transaction(size) as db:
+                first = self._store.last + 1
+                db.executemany("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", self._rows(packed))
+                return list(range(first, self._store.last + 1))
+
+    def _rows(self, packed: list[tuple[str, Primitive, bytes]]) -> list[tuple[int, int, int, Primitive, bytes, int]]:
+        """Give each entry its position and its place in its chain."""
+        rows: list[tuple[int, int, int, Primitive, bytes, int]] = []
+        position = self._store.last
+        for address, kind, data in packed:
+            chain = self._store.chain(address)
+            position += 1
+            chain.last += 1
+            chain.positions.append(position)
+            rows.append((position, chain.id, chain.last, kind, data, row_crc(position, chain.id, chain.last, data)))
+        self._store.last = position
+        self._store.live += len(rows)
+        return rows
+
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int) -> None:
+        """Keep the snapshot, then forget what it contains; see `Journal`.
+
+        A snapshot of more than 1 MiB becomes a file, synced before the row that names it is written. Takes as long as
+        the disk does and removes rows in small transactions: call it in a worker thread.
+        """
+        self._store.refuse_failed()
+        digest = snapshot_digest(address, turn, self.epoch, snapshot)
+        file = self._store.files.write(self.epoch, snapshot) if len(snapshot) > _INLINE_BYTES else None
+        data = snapshot if file is None else None
+        try:
+            with self._store.transaction(len(data or b""), note=True) as db:
+                chain = self._store.chain(address)
+                row = (chain.id, turn, self.epoch, pack_positions(drop), file, digest, data)
+                number = db.execute("INSERT INTO snapshots VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)", row).lastrowid
+                chain.kept.append(number or 0)
+                chain.floor = chain.last
+                chain.write(db)
+        except (StaleEpoch, StoreFailed):
+            if file is not None and self._store.failure is None:  # After a failed sync nobody knows if the row exists.
+                os.unlink(os.path.join(self._store.files.folder, file))
+            raise
+        try:
+            self._clean(chain)
+        except StoreFailed:
+            if self._store.failure is not None:
+                raise
+            # The snapshot is kept, which is what we promised; the next cut cleans up.
+
+    def _clean(self, chain: Chain) -> None:
+        """Remove what only snapshots before the two newest need. A crash in between is made good by the next cut."""
+        for number in chain.kept[:-1]:
+            self._remove_dropped(chain, number)
+        outdated = chain.kept[:-2]
+        if not outdated:
+            return
+        with self._store.transaction(note=True) as db:
+            files = self._delete_snapshots(db, outdated)
+            del chain.kept[: len(outdated)]
+            chain.write(db)
+        self._store.files.remove(files)
+
+    def _remove_dropped(self, chain: Chain, number: int) -> None:
+        """Physically remove the entries that a snapshot made superfluous, then forget which they were."""
+        with self._store.transaction() as db:
+            row = db.execute("SELECT drops FROM snapshots WHERE id = ?", (number,)).fetchone()
+        try:
+            positions = unpack_positions(row[0])
+        except (TypeError, ValueError, zlib.error) as error:
+            raise DamagedStore(self.path, chain.path, None, f"the drop list of snapshot {number} is damaged") from error
+        if row[0]:
+            for start in range(0, len(positions), CHUNK):
+                self._remove(chain, positions[start : start + CHUNK])
+            with self._store.transaction() as db:
+                db.execute("UPDATE snapshots SET drops = x'' WHERE id = ?", (number,))
+
+    def _remove(self, chain: Chain, positions: array[int]) -> None:
+        """Remove those of the sorted positions that the chain has, in one transaction."""
+        with self._store.transaction(note=True) as db:
+            low, high = bisect_left(chain.positions, positions[0]), bisect_right(chain.positions, positions[-1])
+            doomed = set(positions)
+            window = chain.positions[low:high]
+            gone = [position for position in window if position in doomed]
+            marks = ",".join("?" * len(gone))
+            number, total = db.execute(
+                f"SELECT count(*), sum(chain) FROM entries WHERE position IN ({marks})", gone
+            ).fetchone()
+            if number != len(gone):
+                raise DamagedStore(self.path, chain.path, gone[0], "entries have vanished")
+            db.execute(f"DELETE FROM entries WHERE position IN ({marks})", gone)
+            chain.positions[low:high] = array("q", (position for position in window if position not in doomed))
+            chain.removed += number
+            chain.removed_sum = (chain.removed_sum + (total or 0)) % MODULUS
+            self._store.live -= number
+            chain.write(db)
+
+    def _delete_snapshots(self, db: sqlite3.Connection, numbers: Sequence[int]) -> list[str]:
+        """Delete the rows; return the files to be removed once that is committed."""
+        files: list[str] = []
+        for number in numbers:
+            row = db.execute("SELECT file FROM snapshots WHERE id = ?", (number,)).fetchone()
+            files += [row[0]] if row and row[0] else []
+            db.execute("DELETE FROM snapshots WHERE id = ?", (number,))
+        return files
+
+    def load(self, address: str, *, older: bool = False) -> Saved:
+        """Read back one address; see `Journal`. Appends go on meanwhile."""
+        with self._store.read_lock:
+            try:
+                with self._store.view(address) as view:
+                    return Saved(None, 0, []) if view is None else self._reader.load(*view, older)
+            except sqlite3.Error as error:
+                translated = self._store.translate(error)
+                if isinstance(translated, DamagedStore):
+                    raise DamagedStore(self.path, address, None, translated.reason) from error
+                raise translated from error
+
+    def erase(self, address: str) -> None:
+        """Forget everything about the address; see `Journal`."""
+        with self._store.lock:
+            self._store.refresh()
+            if address not in self._store.chains:
+                return
+            with self._store.transaction(note=True) as db:
+                # From here on it is gone; if we die before the rest is done, the next opening does it.
+                chain = self._store.chains.pop(address)
+                chain.path = None
+                chain.write(db)
+        self._finish_erase(chain)
+
+    def _finish_erase(self, chain: Chain) -> None:
+        while chain.positions:
+            self._remove(chain, chain.positions[:CHUNK])
+        with self._store.transaction(note=True) as db:
+            owned = db.execute("SELECT id FROM snapshots WHERE address = ?", (chain.id,)).fetchall()
+            files = self._delete_snapshots(db, [number for (number,) in owned])
+            db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
+        self._store.files.remove(files)
+
+    def addresses(self) -> list[str]:
+        """Every address that has something stored, sorted."""
+        with self._store.lock:
+            self._store.refresh()
+            return sorted(self._store.chains)
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep a small named fact; see `Journal`."""
+        with self._store.transaction(len(value or b""), note=True) as db:
+            db.execute("DELETE FROM notes WHERE name = ?", (key,))
+            self._store.notes.pop(key, None)
+            if value is not None:
+                db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", (key, value, crc_of(key, value)))
+                self._store.notes[key] = value
+
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or `None`."""
+        with self._store.lock:
+            self._store.refresh()
+            return self._store.notes.get(key)

@@ -1,0 +1,80 @@
+"""Files beside the database: snapshots too large for it, each there completely or not at all after a power loss."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Collection, Sequence
+from itertools import count
+from pathlib import Path
+
+from ..journal import StoreFailed
+
+
+class SnapshotFiles:
+    """The directory of snapshot files of the store at `path`."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.folder = f"{path}-snapshots"
+        self._numbers = count(1)
+
+    def write(self, epoch: int, snapshot: bytes) -> str:
+        """Write a new file durably; return its name.
+
+        Raises:
+            StoreFailed: it is not written, and nothing of it is left.
+        """
+        name = f"{epoch}-{next(self._numbers)}.snapshot"
+        try:
+            write_durably(os.path.join(self.folder, name), snapshot)
+        except OSError as error:
+            # The journal goes on: nothing is synced twice here, the next attempt writes a new file.
+            raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error
+        return name
+
+    def read(self, name: str) -> bytes:
+        """Read a file; OSError or ValueError if there is none of that name."""
+        return Path(self.folder, name).read_bytes()
+
+    def remove(self, names: Sequence[str]) -> None:
+        """Remove snapshot files that no row names.
+
+        First the WAL is synced: otherwise a power loss could bring back the rows, but not the files. (It has no locks,
+        so that closing it drops none.)
+        """
+        if names and os.path.exists(f"{self.path}-wal"):
+            sync(f"{self.path}-wal")
+        for name in names:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(os.path.join(self.folder, name))
+
+    def remove_all_but(self, known: Collection[str]) -> None:
+        """Remove what an earlier owner has written or left half made, and never named in a row."""
+        self.remove([name for name in os.listdir(self.folder) if name not in known])
+
+
+def write_durably(path: str, data: bytes) -> None:
+    """Create the file so that it exists after a power loss completely or not at all."""
+    temporary = f"{path}.tmp"
+    try:
+        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.rename(temporary, path)
+        sync(os.path.dirname(path))
+    except BaseException:
+        for name in (temporary, path):
+            with contextlib.suppress(OSError):
+                os.unlink(name)
+        raise
+
+
+def sync(path: str) -> None:
+    """Bring a file or a directory to the disk."""
+    fd = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)

@@ -1,0 +1,64 @@
+"""The mark: a small file that says which position was acknowledged last.
+
+SQLite takes a damaged end of its WAL for the end of the WAL, and a missing WAL for an empty one: entries that were
+acknowledged would be gone without a word. The mark knows better, and it survives the process, being in the page cache.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from typing import Final
+
+from ..journal import DamagedStore
+from .claim import boot_id
+
+_MARK: Final = struct.Struct("<Q?36s")  # last acknowledged position, synced at each commit?, boot
+
+
+class Mark:
+    """The mark of the store at `path`; open from `check` to `close`."""
+
+    def __init__(self, path: str) -> None:
+        self.path = f"{path}-mark"
+        self._store = path
+        self._fd = -1
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it has been checked and not closed since."""
+        return self._fd >= 0
+
+    def check(self, last: int, *, synced: bool) -> None:
+        """Compare what an earlier owner left with the newest position found, then set it to that.
+
+        Raises:
+            DamagedStore: later positions were acknowledged, and no power loss explains that they are gone.
+        """
+        boot = boot_id().encode()
+        self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        found = os.pread(self._fd, _MARK.size, 0)
+        if len(found) == _MARK.size:
+            position, was_synced, marked_boot = _MARK.unpack(found)
+            # After a power loss entries may be gone that were not synced. After anything else they may not.
+            if position > last and (was_synced or marked_boot == boot):
+                reason = (
+                    f"positions up to {position} were acknowledged, but they end at {last} "
+                    f"(remove {self.path} to go on without them)"
+                )
+                raise DamagedStore(self._store, None, last + 1, reason)
+        os.pwrite(self._fd, _MARK.pack(last, synced, boot), 0)
+
+    def set(self, position: int) -> None:
+        """Everything up to this position is acknowledged from now on."""
+        os.pwrite(self._fd, position.to_bytes(8, "little"), 0)
+
+    def close(self) -> None:
+        """Give the descriptor back; the file stays. A second call does nothing."""
+        if self._fd >= 0:
+            fd, self._fd = self._fd, -1
+            os.close(fd)
+
+    def remove(self) -> None:
+        """Remove the file: the row of the store says all now."""
+        os.unlink(self.path)

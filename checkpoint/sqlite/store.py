@@ -1,0 +1,257 @@
+"""The open store: what it holds, as the memory has it, and writes that happen as the owner's or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import threading
+from array import array
+from collections.abc import Generator
+from typing import Final
+
+from ...actors.errors import HoldfastError
+from ..journal import DamagedStore, StaleEpoch, StoreFailed
+from .chains import Chain, Scan, create_chain
+from .claim import Claim
+from .database import connect, create_database, result_code
+from .files import SnapshotFiles
+from .mark import Mark
+
+_CHECKPOINT_BYTES: Final = 4 << 20
+_WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
+
+
+class Store:
+    """One process's hold on a store, from `opening` to `close`.
+
+    Attributes:
+        lock: guards the writing connection and all that memory says of the file; it may be taken again by its holder.
+        read_lock: guards the reading connection.
+        chains: by address.
+        erased: chains whose erase an earlier owner began and did not finish.
+        last: newest position handed out.
+        live: rows in `entries`.
+        failure: why everything is refused from now on.
+    """
+
+    def __init__(self, path: str, *, fsync: bool) -> None:
+        self.path = path
+        self.files = SnapshotFiles(path)
+        self.lock = threading.RLock()
+        self.read_lock = threading.Lock()
+        self.chains: dict[str, Chain] = {}
+        self.notes: dict[str, bytes] = {}
+        self.erased: list[Chain] = []
+        self.last = self.live = 0
+        self.failure: HoldfastError | None = None
+        self._fsync = fsync
+        self._mark = Mark(path)
+        self._in_doubt = False  # Is what we hold in memory behind or ahead of the file?
+        self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly
+        self._checkpointer: threading.Thread | None = None
+
+    # ---- opening and closing
+
+    @contextlib.contextmanager
+    def opening(self, *, takeover: bool) -> Generator[None, None, None]:
+        """Open the store, then do what the caller has to do before it counts as open; if anything fails, let go of it.
+
+        Raises:
+            StoreInUse, DamagedStore, StoreFailed: see `SqliteJournal`.
+        """
+        try:
+            self._connect()
+            try:
+                self.claim.take(takeover)
+                self._configure()
+                try:
+                    self._scan()
+                    self._mark.check(self.last, synced=self._fsync)
+                    yield
+                except BaseException:
+                    with contextlib.suppress(sqlite3.Error):
+                        self.claim.release()
+                    raise
+            except BaseException:
+                self._disconnect()
+                raise
+        except (sqlite3.Error, OSError) as error:
+            raise self.translate(error) from error
+        except UnicodeDecodeError as error:  # SQLite quotes a damaged schema, and Python cannot read the quotation.
+            raise DamagedStore(self.path, None, None, "its tables are not as they were created") from error
+
+    def _connect(self) -> None:
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(self.files.folder, mode=0o700)  # not its parents: a mistyped path should not be made true
+        if not os.path.exists(self.path):
+            create_database(self.path, self.files.folder)
+        if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
+            raise DamagedStore(self.path, None, None, "the file is empty")
+        self.db, self.reader = connect(self.path), connect(self.path)
+        self.claim = Claim(self.db, self.path)
+
+    def _configure(self) -> None:
+        self.db.execute(f"PRAGMA synchronous = {'FULL' if self._fsync else 'NORMAL'}")
+        self.db.execute(f"PRAGMA journal_size_limit = {_WAL_FRAMES * 4096}")
+
+    def _scan(self) -> None:
+        """Take into memory what is in the file."""
+        found = Scan(self.db, self.path).contents()
+        self.chains, self.erased, self.notes = found.chains, found.erased, found.notes
+        self.last, self.live, self._in_doubt = found.last, found.live, False
+
+    def close(self) -> None:
+        """Release the store and sync it; a second call does nothing."""
+        with self.lock:
+            if not self._mark.is_open:
+                return
+            clean = self.failure is None and not self._in_doubt
+            self.failure = self.failure or StoreFailed(self.path, "it is closed")
+            self._mark.close()
+            checkpointer = self._checkpointer
+        if checkpointer is not None:
+            checkpointer.join()  # not under the lock, which it may need
+        with self.lock, self.read_lock:
+            try:
+                with contextlib.suppress(sqlite3.Error):
+                    self._retire(clean)
+            finally:
+                self._disconnect()
+
+    def _retire(self, clean: bool) -> None:
+        """Leave the last word on how much there is, so that the mark is not needed, and strike ourselves out."""
+        db = self.db
+        if clean and db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,):
+            db.execute("PRAGMA synchronous = FULL")
+            db.execute("BEGIN IMMEDIATE")
+            self.claim.write(self.last, self.live)
+            db.execute("COMMIT")
+            self._mark.remove()
+        self.claim.release()
+
+    def _disconnect(self) -> None:
+        self._mark.close()
+        for db in (self.reader, self.db):
+            with contextlib.suppress(sqlite3.Error):
+                db.close()
+
+    # ---- transactions
+
+    @contextlib.contextmanager
+    def transaction(self, size: int = 0, *, note: bool = False) -> Generator[sqlite3.Connection, None, None]:
+        """Run a write of about `size` bytes as the owner, or not at all.
+
+        With `note` the transaction takes a position of its own, so that the mark shows if it is lost, and the store
+        row is brought up to date.
+        """
+        with self.lock:
+            self.refresh()
+            db = self.db
+            try:
+                db.execute("BEGIN IMMEDIATE")
+                (current,) = db.execute("SELECT epoch FROM store").fetchone()
+                if current != self.claim.epoch:
+                    raise StaleEpoch(self.path, self.claim.epoch, current)
+                self._in_doubt = True
+                yield db
+                if note:
+                    self.last += 1
+                    self.claim.write(self.last, self.live)
+                db.execute("COMMIT")
+                self._in_doubt = False
+                self._mark.set(self.last)
+            except BaseException as error:
+                if db.in_transaction:
+                    with contextlib.suppress(sqlite3.Error):
+                        db.execute("ROLLBACK")
+                if isinstance(error, sqlite3.Error | OSError):
+                    raise self.translate(error) from error
+                raise
+            self._unsaved_bytes += size + 8192
+            if self._unsaved_bytes > _CHECKPOINT_BYTES:
+                self._start_checkpoint()
+
+    def refuse_failed(self) -> None:
+        """Raise the failure that ended the store, if there is one."""
+        if self.failure is not None:
+            raise type(self.failure)(*self.failure.args)  # a new one: tracebacks would grow on a shared one
+
+    def refresh(self) -> None:
+        """Make sure that memory and file agree, after a transaction that was broken off."""
+        self.refuse_failed()
+        if self._in_doubt:
+            try:
+                self._scan()
+            except sqlite3.Error as error:
+                raise self.translate(error) from error
+
+    def translate(self, error: sqlite3.Error | OSError) -> HoldfastError:
+        """Our error for theirs; after damage or an I/O error the journal stops for good."""
+        code = result_code(error)
+        # Our statements are fixed: if SQLite finds one in error, the file is no longer what they are for.
+        damaged = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+        translated: HoldfastError
+        if isinstance(error, OSError) or code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
+            translated = StoreFailed(self.path, f"{error}; open it again, which verifies it")
+        elif code in damaged:
+            translated = DamagedStore(self.path, None, None, str(error))
+        else:
+            hint = {sqlite3.SQLITE_BUSY: "try again", sqlite3.SQLITE_FULL: "make room and try again"}
+            return StoreFailed(self.path, f"{error}; nothing was written, {hint.get(code, 'it cannot be')}")
+        self.failure = self.failure or translated
+        return translated
+
+    def chain(self, address: str) -> Chain:
+        """The chain of an address, made within the running transaction if there is none.
+
+        Raises:
+            DamagedStore: the chain is damaged.
+        """
+        chain = self.chains.get(address)
+        if chain is None:
+            chain = self.chains[address] = create_chain(self.db, address)
+        elif chain.damage is not None:
+            raise DamagedStore(*chain.damage.args)
+        return chain
+
+    @contextlib.contextmanager
+    def view(self, address: str) -> Generator[tuple[Chain, array[int], list[int]] | None, None, None]:
+        """Freeze the file, for the reading connection, at the very state that the memory describes now."""
+        db = self.reader
+        with self.lock:
+            self.refresh()
+            db.execute("BEGIN")
+            (current,) = db.execute("SELECT epoch FROM store").fetchone()
+            chain = self.chains.get(address)
+            view = None if chain is None else (chain, chain.positions[:], chain.kept[:])
+        try:
+            if current != self.claim.epoch:
+                raise StaleEpoch(self.path, self.claim.epoch, current)
+            if chain is not None and chain.damage is not None:
+                raise DamagedStore(*chain.damage.args)
+            yield view
+        finally:
+            db.execute("ROLLBACK")
+
+    # ---- checkpoints
+
+    def _start_checkpoint(self) -> None:
+        if self._checkpointer is None or not self._checkpointer.is_alive():
+            self._unsaved_bytes = 0
+            self._checkpointer = threading.Thread(target=self._checkpoint, name="holdfast-store", daemon=True)
+            self._checkpointer.start()
+
+    def _checkpoint(self) -> None:
+        """Bring the WAL into the database: in a thread, for it syncs twice, which takes milliseconds.
+
+        Writers go on meanwhile, so it seldom finds an end; only a WAL grown too long makes them wait for one.
+        """
+        try:
+            with contextlib.closing(connect(self.path)) as db:
+                _, frames, _ = db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+                if frames > _WAL_FRAMES:
+                    with self.lock:
+                        db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+        except sqlite3.Error as error:
+            self.translate(error)  # A failed sync stops the journal; a lock in the way does not.

@@ -1,0 +1,220 @@
+"""Recorded actors below a supervisor that has a process of its own: their homes are here at the root.
+
+The supervisor in the process wants a child started; the home gives it back what it had, and the life is lived there.
+When the process dies, the homes keep what they hold until the subtree has been started again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from typing import TYPE_CHECKING, Any
+
+from ..actors import links, lives
+from ..actors.cell import DOWN, GONE, RUNNING, Cell
+from ..actors.control.calls import Call, send_call
+from ..actors.errors import HoldfastError, StartFailed
+from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
+from ..actors.mail import Item
+from ..actors.mailbox import Bound
+from ..actors.process import frames
+from ..actors.process.inner import know
+from ..actors.process.limits import Limits
+from ..actors.process.remote import ProcessHost
+from ..actors.process.workers import Worker, Workers
+from .controller import FROM_LIFE, RemoteLife
+from .homes import HomeHost, Homes
+from .records import Begin, Closed, Started, ToHome, Wanted
+
+if TYPE_CHECKING:
+    from .switch import Switch
+
+
+class SubtreeHost(ProcessHost):
+    """The host of a supervisor with a process of its own, and the keeper of the homes below it."""
+
+    def __init__(self, workers: Workers, limits: Limits | None, homes: Homes) -> None:
+        super().__init__(workers, limits)
+        self._homes = homes
+        self._below: dict[str, SubtreeHome] = {}
+
+    async def take(self, cell: Cell) -> tuple[Worker, bytes]:
+        worker, recipe = await super().take(cell)
+        slots = Slots(len(worker.page))
+
+        def taker(path: str) -> frames.TakeRecord:
+            home = self._below.get(path)
+            if home is None:
+                home = self._below[path] = SubtreeHome(self._homes, path)
+            return home.joined(cell, worker, slots.of(path))
+
+        worker.record_taker = taker
+        return worker, recipe
+
+    def died(self, cell: Cell, reason: ExitReason) -> None:
+        worker = self._workers.of(cell)
+        if worker is not None:
+            for home in self._below.values():
+                home.lost(worker, reason)
+        super().died(cell, reason)
+
+    def retired(self, cell: Cell) -> None:
+        super().retired(cell)
+        for home in reversed(self._below.values()):
+            if home.cell is not None:
+                home.restarting = True
+                lives.retire(home.cell, "its supervisor has stopped")
+        self._below.clear()
+
+
+class Slots:
+    """Places on the page: which input each recorded life in a process is handling. The first two are taken."""
+
+    def __init__(self, count: int) -> None:
+        self._free = itertools.chain(range(2, count), itertools.repeat(0))
+        self._by_path: dict[str, int] = {}
+
+    def of(self, path: str) -> int:
+        """The place of an address; 0 when there is none left."""
+        if path not in self._by_path:
+            self._by_path[path] = next(self._free)
+        return self._by_path[path]
+
+
+class SubtreeHome(HomeHost):
+    """The host of one recorded address below a supervisor in another process."""
+
+    def __init__(self, homes: Homes, path: str) -> None:
+        self.homes, self.path = homes, path
+        self.switch: Switch | None = None
+        self.clock = None
+        self.cell: Cell | None = None
+        self.restarting = False  # it is its supervisor that has ended
+        self._top: Cell | None = None
+        self._worker: Worker | None = None
+        self._slot = 0
+        self._wanted: Wanted | None = None
+
+    def joined(self, top: Cell, worker: Worker, slot: int) -> frames.TakeRecord:
+        """The process that the next lives are lived in."""
+        self._top, self._worker, self._slot = top, worker, slot
+        return lambda frame: self.from_life(worker, FROM_LIFE.decode(frame.body))
+
+    def from_life(self, worker: Worker, record: ToHome) -> None:
+        """Take what the life, or the supervisor that wants one, says."""
+        if worker is not self._worker:
+            return
+        if isinstance(record, Wanted):
+            self._begin(record)
+        elif isinstance(record, Closed):
+            if self._wanted is not None and record.number == self._wanted.number:
+                self._closed(unpack_exit(record.reason))
+        elif self.switch is not None and self._wanted is not None:
+            self.switch.from_life(record)
+
+    def _begin(self, wanted: Wanted) -> None:
+        """Bring the actor back: its state, what it has handled since, what waits."""
+        worker, top = self._worker, self._top
+        assert worker is not None
+        assert top is not None
+        self._wanted = wanted
+        self.method, self.restarting = wanted.method, False
+        if self.cell is not None and self.cell.state is GONE:
+            self.cell = None
+        cell = self.cell = worker.inner.homed(top, self.path, self.cell, self)
+        cell.spec = wanted  # Somebody restarts it: it is not dead between two lives.
+        know(cell, wanted.kind)
+        if wanted.bound is not None:
+            cell.extra().bound = Bound(wanted.bound.capacity, wanted.bound.overflow)
+        port = RemoteLife(self.path, worker)
+        if not self._slot:
+            port.to_life(Started(wanted.number, "its process holds as many recorded actors as it can"))
+            return
+        switch, live, recovering = self.open(cell)
+        cell.life += 1
+        cell.state = RUNNING
+        self.subscribe(cell, wanted.topics)
+        for record in switch.restore_records():
+            port.to_life(record)
+        port.to_life(Begin(wanted.number, cell.life, switch.state_turn, switch.stash, self._slot))
+        assert self.clock is not None
+        self.clock.mark("restart")
+        switch.attach(port)
+        calls, cell.extra().calls = cell.extra().calls, []
+        for call in calls:
+            send_call(worker, cell.path, call)
+        task = cell.node.loop.create_task(self._follow(cell, wanted, live, recovering), name=f"start of {cell.path}")
+        task.add_done_callback(lambda done: None if done.cancelled() else done.exception())
+
+    async def _follow(self, cell: Cell, wanted: Wanted, live: asyncio.Future[float], recovering: bool) -> None:
+        worker = self._worker
+        assert worker is not None
+        problem = ""
+        try:
+            await self.until_live(cell, live, recovering)
+        except StartFailed as error:
+            problem = error.reason
+        if self._wanted is wanted:
+            if not problem:
+                self.clock = None
+            RemoteLife(self.path, worker).to_life(Started(wanted.number, problem))
+
+    def _closed(
+        self, reason: ExitReason, running: int = -1, *, ordered: bool = True, noticed: float | None = None
+    ) -> None:
+        """The life is over: tell whom it concerns here; its supervisor decides what follows."""
+        cell = self.cell
+        self._wanted = None
+        if cell is None or cell.state is not RUNNING:
+            return
+        self.over(cell, running, str(reason), ordered=ordered, noticed=noticed)
+        cell.state = DOWN
+        more = cell.extra()
+        more.reason = reason
+        links.announce(cell, reason, recovering=self.recovers(reason))
+        lives.tell_enders(more, reason)
+
+    def lost(self, worker: Worker, reason: ExitReason) -> None:
+        """The process is gone, and the life with it."""
+        if worker is self._worker and self._wanted is not None:
+            running = int(worker.page[self._slot]) - 1
+            self._closed(reason, running, ordered=reason == KILLED, noticed=worker.noticed_at)
+
+    # -- what a host does -------------------------------------------------------------------------------------------
+
+    def start(self, cell: Cell) -> None:
+        raise HoldfastError(f"{cell.path} is started by its supervisor, which is in another process")
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self._tell(cell, "stop", {"reason": pack_exit(reason)})
+
+    def kill(self, cell: Cell) -> None:
+        self._tell(cell, "kill", {})
+
+    def _tell(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        worker = self._worker
+        if worker is not None and cell.state is RUNNING:
+            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
+
+    def push(self, cell: Cell, item: Item) -> None:
+        if self.switch is not None:
+            self.switch.push(item)
+
+    def offer(self, cell: Cell, item: Any) -> None:
+        cell.admit(cell, item)
+
+    def control(self, cell: Cell, call: Call) -> None:
+        if self._worker is not None and cell.state is RUNNING:
+            send_call(self._worker, cell.path, call)
+        else:
+            cell.extra().calls.append(call)  # Sent behind what the next life begins with.
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        if verb == "bind":
+            self._tell(cell, verb, data)
+        elif verb == "gone":
+            self.restarting = bool(data["with_parent"])
+
+    def retired(self, cell: Cell) -> None:
+        topics = self._wanted.topics if self._wanted is not None else ()
+        self.give_up(cell, topics, restarting=self.restarting)

@@ -1,0 +1,214 @@
+"""What stands in the mailbox of a recorded life: its inputs, and the commands of its home."""
+
+from __future__ import annotations
+
+import types
+from typing import TYPE_CHECKING, Any
+
+from ..actors import lives
+from ..actors.actor import Actor
+from ..actors.cell import Cell
+from ..actors.errors import HoldfastError, RemoteCrash, StartFailed
+from ..actors.exits import NORMAL, ExitReason, unpack_exit
+from ..actors.mail import LEAVE, Item, ReplyHandle
+from ..actors.message import Refusal
+from .keys import save_state
+from .records import CRASH, DROPPED, LATER, OK, START, STASHED, Answer, Feed, Go
+
+if TYPE_CHECKING:
+    from ..actors.node import Node
+    from .life import Life
+
+Coroutine_ = types.CoroutineType
+
+
+class Fed(Item):
+    """An input in the mailbox of its life."""
+
+    __slots__ = ("feed", "is_stashed", "life", "message", "sender")
+
+    def __init__(self, life: Life, feed: Feed, message: Any, sender: Cell | None) -> None:
+        self.life, self.feed, self.message, self.sender = life, feed, message, sender
+        self.is_stashed = False
+
+    @property
+    def chain(self) -> tuple[tuple[str, int], ...]:
+        """Who waits for this turn."""
+        return self.feed.chain
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        life: Life = item.life
+        feed: Feed = item.feed
+        life.open_turn(feed)
+        if feed.deadline and feed.deadline <= life.cell.node.loop.time() and feed.turn < 0:
+            life.close_turn(DROPPED, Answer())  # Nobody waits any more.
+            return None
+        if item.message is None and feed.name:
+            try:
+                item.message = life.cell.node.codec.message_in(life.cell, feed.name, feed.body)
+            except HoldfastError as error:  # It came encoded, and is none of ours.
+                life.close_turn(DROPPED, life.answer_error(error) if feed.is_ask else Answer())
+                return None
+        try:
+            result = item.call(actor)
+        except Refusal as no:
+            item.refuse(no)
+            return None
+        if type(result) is Coroutine_:
+            return item.finish(result)
+        item.end_with(result)
+        return None
+
+    def call(self, actor: Any) -> Any:
+        """Call the handler or hook that this input is for."""
+        feed = self.feed
+        node: Node = self.life.cell.node
+        match feed.kind:
+            case "start":
+                return actor.on_start(False)
+            case "exit":
+                data = node.codec.decode(dict[str, Any], feed.body)
+                reason, more = unpack_exit(data["reason"]), self.life.cell.more
+                if more is not None and more.trap_exits:
+                    return actor.on_exit(node.cell_at(data["source"]).ref, reason)
+                if reason != NORMAL:
+                    actor.ctx.stop(reason)
+                return None
+            case "down":
+                data = node.codec.decode(dict[str, Any], feed.body)
+                return actor.on_down(
+                    node.cell_at(data["source"]).ref, unpack_exit(data["reason"]), bool(data["recovering"])
+                )
+            case "pipe" if not feed.name:
+                error = node.codec.decode_error(CRASH, "", feed.body)
+                assert isinstance(error, RemoteCrash)
+                raise error
+            case _:
+                return actor._table[type(self.message)](actor, self.message)
+
+    async def finish(self, handler: Any) -> None:
+        """The turn of an async handler."""
+        try:
+            result = await handler
+        except Refusal as no:
+            self.refuse(no)
+        else:
+            self.end_with(result)
+
+    def refuse(self, no: Refusal) -> None:
+        """The handler said no, which is an answer; nobody has asked an actor to start."""
+        if self.feed.kind == START:
+            raise StartFailed(self.life.cell.path, str(no)) from no
+        self.end(self.life.answer_error(no) if self.feed.is_ask else Answer())
+
+    def end_with(self, result: object) -> None:
+        """The handler returned."""
+        if not self.feed.is_ask:
+            self.end(Answer())
+        elif isinstance(result, ReplyHandle):
+            self.end(Answer(LATER))
+        else:
+            self.end(self.life.answer_value(result))
+
+    def end(self, answer: Answer) -> None:
+        """The turn is over; a stashed message stays open."""
+        life = self.life
+        if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None:
+            save_state(life.cell.actor)  # What cannot be saved is refused now, not when it is needed.
+        if self.is_stashed:
+            life.close_turn(STASHED, Answer())
+        else:
+            life.close_turn(OK, answer if self.feed.is_ask else Answer())
+
+    def fail(self, error: BaseException) -> None:
+        """Called when the turn crashed the actor."""
+        self.life.fail_turn(error.__cause__ or error)
+
+
+class Hook(Item):
+    """A hook that is no turn: called at each life, what it sends goes out at once and is not journaled."""
+
+    __slots__ = ("life", "name")
+
+    def __init__(self, life: Life, name: str) -> None:
+        self.life, self.name = life, name
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        life: Life = item.life
+        life.in_hook = True
+        try:
+            result = actor.on_start(True) if item.name == "on_start" else actor.on_recovered()
+        except Refusal as no:  # Nobody asked: an actor that refuses to start has failed to.
+            raise StartFailed(life.cell.path, str(no)) from no
+        if type(result) is Coroutine_:
+            return item.finish(result)
+        item.over()
+        return None
+
+    async def finish(self, hook: Any) -> None:
+        try:
+            await hook
+        except Refusal as no:
+            raise StartFailed(self.life.cell.path, str(no)) from no
+        self.over()
+
+    def over(self) -> None:
+        """The hook has returned."""
+        self.life.in_hook = False
+
+
+class GoLive(Hook):
+    """Everything that was handled before has been handled again."""
+
+    __slots__ = ("go",)
+
+    def __init__(self, life: Life, go: Go) -> None:
+        super().__init__(life, "on_recovered")
+        self.go = go
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        # Turns that failed are not replayed, but their numbers are used.
+        item.life.turn = max(item.life.turn, item.go.turn)
+        item.life.gone = item.go.gone
+        if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
+            return Hook.run(actor, item)
+        item.over()
+        return None
+
+    def over(self) -> None:
+        super().over()
+        self.life.go_live()
+
+
+class TakeSnapshot(Item):
+    """A command: save the state now, between two turns."""
+
+    __slots__ = ("life",)
+
+    def __init__(self, life: Life) -> None:
+        self.life = life
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        item.life.take_snapshot()
+        return None
+
+
+class StopRecorded(Item):
+    """A command: end in good order, with a final snapshot."""
+
+    __slots__ = ("life", "reason")
+
+    def __init__(self, life: Life, reason: ExitReason) -> None:
+        self.life, self.reason = life, reason
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        life: Life = item.life
+        life.take_snapshot()
+        life.in_hook = True
+        lives.finish(life.cell, item.reason)
+        return LEAVE

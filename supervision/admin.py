@@ -1,0 +1,192 @@
+"""Administration: the messages that a supervisor answers, and how it says no."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from ..actors.codec import Packed
+from ..actors.errors import HoldfastError, SpecError
+from ..actors.message import Message, Refusal
+from ..actors.node import Node
+from ..actors.process.recipe import pack_data, unpack_data
+from ..actors.ref import ActorRef
+
+# -- refusals -------------------------------------------------------------------------------------------------------
+
+
+class AlreadyStarted(Refusal):
+    """A child of this id runs already; `ref` is it."""
+
+    id: str
+    ref: ActorRef[Any]
+
+
+class AlreadyPresent(Refusal):
+    """A child of this id is known, but does not run now: restart or delete it."""
+
+    id: str
+
+
+class ChildBusy(Refusal):
+    """The child is "running", "restarting" or "recovering": terminate it first."""
+
+    id: str
+    state: str
+
+
+class NoSuchChild(Refusal):
+    """The supervisor has no child of this id."""
+
+    id: str
+
+
+class MaxChildren(Refusal):
+    """A dynamic supervisor has as many children as it may have; those that are being restarted count."""
+
+    max_children: int
+
+
+class NotSupported(Refusal):
+    """This kind of supervisor does not do that; `why` says what to do instead."""
+
+    why: str
+
+
+class NoPartitions(Refusal):
+    """A partition supervisor was resized to nothing: there is nobody to route to."""
+
+    supervisor: str
+
+
+# -- requests -------------------------------------------------------------------------------------------------------
+
+
+class Boxed:
+    """A child spec, recipe or plan in a message: as it is in this process, packed when it leaves it."""
+
+    __slots__ = ("value",)
+
+    def __init__(self, value: Any) -> None:
+        self.value = value
+
+    def packed(self) -> bytes:
+        """As bytes; raises UnsavableValue or SpecError if it cannot be sent."""
+        return pack_data(self.value, type(self.value).__name__)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Boxed) and other.value == self.value
+
+    __hash__ = None  # type: ignore[assignment]  # specs hold dicts
+
+    def __repr__(self) -> str:
+        return repr(self.value)
+
+
+def boxed(value: Any) -> Any:
+    """`value` so that it can be sent, unless it is plain data already."""
+    return value if value is None or isinstance(value, (Boxed, Packed)) else Boxed(value)
+
+
+def opened(value: Any, node: Node) -> Any:
+    """What is in a box.
+
+    Raises:
+        SpecError: it came from another process than the root: nothing that comes from there is imported or made here.
+    """
+    if not isinstance(value, Packed):
+        return value.value if isinstance(value, Boxed) else value
+    if node.uplink is None:
+        raise SpecError(
+            "supervisor", "a child spec from an actor process is not taken here: start from a template with plain args"
+        )
+    try:
+        return unpack_data(value.data)
+    except HoldfastError as error:
+        raise SpecError("supervisor", str(error)) from error
+
+
+class StartChild(Message[Any]):
+    """Start one more child; the reply is its ref, or None if it did not want to be started (`Ignore`).
+
+    `spec` is a child spec; a dynamic supervisor takes a bare `start(...)` too. From a template a child is started by
+    `StartChild(args=(...), kwargs={...}, id=...)`.
+    """
+
+    spec: Any = None
+    args: tuple[Any, ...] = ()
+    kwargs: dict[str, Any] = msgspec.field(default_factory=dict[str, Any])
+    id: str | None = None
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "spec", boxed(self.spec))
+
+
+class TerminateChild(Message[None]):
+    """Stop a child by its spec; the spec stays, unless it is temporary. A pending restart is void.
+
+    `reason` is what `pack_exit` gives; None is SHUTDOWN.
+    """
+
+    id: str
+    reason: dict[str, Any] | None = None
+
+
+class RestartChild(Message[Any]):
+    """Start a stopped child again; the reply is its ref, or None if it did not want to be started."""
+
+    id: str
+
+
+class DeleteChild(Message[None]):
+    """Forget a stopped child."""
+
+    id: str
+
+
+class ChildInfo(Message[None]):
+    """One child, as `WhichChildren` tells it. `state`: running, restarting, recovering or stopped."""
+
+    id: str
+    state: str
+    path: str
+    is_supervisor: bool
+
+
+class WhichChildren(Message[list[ChildInfo]]):
+    """All children, in start order."""
+
+
+class ChildCounts(Message[None]):
+    """How many specs there are, how many of them run, and how many are supervisors and workers, running or not."""
+
+    specs: int
+    active: int
+    supervisors: int
+    workers: int
+
+
+class CountChildren(Message[ChildCounts]):
+    """How many children there are."""
+
+
+class GetChildSpec(Message[Any]):
+    """The child's spec, with everything that was left out filled in."""
+
+    id: str
+
+
+class ChangeSupervisor(Message[None]):
+    """Change a supervisor while it works. What is left out stays; with nothing given its `init` is asked anew.
+
+    Flags hold at once. A child whose id is known gets its new spec and goes on; a new one is added and not started; one
+    that is not mentioned stays, behind the others. If anything is not valid, nothing changes.
+    """
+
+    flags: Any = None
+    children: Any = None
+
+    def __post_init__(self) -> None:
+        msgspec.structs.force_setattr(self, "flags", boxed(self.flags))
+        msgspec.structs.force_setattr(self, "children", boxed(self.children))

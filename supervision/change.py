@@ -1,0 +1,125 @@
+"""What a supervisor is made of, at its start and when it is changed while it works."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from ..actors.cell import GONE
+from ..actors.errors import HoldfastError, Ignore, SpecError, StartIgnored, remote_crash, type_name
+from ..actors.node import Node
+from .admin import ChangeSupervisor, opened
+from .children import Child
+from .spec import ChildSpec, Flags, Plan, check_spec
+
+if TYPE_CHECKING:
+    from .supervisor import Supervisor
+
+FIXED = ("isolation", "recovery", "mailbox", "limits", "bindings")
+"""What belongs to an address and not to a life: it takes a new address to change it."""
+
+
+def new_plan(supervisor: Supervisor, message: ChangeSupervisor | None = None) -> Plan:
+    """The plan a supervisor is to follow: what `init` returns, or what the message says.
+
+    Raises:
+        SpecError: something in it is not valid. StartIgnored, RemoteCrash: when `init` is asked anew, and raises.
+    """
+    node, where = supervisor.ctx.cell.node, supervisor.ctx.path
+    if message is None:
+        plan = _asked(supervisor)
+    elif message.flags is None and message.children is None:
+        plan = _asked_anew(supervisor)
+    else:
+        flags = opened(message.flags, node)
+        specs = opened(message.children, node)
+        if flags is not None and not isinstance(flags, Flags):
+            raise SpecError("ChangeSupervisor", f"flags must be Flags(...) or left out, not {flags!r}")
+        now = supervisor._flags if flags is None else flags
+        if specs is None:
+            specs = supervisor._specs()
+        plan = Plan.of(now, specs)
+    for spec in plan.children:
+        check_spec(where, spec, plan.flags.auto_shutdown, nameless=supervisor._is_dynamic)
+    check_place(where, plan.children, node)
+    return plan
+
+
+def _asked(supervisor: Supervisor) -> Plan:
+    plan: object = supervisor.init()
+    if not isinstance(plan, Plan):
+        raise SpecError(type_name(type(supervisor)), f"init must return a Plan, not {plan!r}")
+    return plan
+
+
+def _asked_anew(supervisor: Supervisor) -> Plan:
+    """`init` runs in the turn of an admin call: what it raises is the caller's business."""
+    try:
+        return _asked(supervisor)
+    except Ignore as no:
+        raise StartIgnored(supervisor.ctx.path, no.why) from no
+    except HoldfastError:
+        raise
+    except Exception as error:
+        raise remote_crash(error) from error
+
+
+def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> dict[str, Child]:
+    """The children after a change: those of the plan in its order, then those it does not mention.
+
+    Source:
+        Erlang/OTP `supervisor:code_change`.
+
+    Raises:
+        SpecError: a spec changes what belongs to the address of a child that has one.
+    """
+    for spec in plan.children:
+        one = known.get(spec.id)
+        if one is None or one.cell is None or one.cell.state is GONE:
+            continue
+        for name in FIXED:
+            if getattr(spec, name) != getattr(one.spec, name):
+                raise SpecError(
+                    f"child {spec.id!r}", f"{name} belongs to its address: terminate the child before you change it"
+                )
+    children: dict[str, Child] = {}
+    for spec in plan.children:
+        one = children[spec.id] = known.get(spec.id) or Child(spec)
+        one.spec = spec
+        if one.cell is not None and one.cell.state is not GONE:
+            one.cell.spec = spec
+            one.cell.extra().start = spec.start
+    return {**children, **{name: one for name, one in known.items() if name not in children}}
+
+
+def check_place(where: str, specs: Iterable[ChildSpec], node: Node) -> None:
+    """Whether children can live where this supervisor lives.
+
+    Raises:
+        SpecError: an actor process cannot have processes of its own.
+    """
+    if node.uplink is not None:
+        check_subtree(where, specs)
+
+
+def check_subtree(where: str, specs: Iterable[ChildSpec]) -> None:
+    """Whether specs, and what is below them, can live in one process other than the root."""
+    for spec in everything(specs):
+        if spec.isolation == "process":
+            raise SpecError(where, "a subtree in a process cannot hold process children: its own is theirs")
+
+
+def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:
+    """The specs, and those below them as far as they are known before anything runs."""
+    for spec in specs:
+        yield spec
+        if spec.is_supervisor:
+            yield from everything(_specs_in((*spec.start.args, *spec.start.kwargs.values())))
+
+
+def _specs_in(values: Iterable[Any]) -> Iterator[ChildSpec]:
+    for value in values:
+        if isinstance(value, ChildSpec):
+            yield value
+        elif isinstance(value, (list, tuple)):
+            yield from _specs_in(value)

@@ -1,0 +1,236 @@
+"""Dynamic supervisors: children come and go by request, each on its own. Elixir's DynamicSupervisor, in OTP's words.
+
+Differences from a supervisor with a list: it starts empty; only one_for_one; a child that is not restarted is
+forgotten; at the end all children are stopped at once; `max_children` bounds them; with a template each start gives
+arguments only.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from typing import Any, ClassVar
+
+from ..actors import lives
+from ..actors.actor import Start, on
+from ..actors.cell import DOWN, GONE, Cell
+from ..actors.errors import SpecError, type_name
+from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.process.limits import Limits
+from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
+from .change import check_place, check_subtree
+from .children import Child
+from .rules import Rule
+from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
+from .supervisor import Supervisor
+
+
+class DynamicSupervisor(Supervisor):
+    """Keeps children alive that are started by request. Built by `dynamic(...)`, or derived from.
+
+    A derived class returns its flags from `init`, and as only child the template, if there is to be one.
+    """
+
+    _is_dynamic: ClassVar[bool] = True
+
+    _template: ChildSpec | None
+    _count: int
+
+    def __init__(self, flags: Flags | None = None, template: ChildSpec | None = None) -> None:
+        self._given = Plan.of(flags or Flags(), () if template is None else (template,))
+
+    def _begin(self, plan: Plan) -> None:
+        check_dynamic(type_name(type(self)), plan)
+        self._count = 0
+        super()._begin(Plan.of(plan.flags, ()))
+        self._template = plan.children[0] if plan.children else None
+
+    def _take(self, plan: Plan) -> None:
+        """New flags and template; those who live now stay as they are, even if there are more than there may be."""
+        check_dynamic(self.ctx.path, plan)
+        self._flags, self._template = plan.flags, plan.children[0] if plan.children else None
+
+    def _specs(self) -> tuple[ChildSpec, ...]:
+        return () if self._template is None else (self._template,)
+
+    # -- starting ---------------------------------------------------------------------------------------------------
+
+    def _spec_in(self, message: StartChild) -> ChildSpec:
+        own = self.ctx.cell
+        given = opened(message.spec, own.node)
+        if self._template is not None:
+            if given is not None:
+                raise SpecError("StartChild", f"{self.ctx.path} has a template: give args and kwargs only")
+            spec = _filled(self._template, message)
+        elif message.args or message.kwargs:
+            raise SpecError("StartChild", f"{self.ctx.path} has no template for these arguments: give a child spec")
+        elif isinstance(given, Start):
+            spec = child(None, given)
+        elif isinstance(given, ChildSpec):
+            spec = given
+        else:
+            raise SpecError("StartChild", f"takes child(...), start(...) or supervisor(...), not {given!r}")
+        check_spec("StartChild", spec, "never", nameless=True)
+        check_place("StartChild", (spec,), own.node)
+        if message.id is not None:
+            return dataclasses.replace(spec, id=message.id)
+        if spec.id != NAMELESS and self._template is None:
+            return spec
+        return dataclasses.replace(spec, id=self._new_id(spec))
+
+    def _new_id(self, spec: ChildSpec) -> str:
+        """An id that nobody has here: the template's or the class's name, and a number."""
+        prefix = spec.start.kind.__name__.lower() if spec.id == NAMELESS else spec.id
+        while True:
+            self._count += 1
+            name = f"{prefix}-{self._count}"
+            if name not in self._children and name not in (self.ctx.cell.children or ()):
+                return name
+
+    def _check_free(self, spec: ChildSpec) -> None:
+        known = self._children.get(spec.id)
+        if known is not None:
+            assert known.cell is not None  # Here a child is known only while its address is.
+            raise AlreadyStarted(spec.id, known.cell.ref)
+        most = self._flags.max_children
+        if most is not None and len(self._children) >= most:
+            raise MaxChildren(most)
+
+    # -- ending -----------------------------------------------------------------------------------------------------
+
+    def _give_up_address(self, one: Child, reason: object) -> None:
+        super()._give_up_address(one, reason)
+        self._forget(one)
+
+    async def _stop_children(self) -> None:
+        """We end: all children are told at once, and each has the time its spec gives it."""
+        await stop_together(list((self.ctx.cell.children or {}).values()))
+
+    # -- what makes no sense here -----------------------------------------------------------------------------------
+
+    @on(RestartChild)
+    async def _restart_child(self, message: RestartChild) -> Any:
+        """A stopped child is forgotten here."""
+        self._child(message.id)
+        raise NotSupported("a dynamic supervisor forgets stopped children: start it anew with StartChild")
+
+    @on(DeleteChild)
+    def _delete_child(self, message: DeleteChild) -> None:
+        """A stopped child is forgotten here."""
+        self._child(message.id)
+        raise NotSupported("a dynamic supervisor forgets stopped children by itself: use TerminateChild")
+
+
+async def stop_together(cells: list[Cell]) -> None:
+    """Stop children side by side: one timer for each shutdown time that occurs, however many they are."""
+    waiting: list[tuple[Cell, asyncio.Future[ExitReason]]] = []
+    late: dict[float, list[Cell]] = {}
+    for cell in cells:
+        spec: ChildSpec | None = cell.spec
+        if cell.state in (DOWN, GONE):
+            lives.retire(cell, "its parent has stopped")
+            continue
+        waiting.append((cell, lives.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
+        patience = lives.PATIENCE if spec is None else spec.shutdown
+        if not isinstance(patience, str):
+            late.setdefault(patience, []).append(cell)
+    timers = [cells[0].node.loop.call_later(seconds, _kill_all, those) for seconds, those in late.items()]
+    try:
+        for cell, gone in waiting:
+            ended = await gone
+            if cell.spec is not None:
+                cell.spec.judge(cell, SHUTDOWN, ended)
+            lives.retire(cell, "its parent has stopped")
+    finally:
+        for timer in timers:
+            timer.cancel()
+
+
+def _kill_all(cells: list[Cell]) -> None:
+    for cell in cells:
+        if cell.state not in (DOWN, GONE):
+            cell.kill()
+
+
+def _filled(template: ChildSpec, message: StartChild) -> ChildSpec:
+    """The template with the arguments of one start behind its own.
+
+    Raises:
+        SpecError: the arguments do not fit the class.
+    """
+    own = template.start
+    start = Start(own.kind, (*own.args, *message.args), {**own.kwargs, **message.kwargs})
+    try:
+        start.check()
+    except TypeError as error:
+        raise SpecError("StartChild", f"start({type_name(own.kind)}, ...): {error}") from error
+    return dataclasses.replace(template, start=start)
+
+
+def check_dynamic(where: str, plan: Plan) -> None:
+    """Whether a plan is one for a dynamic supervisor.
+
+    Raises:
+        SpecError: naming what does not go together.
+    """
+    flags = plan.flags
+    if flags.strategy != "one_for_one":
+        raise SpecError(
+            where, f"a dynamic supervisor is one_for_one, not {flags.strategy!r}: its children have no order"
+        )
+    if flags.auto_shutdown != "never":
+        raise SpecError(
+            where, f"a dynamic supervisor has no significant children: auto_shutdown {flags.auto_shutdown!r}"
+        )
+    if len(plan.children) > 1:
+        raise SpecError(where, "a dynamic supervisor starts empty: it takes one template at most")
+
+
+def dynamic(
+    name: str,
+    *,
+    template: ChildSpec | None = None,
+    max_children: int | None = None,
+    intensity: int = 1,
+    period: float = 5.0,
+    restart: Restart = "permanent",
+    shutdown: Shutdown = "infinity",
+    isolation: Isolation = "task",
+    limits: Limits | None = None,
+    significant: bool = False,
+    rules: tuple[Rule, ...] = (),
+) -> ChildSpec:
+    """A supervisor that starts empty and takes children by `StartChild`, as a spec.
+
+    Args:
+        name: the last part of its address.
+        template: `child(None, start(Class, ...))`: every child is one of these, and `StartChild(args=...)` adds the
+            rest of its arguments; without one `StartChild` takes any child spec, or a bare `start(...)`.
+        max_children: how many there may be, those that are being restarted among them; None sets no limit.
+        intensity: restarts allowed within `period` seconds; one more and it gives up.
+        period: seconds, > 0.
+        restart, shutdown, isolation, limits, significant, rules: as a child of its own supervisor; see `supervisor`.
+
+    Raises:
+        SpecError: naming the option and what it may be.
+    """
+    where = f"dynamic {name!r}"
+    try:
+        flags = Flags("one_for_one", intensity, period, "never", max_children)
+    except SpecError as error:
+        raise SpecError(where, error.problem) from None
+    if template is not None:
+        check_spec(where, template, "never", nameless=True)
+        if isolation == "process":
+            check_subtree(where, (template,))
+    return ChildSpec(
+        name,
+        Start(DynamicSupervisor, (flags, template)),
+        restart,
+        shutdown,
+        isolation,
+        limits=limits,
+        is_supervisor=True,
+        significant=significant,
+        rules=tuple(rules),
+    )

@@ -1,0 +1,161 @@
+"""The idle barrier: wait until nothing can happen any more by itself, instead of sleeping and hoping.
+
+Idle means: no actor is on the run queue, every task of the loop waits for something that nobody here is about to do,
+and each actor process has handled what it was sent and said what it had to say. What is left then needs time to pass
+(a timer, a deadline) or something from outside.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ..actors.errors import HoldfastError
+from ..actors.process import frames
+from ..actors.process.remote import Outlet
+from ..actors.process.workers import Worker
+from ..checkpoint.outputs import switch_of
+from ..checkpoint.records import STASHED
+from ..checkpoint.switch import Switch
+
+if TYPE_CHECKING:
+    from ..actors.node import Node
+    from ..system.system import ActorSystem
+
+TIMEOUT = 10.0
+"""Seconds on the loop's clock."""
+QUIET = 3
+"""Ticks of the loop in a row in which nothing moves: a callback that is due now may still wake somebody."""
+NIL = msgspec.Raw(msgspec.msgpack.encode(None))
+PING = "holdfast.testing:Ping"
+"""A message name that nobody has: the refusal comes back behind everything that was said before."""
+
+
+class NotIdle(HoldfastError, TimeoutError):
+    """The system did not come to rest; `busy` says what still moved."""
+
+    def __init__(self, timeout: float, busy: tuple[str, ...]) -> None:
+        super().__init__(timeout, busy)
+        self.timeout, self.busy = timeout, busy
+
+    def __str__(self) -> str:
+        return f"not idle after {self.timeout:g} s: {'; '.join(self.busy) or 'something came up each time'}"
+
+
+async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
+    """Wait until nothing is queued and nothing that runs could go on.
+
+    Args:
+        system: a running one. Its actors in processes of their own are asked for a round trip each; of a subtree in a
+            process only the turns of its supervisor are known, and what an actor there tells itself is not.
+        timeout: seconds on the loop's clock, > 0. Turns that wait for time or for the outside are not waited for here,
+            but those in other processes are: nobody sees from here what they wait for.
+
+    Raises:
+        NotIdle: it went on all that time; one task at a time may wait for this.
+    """
+    node = system.node
+    try:
+        async with asyncio.timeout(timeout):
+            while True:
+                await quiet(node)
+                if not await _hear(system):
+                    return
+    except TimeoutError:
+        raise NotIdle(timeout, tuple(_busy(node) + _waiting(system))) from None
+
+
+async def quiet(node: Node | None = None) -> None:
+    """Wait until no task of this loop could go on, and no actor of the node is ready."""
+    calm = 0
+    while calm < QUIET:
+        await asyncio.sleep(0)
+        calm = 0 if _busy(node) else calm + 1
+
+
+def _busy(node: Node | None) -> list[str]:
+    """What could go on now."""
+    own = asyncio.current_task()
+    found = [cell.path for cell in node.ready] if node is not None else []
+    if node is not None and node.awake and not found:
+        found.append("the run queue")
+    found += [task.get_name() for task in asyncio.all_tasks() if task is not own and _could_go_on(task)]
+    return found
+
+
+def _could_go_on(task: asyncio.Task[Any]) -> bool:
+    """Whether a task waits for nothing, or for something that is there."""
+    waiter = getattr(task, "_fut_waiter", None)  # What asyncio's own debug output shows as `wait_for`.
+    return waiter is None or waiter.done()
+
+
+async def _hear(system: ActorSystem) -> bool:
+    """One round trip through each actor process. Returns whether anything moved, or may have."""
+    moved = bool(_waiting(system))
+    for worker in list(system._workers.by_cell.values()):
+        moved |= await _ping(worker)
+    return moved or bool(_busy(system.node))
+
+
+async def _ping(worker: Worker) -> bool:
+    """Everything the process said before its answer has been taken in when this returns. Whether it said anything."""
+    if not worker.connection.is_open:
+        return True  # It has ended, and what follows from that is still to come.
+    counter = FrameCounter(worker)
+    try:
+        key, answered = worker.acceptance()
+        name = worker.connection.name_out(worker.cell.path if worker.cell is not None else "/")
+        worker.connection.send(frames.Ask(key, name, worker.connection.name_out(PING), NIL, TIMEOUT))
+        try:
+            await answered
+        except HoldfastError:
+            pass  # As it must be: nobody has a handler for it, or the process has ended meanwhile.
+    finally:
+        counter.close()
+    return counter.count > 1
+
+
+class FrameCounter:
+    """Counts what comes from a process: `takers` first, all else by `_on_frame`."""
+
+    def __init__(self, worker: Worker) -> None:
+        self.count = 0
+        self._connection = worker.connection
+        self._on_frame = self._connection._on_frame
+        self._takers = dict(self._connection.takers)
+        self._connection._on_frame = self._counted(self._on_frame)
+        self._connection.takers = {kind: self._counted(take) for kind, take in self._takers.items()}
+
+    def _counted(self, take: Any) -> Any:
+        def counted(frame: Any) -> None:
+            self.count += not isinstance(frame, frames.Beat)
+            take(frame)
+
+        return counted
+
+    def close(self) -> None:
+        """Count no more."""
+        self._connection._on_frame, self._connection.takers = self._on_frame, self._takers
+
+
+def _waiting(system: ActorSystem) -> list[str]:
+    """Actors in processes that have not handled what they were sent."""
+    found: list[str] = []
+    for cell in system._workers.by_cell:
+        outlet = cell.more.outlet if cell.more is not None else None
+        switch = switch_of(cell)
+        if switch is not None:
+            if set(switch.open) - _put_aside(switch):
+                found.append(f"{cell.path} has {len(switch.open)} inputs in hand")
+        elif isinstance(outlet, Outlet):
+            outlet.trim()
+            if outlet.flight:
+                found.append(f"{cell.path} has {len(outlet.flight)} messages in hand")
+    return found
+
+
+def _put_aside(switch: Switch) -> set[int]:
+    """Inputs that are stashed: they are open, and nothing happens to them by itself."""
+    return {turn.input.id for turn in switch.turns.values() if turn.status == STASHED} | set(switch.stash)

@@ -1,0 +1,261 @@
+"""Faults at named points, from a seed: what crashes, hangs, comes late, twice, out of order, damaged, or never.
+
+A fault is installed on one actor (or one system) by exchanging the function that stands at that point, for as long as
+the context is open. Production code has no hooks for it and pays nothing.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, Literal, NamedTuple, get_args
+
+from ..actors.errors import HoldfastError, SpecError
+from ..actors.ref import ActorRef
+from ..system.system import ActorSystem
+
+Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail"]
+KINDS: tuple[str, ...] = get_args(Kind)
+
+
+class Point(NamedTuple):
+    """A place where faults strike.
+
+    Attributes:
+        name: as in `on(..., at=name)`.
+        where: what passes there.
+        kinds: the faults that can strike there.
+        guarantee: what holds all the same.
+    """
+
+    name: str
+    where: str
+    kinds: tuple[Kind, ...]
+    guarantee: str
+
+
+POINTS: dict[str, Point] = {
+    point.name: point
+    for point in (
+        Point(
+            "admit",
+            "a message on its way into the mailbox",
+            ("drop", "delay", "duplicate", "reorder", "corrupt"),
+            "an ask that is lost ends at its deadline, surely not handled; a doubled one has one outcome",
+        ),
+        Point(
+            "turn begin",
+            "a message's turn in this process, before its handler",
+            ("crash", "hang", "delay"),
+            "the asker gets RemoteCrash, the state is as before, what is queued is kept",
+        ),
+        Point(
+            "turn end",
+            "the same, when the handler has returned and nothing has left yet",
+            ("crash", "hang", "delay"),
+            "the asker gets RemoteCrash and no reply; what is queued is kept",
+        ),
+        Point(
+            "reply",
+            "a reply on its way to an ask made in this process",
+            ("drop", "delay", "duplicate", "corrupt"),
+            "the ask ends once: by the reply, or at its deadline, which cannot tell whether it was handled",
+        ),
+        Point(
+            "frame out",
+            "a message on its way to an actor's own process",
+            ("crash", "delay", "drop", "corrupt"),
+            "crash, corrupt: its process ends and is started again; with recovery every ask is answered, once",
+        ),
+        Point(
+            "frame in",
+            "a message or reply on its way back from there",
+            ("crash", "delay", "drop", "corrupt"),
+            "as frame out; what the actor has released is not released twice",
+        ),
+        Point(
+            "journal append",
+            "a recorded actor's append to a durable store",
+            ("fail",),
+            "what is not in the journal is not accepted: its sender hears of it, and it is never applied",
+        ),
+        Point(
+            "snapshot write",
+            "a recorded actor's snapshot on its way into a durable store",
+            ("fail",),
+            "the older snapshot and the whole journal stay, and bring everything back",
+        ),
+        Point(
+            "process start",
+            "a system's next process for an actor",
+            ("fail", "crash", "delay"),
+            "the start fails and is tried again within the supervisor's intensity",
+        ),
+    )
+}
+"""Every point, by name."""
+
+
+class InjectedCrash(HoldfastError):
+    """Raised in a turn by a fault, as if the handler had."""
+
+    def __init__(self, at: str, number: int, seed: int) -> None:
+        super().__init__(at, number, seed)
+        self.at, self.number, self.seed = at, number, seed
+
+    def __str__(self) -> str:
+        return f"injected crash at {self.at!r}, chance {self.number} (seed {self.seed})"
+
+
+class Strike(NamedTuple):
+    """One fault that struck: at the how manieth chance, counted from 1, and what it hit."""
+
+    at: str
+    path: str
+    kind: Kind
+    number: int
+    what: str
+
+    def __str__(self) -> str:
+        return f"{self.kind} at {self.at!r} of {self.path}, chance {self.number}: {self.what}"
+
+
+class Strikes:
+    """The faults of one point of one target, from `on` to the end of the context."""
+
+    def __init__(
+        self,
+        faults: Faults,
+        path: str,
+        point: Point,
+        odds: dict[Kind, float],
+        seconds: float,
+        after: int,
+        times: int | None,
+    ) -> None:
+        self.at, self.path, self.seconds, self.seed = point.name, path, seconds, faults.seed
+        self.chances = 0
+        self.struck: list[Strike] = []
+        self.draw = random.Random(f"{faults.seed}|{path}|{point.name}|{len(faults.installed)}")
+        self._faults, self._odds, self._after, self._times = faults, odds, after, times
+        self._undo: list[Callable[[], None]] = []
+
+    def next(self, what: object) -> Kind | None:
+        """One chance: the fault that strikes now, if any. `what` passes the point."""
+        self.chances += 1
+        drawn = self.draw.random()  # At each chance, so that the next ones do not depend on what this one does.
+        if self.chances <= self._after or (self._times is not None and len(self.struck) >= self._times):
+            return None
+        for kind, odds in self._odds.items():
+            if drawn < odds:
+                strike = Strike(self.at, self.path, kind, self.chances, repr(what)[:200])
+                self.struck.append(strike)
+                self._faults.strikes.append(strike)
+                return kind
+            drawn -= odds
+        return None
+
+    def crash(self) -> InjectedCrash:
+        """The exception of a crash that strikes now."""
+        return InjectedCrash(self.at, self.chances, self.seed)
+
+    def at_end(self, undo: Callable[[], None]) -> None:
+        """Call this when the faults end, last first."""
+        self._undo.append(undo)
+
+    def end(self) -> None:
+        """No more faults: what was exchanged is put back, what was held goes on. A second call changes nothing."""
+        while self._undo:
+            self._undo.pop()()
+
+    def __enter__(self) -> Strikes:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.end()
+        if error is not None and self.struck:
+            error.add_note("\n".join(["faults that struck:", *(f"  {strike}" for strike in self.struck)]))
+
+    async def __aenter__(self) -> Strikes:
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.__exit__(kind, error, trace)
+
+
+class Faults:
+    """Faults from one seed: the same seed strikes the same chances.
+
+    Attributes:
+        strikes: everything that struck so far, oldest first.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self.strikes: list[Strike] = []
+        self.installed: list[Strikes] = []
+
+    def on(
+        self,
+        target: ActorRef[Any] | ActorSystem,
+        *,
+        at: str,
+        seconds: float = 1.0,
+        after: int = 0,
+        times: int | None = None,
+        **odds: float,
+    ) -> Strikes:
+        """Faults at one point, from now to the end of the context: `async with faults.on(ref, at="admit", drop=0.1):`.
+
+        Args:
+            target: the actor; for "process start" the system.
+            at: a name in POINTS.
+            seconds: how long a delay is, on the loop's clock.
+            after: this many chances are let pass first.
+            times: at most so many strikes; None: no limit.
+            odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail), the probability with
+                which it strikes at each chance; together at most 1.
+
+        Raises:
+            SpecError: there is no such point, the fault cannot strike there, or the target has no such point.
+        """
+        from .injectors import INSTALL  # It needs the names above.
+
+        point = POINTS.get(at)
+        if point is None:
+            raise SpecError("faults", f"at must be one of {', '.join(POINTS)}, not {at!r}")
+        strikes = Strikes(self, _path(target), point, _checked(point, odds), seconds, after, times)
+        INSTALL[at](strikes, target)
+        self.installed.append(strikes)
+        return strikes
+
+    def end(self) -> None:
+        """End all of them."""
+        for strikes in reversed(self.installed):
+            strikes.end()
+
+    def __repr__(self) -> str:
+        return f"<Faults seed={self.seed}, {len(self.strikes)} struck>"
+
+
+def _path(target: ActorRef[Any] | ActorSystem) -> str:
+    return target.path if isinstance(target, ActorRef) else f"/{target.name}"
+
+
+def _checked(point: Point, odds: dict[str, float]) -> dict[Kind, float]:
+    """The odds by kind, if they are any."""
+    chosen: dict[Kind, float] = {}
+    for kind in point.kinds:
+        if kind in odds:
+            chosen[kind] = odds[kind]
+    unfit = sorted(set(odds) - set(chosen))
+    if unfit:
+        raise SpecError("faults", f"at {point.name!r} there can be {', '.join(point.kinds)}, not {unfit[0]!r}")
+    if not chosen or any(not 0 <= one <= 1 for one in chosen.values()) or sum(chosen.values()) > 1 + 1e-9:
+        raise SpecError("faults", f"give at least one probability, each from 0 to 1, together at most 1, not {odds!r}")
+    return chosen

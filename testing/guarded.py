@@ -1,0 +1,191 @@
+"""A system under guard: at its end the test hears of everything that went wrong and that it did not expect."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+from ..actors.cell import Host
+from ..actors.errors import HoldfastError
+from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
+from ..actors.exits import Exited, Hung, OutOfMemory, Signal
+from ..supervision.spec import ChildSpec
+from ..system.system import ActorSystem
+from .clock import RealTimeNeeded, VirtualClockLoop
+from .leaks import Leaks
+from .sends import SendChecks
+
+CRASHES = (ActorCrashed, HookFailed, LifeAbandoned)
+DEATHS = (Signal, Exited, OutOfMemory, Hung)
+SHOWN = 20
+"""Problems of one kind that are told in full."""
+
+
+class Expected:
+    """How often something may happen: never, any number of times, or exactly so often."""
+
+    def __init__(self) -> None:
+        self.any = False
+        self.count = 0
+
+    def expect(self, count: int | None) -> None:
+        """Any number if `count` is None."""
+        if count is None:
+            self.any = True
+        else:
+            self.count += count
+
+    def problem(self, what: str, happened: list[Event]) -> str | None:
+        """What is wrong, as text; None if nothing is."""
+        if self.any or len(happened) == self.count:
+            return None
+        hint = f"actor_system.expect_{what.replace(' ', '_')}()"
+        lines = [f"  {describe(event)}" for event in happened[:SHOWN]]
+        if len(happened) > SHOWN:
+            lines.append(f"  ... and {len(happened) - SHOWN} more")
+        expected = f"{self.count} expected" if self.count else f"none expected; if they are meant to be: {hint}"
+        return "\n".join([f"{len(happened)} {what} ({expected})", *lines])
+
+
+class UnexpectedEnd(HoldfastError, AssertionError):
+    """A guarded system saw what its test did not expect; each problem is a text."""
+
+    def __init__(self, problems: tuple[str, ...]) -> None:
+        super().__init__(problems)
+        self.problems = problems
+
+    def __str__(self) -> str:
+        return "\n".join(self.problems)
+
+
+class GuardedSystem(ActorSystem):
+    """An ActorSystem for tests. It notes crashes and dead letters, and checks what is sent.
+
+    Args:
+        as `ActorSystem`; but it does not log, and its actors' random numbers are the same each time.
+
+    `verify` (after the end) raises what was not expected.
+    """
+
+    def __init__(self, name: str = "app", *, log: bool = False, seed: int | None = 1, **options: Any) -> None:
+        super().__init__(name, log=log, seed=seed, **options)
+        self.crashes: list[Event] = []
+        self.letters: list[Event] = []
+        self._expected_crashes, self._expected_letters = Expected(), Expected()
+        self._checks: SendChecks | None = None
+        self._ends = False
+
+    async def __aenter__(self) -> GuardedSystem:
+        await super().__aenter__()
+        self.node.events.add_sink(self._note)
+        self._checks = SendChecks(self.node)
+        return self
+
+    def _host_for(self, spec: ChildSpec) -> Host:
+        if spec.isolation == "process" and isinstance(self.node.loop, VirtualClockLoop):
+            raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")
+        return super()._host_for(spec)
+
+    async def shutdown(self) -> None:
+        # What is still queued when the test is over was never waited for: its end is no news.
+        self._ends = True
+        try:
+            await super().shutdown()
+        finally:
+            if self._checks is not None:
+                self._checks.close()
+
+    def expect_dead_letters(self, count: int | None = None) -> None:
+        """Dead letters (refused tells among them) are part of this test: exactly `count` more, or any number."""
+        self._expected_letters.expect(count)
+
+    def expect_crashes(self, count: int | None = None) -> None:
+        """Crashes of actors and deaths of their processes are part of this test: exactly `count` more, or any number.
+
+        A process that is killed from outside is one, too; `ref.kill()` is not.
+        """
+        self._expected_crashes.expect(count)
+
+    def expect_sends(self) -> None:
+        """Do not complain of messages that are mutated after they were sent."""
+        if self._checks is not None:
+            self._checks.is_expected = True
+
+    def _note(self, event: Event) -> None:
+        if isinstance(event, CRASHES) or (isinstance(event, ProcessDied) and isinstance(event.reason, DEATHS)):
+            self.crashes.append(event)
+        elif isinstance(event, DeadLetter) and not self._ends:
+            self.letters.append(event)
+
+    def problems(self) -> list[str]:
+        """What happened and was not expected, as texts."""
+        found = [
+            self._expected_crashes.problem("crashes", self.crashes),
+            self._expected_letters.problem("dead letters", self.letters),
+            self._checks.problem() if self._checks is not None else None,
+        ]
+        return [problem for problem in found if problem is not None]
+
+    def verify(self) -> None:
+        """Raise UnexpectedEnd if something happened that was not expected."""
+        problems = self.problems()
+        if problems:
+            raise UnexpectedEnd(tuple(problems))
+
+
+def describe(event: Event) -> str:
+    """An event in one line."""
+    match event:
+        case ActorCrashed(life=life, reason=reason, item=item):
+            return f"{event.address} (life {life}) crashed in {_brief(item)}: {reason}"
+        case HookFailed(hook=hook, reason=reason):
+            return f"{event.address}: {hook} raised: {reason}"
+        case LifeAbandoned(life=life):
+            return f"{event.address} (life {life}) went on in spite of its cancellation"
+        case ProcessDied(pid=pid, reason=reason):
+            return f"{event.address}: its process {pid} died: {reason}"
+        case DeadLetter(message=message, why=why):
+            return f"{event.address}: {_brief(message)}: {why}"
+        case _:
+            return f"{event.address}: {type(event).__name__}"
+
+
+def _brief(item: Any) -> str:
+    text = repr(getattr(item, "message", item))
+    return text if len(text) <= 200 else text[:200] + "..."
+
+
+class Guard:
+    """The systems of one test, and what must not be left when they have ended."""
+
+    def __init__(self, *, leaks: bool = True) -> None:
+        self._leaks = Leaks() if leaks else None
+        self._systems: list[GuardedSystem] = []
+
+    async def start(self, system: GuardedSystem) -> GuardedSystem:
+        """Start a system; `close` ends it."""
+        await system.__aenter__()
+        self._systems.append(system)
+        return system
+
+    async def close(self) -> None:
+        """End every system, newest first.
+
+        Raises:
+            UnexpectedEnd: naming every leak, dead letter and crash that was not expected.
+        """
+        problems: list[str] = []
+        for system in reversed(self._systems):
+            try:
+                await system.__aexit__(None, None, None)
+            except asyncio.CancelledError:
+                raise
+            except HoldfastError as error:  # The tree failed; the others still have to end.
+                problems.append(f"system {system.name!r}: {error}")
+            problems += system.problems()
+        if self._leaks is not None:
+            problems += [f"a task was left running: {text}" for text in await self._leaks.tasks()]
+            problems += [f"a process was left running: {text}" for text in self._leaks.processes()]
+            problems += [f"a descriptor was left open: {text}" for text in self._leaks.files()]
+        if problems:
+            raise UnexpectedEnd(tuple(problems))

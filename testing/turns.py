@@ -1,0 +1,141 @@
+"""A look into turns, for tests: what is called before and after each turn of a node, or instead of its handler.
+
+Installed by exchanging one function of the run loop, `run_turns`, for one that runs the same turns singly. Without a
+watcher the loop's own function stands there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from ..actors import loop as run_loop
+from ..actors.cell import Cell
+from ..actors.loop import RunLoop, Suspended
+from ..actors.mail import Handler, Table
+from ..actors.message import Message
+from .swaps import Swaps
+
+Substitute = Callable[[Handler], Handler]
+"""Makes what runs in a turn from what would have run."""
+
+
+class TurnWatcher:
+    """Hears of the turns of one node. Subclasses override what they need."""
+
+    def begins(self, cell: Cell, item: Any) -> Substitute | None:
+        """The turn of `item` is next; a substitute is run in place of its handler."""
+        return None
+
+    def ended(self, cell: Cell, item: Any) -> None:
+        """The turn is over: its handler has returned or raised, also if it had to wait in between."""
+
+
+class Watched:
+    """The turns of one node under watch."""
+
+    def __init__(self, node: RunLoop) -> None:
+        self.node = node
+        self.watchers: list[TurnWatcher] = []
+        self.swaps = Swaps()
+        self._over = node.turn_over
+        self.swaps.put(node, "turn_over", self._turn_over)
+
+    def run(self, original: Callable[[Cell, int], bool], cell: Cell, most: int) -> bool:
+        """As `run_turns`, one turn at a time."""
+        queue = cell.queue
+        if not queue:
+            return original(cell, most)
+        for _ in range(min(len(queue), most)):
+            item = queue[0] if queue else None
+            if not self._run_one(original, cell, item):
+                return False
+        return True
+
+    def _run_one(self, original: Callable[[Cell, int], bool], cell: Cell, item: Any) -> bool:
+        made = [made for watcher in self.watchers if (made := watcher.begins(cell, item)) is not None]
+        if made:
+            with Swaps() as swaps:
+                # A bare message is looked up in its cell's table; what carries one looks it up in its actor's.
+                owner: Any = cell if isinstance(item, Message) else cell.actor
+                name = "table" if owner is cell else "_table"
+                swaps.put(owner, name, SubstituteTable(getattr(owner, name), made))
+                goes_on = original(cell, 1)
+        else:
+            goes_on = original(cell, 1)
+        turn = cell.more.turn if cell.more is not None else None
+        if turn is None or turn.item is not item:  # Else it waits for something, and is over later.
+            self._ended(cell, item)
+        return goes_on
+
+    def _turn_over(self, turn: Suspended, error: BaseException | None) -> None:
+        item = turn.item
+        self._over(turn, error)
+        if item is not None:
+            self._ended(turn.cell, item)
+
+    def _ended(self, cell: Cell, item: Any) -> None:
+        for watcher in self.watchers:
+            watcher.ended(cell, item)
+
+
+class SubstituteTable(Table):
+    """A table for the length of one turn: the handlers of messages are substituted."""
+
+    def __init__(self, table: Table, substitutes: list[Substitute]) -> None:
+        super().__init__()
+        self._table, self._substitutes = table, substitutes
+
+    def __getitem__(self, kind: type) -> Handler:
+        handler = self._table[kind]
+        if issubclass(kind, Message):
+            for substitute in self._substitutes:
+                handler = substitute(handler)
+        return handler
+
+    def __contains__(self, kind: object) -> bool:
+        return kind in self._table
+
+    def knows(self, kind: type) -> bool:
+        return self._table.knows(kind)
+
+
+class Turns:
+    """Stands in for `run_turns` while any node of this process is watched."""
+
+    def __init__(self) -> None:
+        self._original: Callable[[Cell, int], bool] = run_loop.run_turns
+        self._nodes: dict[RunLoop, Watched] = {}
+        self._swaps = Swaps()
+        self._swaps.put(run_loop, "run_turns", self.run_turns)
+
+    def run_turns(self, cell: Cell, most: int) -> bool:
+        """Run turns of a cell as its node wants it."""
+        watched = self._nodes.get(cell.node)
+        return self._original(cell, most) if watched is None else watched.run(self._original, cell, most)
+
+    def add(self, node: RunLoop, watcher: TurnWatcher) -> None:
+        """Let the watcher hear of this node's turns."""
+        if node not in self._nodes:
+            self._nodes[node] = Watched(node)
+        self._nodes[node].watchers.append(watcher)
+
+    def remove(self, node: RunLoop, watcher: TurnWatcher) -> None:
+        """Stop; after the last watcher the loop has its own function back."""
+        watched = self._nodes.get(node)
+        if watched is None:
+            return
+        watched.watchers = [other for other in watched.watchers if other is not watcher]
+        if not watched.watchers:
+            watched.swaps.undo()
+            del self._nodes[node]
+        if not self._nodes:
+            self._swaps.undo()
+
+
+def watch_turns(node: RunLoop, watcher: TurnWatcher) -> Callable[[], None]:
+    """Let `watcher` hear of the turns of a node. Returns what ends that."""
+    standing = getattr(run_loop.run_turns, "__self__", None)
+    turns = standing if isinstance(standing, Turns) else Turns()
+    turns.add(node, watcher)
+    return lambda: turns.remove(node, watcher)

@@ -1,0 +1,96 @@
+"""What is done to stores, by these tests and by a process of its own."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from holdfast.checkpoint.journal import (
+    Entry,
+    Saved,
+)
+from holdfast.checkpoint.sqlite import SqliteJournal
+
+A, B = "/app/bank/alice", "/app/bank/bob"
+
+
+def inputs(count: int, address: str = A, start: int = 0) -> list[tuple[str, Entry]]:
+    return [(address, ("in", number)) for number in range(start, start + count)]
+
+
+def numbers(saved: Saved) -> list[Any]:
+    return [entry[1] for _, entry in saved.entries]
+
+
+def reopened(path: Path) -> Saved:
+    with closing(SqliteJournal(path)) as journal:
+        return journal.load(A)
+
+
+def edit(path: Path, *statements: str) -> None:
+    """Damage a closed store behind its back."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as db:
+        for statement in statements:
+            db.execute(statement)
+
+
+def flip(path: Path, bit: int) -> None:
+    data = bytearray(path.read_bytes())
+    data[bit // 8] ^= 1 << bit % 8
+    path.write_bytes(data)
+
+
+CHILD = """
+import os, random, signal, sys
+from holdfast.checkpoint.sqlite import SqliteJournal
+path, what, seed = sys.argv[1], sys.argv[2], int(sys.argv[3])
+journal = SqliteJournal(path, synchronous="fsync" if seed % 2 else "os")
+print("open", journal.epoch, flush=True)
+choose = random.Random(seed)
+if what == "hold":
+    journal.append([("/app/bank/alice", ("in", 1))])
+    print("held", flush=True)
+    sys.stdin.read()
+if what == "stop":  # in the middle of a transaction, with SQLite's write lock held
+    with journal._store.transaction():
+        os.kill(os.getpid(), signal.SIGSTOP)
+number, live, done = 0, {0: [], 1: []}, 0
+while what == "write":
+    size = choose.choice([1, 1, 2, 7, 40])
+    batch = [(f"/{(number + n) % 2}", ("in", number + n, size, n, "x" * choose.randrange(200))) for n in range(size)]
+    for (address, _), position in zip(batch, journal.append(batch)):
+        live[int(address[1])].append(position)
+    number += size
+    os.write(1, b"%d\\n" % number)  # acknowledged
+    if choose.random() < 0.1:
+        owner = choose.randrange(2)
+        snapshot = b"%d " % (number) + b"x" * choose.choice([10, 3 << 20])
+        journal.cut(f"/{owner}", snapshot, live[owner], turn=number)
+        live[owner] = []
+        os.write(1, b"cut %d %d\\n" % (owner, number))
+"""
+
+
+def spawn(path: Path, what: str, seed: int = 0) -> subprocess.Popen[bytes]:
+    return subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(path), what, str(seed)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+    )
+
+
+def end(child: subprocess.Popen[bytes]) -> bytes:
+    """Kill the child; return what it had still said."""
+    child.kill()
+    return child.communicate()[0]
+
+
+def line(child: subprocess.Popen[bytes]) -> bytes:
+    assert child.stdout is not None
+    return child.stdout.readline()

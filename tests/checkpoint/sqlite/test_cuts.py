@@ -1,0 +1,241 @@
+"""What the store holds agrees with what was appended, cut and erased, whoever else is at work."""
+
+from __future__ import annotations
+
+import os
+import random
+import shutil
+import sqlite3
+import stat
+import threading
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from holdfast.checkpoint.journal import (
+    Entry,
+    StoreFailed,
+)
+from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.sqlite import store as sqlite_store
+from holdfast.checkpoint.sqlite.chains import Chain
+from holdfast.checkpoint.sqlite.claim import Claim
+from holdfast.checkpoint.sqlite.rows import crc_of
+from tests.checkpoint.sqlite.stores import A, B, inputs, numbers, reopened
+
+
+@pytest.mark.parametrize("size", [0, 1 << 20, (1 << 20) + 1, 5 << 20])
+def test_a_snapshot_and_what_it_does_not_contain_survive(path: Path, size: int) -> None:
+    snapshot = random.Random(size).randbytes(size)
+    with closing(SqliteJournal(path)) as journal:
+        positions = journal.append(inputs(5))
+        journal.cut(A, snapshot, [positions[3], positions[0]], turn=7)
+        assert numbers(journal.load(A)) == [1, 2, 4]
+    saved = reopened(path)
+    assert (saved.snapshot, saved.turn, numbers(saved)) == (snapshot, 7, [1, 2, 4])
+
+
+def test_dropped_entries_are_removed_by_the_next_cut(path: Path) -> None:
+    big = b"x" * (2 << 20)
+    with closing(SqliteJournal(path)) as journal:
+        for turn in range(1, 6):
+            positions = journal.append(inputs(2, start=10 * turn))
+            journal.cut(A, big, range(positions[0], positions[1] + 1), turn=turn)
+            rows = sqlite3.connect(path)
+            assert rows.execute("SELECT count(*) FROM entries").fetchone() == (2,)
+            assert rows.execute("SELECT count(*) FROM snapshots").fetchone() == (min(turn, 2),)
+            rows.close()
+            assert len(os.listdir(f"{path}-snapshots")) == min(turn, 2)
+        assert numbers(journal.load(A)) == []
+        older = journal.load(A, older=True)
+        assert (older.turn, numbers(older)) == (4, [50, 51])
+    assert reopened(path).turn == 5
+
+
+def test_many_interleaved_entries_are_dropped(path: Path) -> None:
+    with closing(SqliteJournal(path)) as journal:
+        mine = journal.append([(A if n % 3 else B, ("in", n)) for n in range(5000)])
+        mine = [position for position, n in zip(mine, range(5000), strict=True) if n % 3]
+        journal.cut(A, b"1", mine[:-1], turn=1)
+        journal.cut(A, b"2", [], turn=2)
+        assert [position for position, _ in journal.load(A).entries] == mine[-1:]
+        assert len(journal.load(B).entries) == 1667
+        assert journal._store.live == 1668
+    assert numbers(reopened(path)) == [4999]
+
+
+def test_positions_that_the_address_has_not_are_ignored(store: SqliteJournal) -> None:
+    store.append([*inputs(1, B), *inputs(1)])
+    store.cut(A, b"1", range(1000), turn=1)
+    store.cut(A, b"2", range(1000), turn=2)
+    assert numbers(store.load(A)) == []
+    assert numbers(store.load(B)) == [0]
+
+
+@given(data=st.data())
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=25)
+def test_the_store_agrees_with_a_naive_model(path: Path, data: st.DataObject) -> None:
+    """Any sequence of appends, cuts, erases and reopenings loads as a dictionary of lists does."""
+    shutil.rmtree(path.parent)
+    path.parent.mkdir()
+    journal = SqliteJournal(path)
+    model: dict[str, tuple[bytes | None, int, dict[int, Entry]]] = {}
+    for step in range(data.draw(st.integers(1, 12))):
+        address = data.draw(st.sampled_from([A, B]))
+        action = data.draw(st.sampled_from(["append", "append", "cut", "cut", "erase", "reopen", "kill"]))
+        snapshot, turn, entries = model.get(address, (None, 0, {}))
+        if action == "append":
+            batch = inputs(data.draw(st.integers(1, 4)), address, 10 * step)
+            entries |= dict(zip(journal.append(batch), [entry for _, entry in batch], strict=True))
+            model[address] = snapshot, turn, entries
+        elif action == "cut":
+            drop = [position for position in entries if data.draw(st.booleans())]
+            journal.cut(address, b"%d" % step, drop, turn=step)
+            left = {position: entry for position, entry in entries.items() if position not in drop}
+            model[address] = b"%d" % step, step, left
+        elif action == "erase":
+            journal.erase(address)
+            model.pop(address, None)
+        else:
+            journal = abandon(journal) if action == "kill" else closed(journal)
+        assert journal.addresses() == sorted(model)
+        for known, (snapshot, turn, entries) in model.items():
+            assert journal.load(known) == (snapshot, turn, list(entries.items()), "")
+    journal.close()
+
+
+def closed(journal: SqliteJournal) -> SqliteJournal:
+    journal.close()
+    return SqliteJournal(journal.path)
+
+
+def abandon(journal: SqliteJournal) -> SqliteJournal:
+    """Open a copy of the files as they are: what a kill would leave."""
+    folder = Path(journal.path).parent
+    copy = folder.parent / f"{folder.name}-copy"
+    shutil.rmtree(copy, ignore_errors=True)
+    shutil.copytree(folder, copy)
+    journal.close()
+    shutil.rmtree(folder)
+    shutil.copytree(copy, folder)
+    with closing(sqlite3.connect(journal.path, isolation_level=None)) as db:
+        row = db.execute("SELECT epoch, pid, start, floor, live FROM store").fetchone()
+        dead = (row[0], 0, "", row[3], row[4])
+        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc_of(*dead),))
+    return SqliteJournal(journal.path)
+
+
+def test_an_address_that_is_erased_starts_afresh(path: Path) -> None:
+    with closing(SqliteJournal(path)) as journal:
+        first = journal.append(inputs(3))
+        journal.cut(A, b"x" * (2 << 20), first[:1], turn=1)
+        journal.erase(A)
+        assert os.listdir(f"{path}-snapshots") == []
+        assert journal.append(inputs(1, start=7))[0] > first[-1]
+        assert journal.load(A)[:2] == (None, 0)
+    assert numbers(reopened(path)) == [7]
+
+
+def test_positions_are_not_used_again_after_everything_was_removed(path: Path) -> None:
+    with closing(SqliteJournal(path)) as journal:
+        last = journal.append(inputs(3))[-1]
+        journal.erase(A)
+    with closing(SqliteJournal(path)) as journal:
+        assert journal.append(inputs(1))[0] > last
+
+
+def test_a_cut_whose_file_cannot_be_written_changes_nothing(store: SqliteJournal, path: Path) -> None:
+    positions = store.append(inputs(2))
+    store.cut(A, b"1", positions[:1], turn=1)
+    shutil.rmtree(f"{path}-snapshots")
+    with pytest.raises(StoreFailed, match="snapshot not written"):
+        store.cut(A, b"x" * (2 << 20), positions, turn=2)
+    assert (store.load(A).snapshot, numbers(store.load(A))) == (b"1", [1])
+    store.append(inputs(1, start=5))  # The journal goes on.
+    assert numbers(store.load(A)) == [1, 5]
+
+
+def test_orphan_files_are_removed_at_the_opening(path: Path) -> None:
+    with closing(SqliteJournal(path)) as journal:
+        journal.cut(A, b"x" * (2 << 20), [], turn=1)
+    folder = Path(f"{path}-snapshots")
+    for name in ("1-99.snapshot", "1-98.snapshot.tmp", "new-1-1"):
+        (folder / name).write_bytes(b"x")
+    assert reopened(path).turn == 1
+    assert os.listdir(folder) == ["1-1.snapshot"]
+
+
+def test_files_are_for_the_owner_only(store: SqliteJournal, path: Path) -> None:
+    store.cut(A, b"x" * (2 << 20), [], turn=1)
+    files = [*path.parent.glob("app.db*"), *Path(f"{path}-snapshots").iterdir()]
+    assert {stat.S_IMODE(file.stat().st_mode) & 0o077 for file in files} == {0}
+
+
+def test_a_missing_folder_is_not_made(tmp_path: Path) -> None:
+    with pytest.raises(StoreFailed):
+        SqliteJournal(tmp_path / "no" / "app.db")
+    assert os.listdir(tmp_path) == []
+
+
+def test_appends_go_on_while_other_threads_cut_and_load(store: SqliteJournal) -> None:
+    positions = store.append(inputs(3000, B))
+    errors: list[BaseException] = []
+
+    def cut_and_load() -> None:
+        try:
+            for turn in range(1, 4):
+                store.cut(B, b"x" * (3 << 20), positions[: 1000 * turn], turn=turn)
+                assert len(store.load(B).entries) == 3000 - 1000 * turn
+        except BaseException as error:  # shown by the main thread
+            errors.append(error)
+
+    thread = threading.Thread(target=cut_and_load)
+    thread.start()
+    count = 0
+    while thread.is_alive():
+        store.append(inputs(1, start=count))
+        count += 1
+    thread.join()
+    assert errors == []
+    assert numbers(store.load(A)) == list(range(count))
+
+
+def test_the_wal_is_brought_into_the_database_meanwhile(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 16)
+    monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
+    with closing(SqliteJournal(path)) as journal:
+        sizes, count = [-1, 0], 0
+        while sizes[-1] != sizes[-2]:  # The file does not shrink, but once it is written over it does not grow either.
+            assert count < 40_000, f"the WAL only grows: {sizes}"
+            for number in range(count, count + 500):
+                journal.append(inputs(1, start=number))
+            count += 500
+            sizes.append(os.path.getsize(f"{path}-wal"))
+    assert numbers(reopened(path)) == list(range(count))
+
+
+def test_a_broken_off_transaction_leaves_no_trace(store: SqliteJournal, monkeypatch: pytest.MonkeyPatch) -> None:
+    positions = store.append(inputs(2))
+    for interrupted in (Chain, Claim):
+        with monkeypatch.context() as patch:
+            patch.setattr(interrupted, "write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+            with pytest.raises(KeyboardInterrupt):
+                store.cut(A, b"1", positions, turn=1)
+            if interrupted is Chain:
+                with pytest.raises(KeyboardInterrupt):
+                    store.append([*inputs(1), *inputs(1, "/new")])
+        assert store.load(A) == (None, 0, list(zip(positions, [("in", 0), ("in", 1)], strict=True)), "")
+    assert store.append(inputs(1, "/new"))[0] == positions[-1] + 1
+    assert store.addresses() == [A, "/new"]
+
+
+def test_a_foreign_lock_is_named_and_passes(store: SqliteJournal, path: Path) -> None:
+    with closing(sqlite3.connect(path, isolation_level=None)) as rival:
+        rival.execute("BEGIN IMMEDIATE")
+        with pytest.raises(StoreFailed, match="try again"):
+            store.append(inputs(1))
+        rival.execute("ROLLBACK")
+    assert store.append(inputs(1)) == [1]

@@ -1,0 +1,126 @@
+"""What recovery refuses, gives up, or brings back only when asked (DESIGN 4 and 6, T9-T28)."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.supervision.admin import RestartChild, TerminateChild
+from tests.checkpoint.players import Dice, Do, Doer, Honest, Note, Notes, Seen, until
+from tests.checkpoint.strikes import NEVER, doer, event, let_through, sink, strike, struck
+
+
+def below(isolation: Any) -> tuple[Any, Any]:
+    """Where the actor lives, and where its supervisor does."""
+    return ("task", "process") if isolation == "subtree" else (isolation, "task")
+
+
+async def test_replay_of_an_actor_that_is_not_deterministic_diverges(system: hf.ActorSystem, isolation: Any) -> None:
+    notes = await sink(system)
+    own, above = below(isolation)
+    spec = hf.child("dice", hf.start(Dice), isolation=own, recovery=hf.hybrid(interval=NEVER))
+    nested = hf.supervisor("games", intensity=2, period=60.0, children=[spec], restart="temporary", isolation=above)
+    await system.start(nested)
+    ref = system.ref("/app/games/dice", Dice)
+    await ref.ask(Do([], notes))
+    with system.events() as stream:
+        ref.kill()
+        assert "diverged at turn 1, output 1" in (await event(stream, hf.RecoveryFailed)).reason
+        await event(stream, hf.SupervisorGaveUp)
+    noted = await notes.ask(Notes())
+    assert len(noted) == 1
+
+
+def test_a_class_that_says_it_is_not_deterministic_is_refused() -> None:
+    with pytest.raises(hf.SpecError, match="Honest is not deterministic"):
+        hf.child("honest", hf.start(Honest), recovery=hf.hybrid())
+
+
+async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """T16: and the next turn does not inherit what that one has sent or asked."""
+    ref, notes = await doer(system, "process", max_deliveries=3), await sink(system)
+    await ref.ask(Note("before"))
+    with system.events() as stream:
+        bad = ref.ask(Do(["ask bad", f"die {tmp_path}/deaths"], notes), timeout=8.0)
+        after = ref.ask(Do(["tell 1", "ask good", "tell 2"], notes), timeout=8.0)
+        with pytest.raises(hf.Quarantined):
+            await bad
+        assert (await event(stream, hf.MessageQuarantined)).deliveries == 3
+    await after
+    await struck(system, ref)
+    assert (tmp_path / "deaths").read_text() == "xxx"
+    assert await ref.ask(Seen()) == ["before", "good:3"]
+    assert await notes.ask(Notes()) == ["bad", "1", "good", "2"]
+
+
+async def test_deaths_that_the_runtime_ordered_do_not_quarantine(system: hf.ActorSystem, gate: Path) -> None:
+    ref = await doer(system, "process", max_deliveries=2)
+    asked = ref.ask(Do([f"gate {gate}"]), timeout=8.0)
+    for _ in range(4):
+        await until(gate.exists)
+        gate.unlink()
+        with system.events() as stream:
+            ref.kill()
+            await event(stream, hf.Recovered)
+    let_through(gate)
+    assert await asked == "0"
+
+
+async def test_stopped_and_started_again_the_state_comes_back(system: hf.ActorSystem, isolation: Any) -> None:
+    own, above = below(isolation)
+    spec = hf.child("doer", hf.start(Doer), isolation=own, recovery=hf.hybrid(interval=NEVER))
+    await system.start(hf.supervisor("house", children=[spec], isolation=above))
+    house = system.ref("/app/house", hf.Supervisor)
+    ref = system.ref("/app/house/doer", Doer)
+    await ref.ask(Do(["add kept", "subscribe /news", "after 0.05"]))
+    await house.ask(TerminateChild("doer"))
+    with pytest.raises(hf.ActorStopped):
+        await ref.ask(Seen())
+    again = await house.ask(RestartChild("doer"))
+    await system.publish("/news", Note("news"))
+    while len(await again.ask(Seen())) < 3:
+        await asyncio.sleep(0.005)
+    assert sorted(await again.ask(Seen())) == ["kept", "news", "tick"]
+
+
+async def test_an_actor_that_stopped_itself_comes_back_as_it_was(system: hf.ActorSystem, isolation: str) -> None:
+    ref = await doer(system, isolation)
+    ref.tell(Do(["add kept", "stop"]))
+    ref.tell(Note("queued"))
+    assert await ref.ask(Note("last"), timeout=8.0) == 3
+    assert await ref.ask(Seen()) == ["kept", "queued", "last"]
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])  # Below another process its queue is there, too.
+async def test_fresh_loses_the_state_and_keeps_the_queue(system: hf.ActorSystem, isolation: Any, gate: Path) -> None:
+    ref = await system.start(hf.child("doer", hf.start(Doer), isolation=isolation, recovery=hf.fresh()))
+    await ref.ask(Note("lost"))
+    hold = ref.ask(Do([f"gate {gate}"]), timeout=8.0)
+    queued = ref.ask(Note("queued"), timeout=8.0)
+    await until(gate.exists)
+    strike(system, ref)
+    with pytest.raises(hf.AskFailed):
+        await hold
+    assert await queued == 1
+
+
+async def test_a_replay_is_followed_by_a_snapshot_so_that_the_next_need_not_repeat_it(
+    system: hf.ActorSystem, isolation: Any
+) -> None:
+    """T17: a crash loop makes progress; the interval alone would start anew with each life."""
+    ref = await doer(system, isolation)
+    await ref.ask(Note("one"))
+    with system.events() as stream:
+        strike(system, ref)
+        assert (await event(stream, hf.SnapshotTaken)).turn == 1
+        strike(system, ref)
+        back = await event(stream, hf.Recovered)
+        if back.life == 2:  # In one process the snapshot is told of before the recovery that led to it.
+            back = await event(stream, hf.Recovered)
+    assert (back.life, back.replayed) == (3, 0)

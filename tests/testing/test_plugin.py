@@ -1,0 +1,365 @@
+"""The pytest plugin, seen from outside: each test runs a small test suite of a user's in a directory of its own."""
+
+import os
+import sys
+
+import pytest
+
+CONFTEST = """
+from importlib.metadata import entry_points
+pytest_plugins = [] if entry_points(group="pytest11", name="holdfast") else ["holdfast.testing.plugin"]
+"""
+HEAD = """
+import asyncio, pytest
+import holdfast as hf
+
+class Add(hf.Message[int]):
+    n: int
+
+class Many(hf.Message):
+    items: list[int]
+
+class Counter(hf.Actor):
+    def __init__(self):
+        self.total = 0
+
+    @hf.on(Add)
+    def add(self, message):
+        if message.n < 0:
+            raise ValueError("negative")
+        self.total += message.n
+        return self.total
+
+    @hf.on(Many)
+    async def many(self, message):
+        await asyncio.sleep(0)
+        message.items.append(1)
+"""
+
+
+@pytest.fixture
+def suite(pytester: pytest.Pytester):
+    """Runs test functions of a user; `options` go into the pytest configuration."""
+
+    def run(tests: str, *args: str, **options: str) -> pytest.RunResult:
+        pytester.makeconftest(CONFTEST)
+        lines = {"asyncio_mode": "auto", "asyncio_default_fixture_loop_scope": "function", **options}
+        pytester.makeini("[pytest]\n" + "\n".join(f"{name} = {value}" for name, value in lines.items()))
+        pytester.makepyfile(HEAD + tests)
+        return pytester.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:randomly", *args)
+
+    return run
+
+
+def test_a_good_test_passes(suite) -> None:
+    result = suite("""
+async def test_adds(actor_system, probe):
+    counter = actor_system.spawn(hf.start(Counter))
+    assert await counter.ask(Add(2)) == 2
+    probe.ref.tell(Add(1))
+    await probe.expect(Add(1))
+""")
+    result.assert_outcomes(passed=1)
+
+
+def test_the_fixtures_work_in_strict_mode_too(suite) -> None:
+    result = suite(
+        """
+@pytest.mark.asyncio
+async def test_adds(actor_system):
+    assert await actor_system.spawn(hf.start(Counter)).ask(Add(2)) == 2
+""",
+        asyncio_mode="strict",
+    )
+    result.assert_outcomes(passed=1)
+
+
+def test_a_dead_letter_that_nobody_expected_fails_the_test(suite) -> None:
+    result = suite("""
+async def test_forgets(actor_system):
+    counter = actor_system.spawn(hf.start(Counter), "counter")
+    await actor_system.stop(counter)
+    counter.tell(Add(7))
+""")
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines(
+        ["*1 dead letters (none expected; if they are meant to be: actor_system.expect_dead_letters())*"]
+    )
+    result.stdout.fnmatch_lines(["*/app/counter: Add(n=7): the actor has stopped*"])
+
+
+def test_a_crash_that_nobody_expected_fails_the_test(suite) -> None:
+    result = suite("""
+async def test_crashes(actor_system):
+    counter = actor_system.spawn(hf.start(Counter), "counter")
+    counter.tell(Add(-1))
+    await actor_system.node.settled()
+""")
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines(["*/app/counter (life 1) crashed in Add(n=-1): ValueError: negative*"])
+
+
+def test_what_is_expected_passes_and_is_counted(suite) -> None:
+    result = suite("""
+async def crash(system):
+    counter = system.spawn(hf.start(Counter), "counter")
+    counter.tell(Add(-1))
+    await system.node.settled()
+    counter.tell(Add(1))
+
+async def test_any(actor_system):
+    actor_system.expect_crashes()
+    actor_system.expect_dead_letters()
+    await crash(actor_system)
+
+@pytest.mark.holdfast(crashes=1, dead_letters=True)
+async def test_marked(actor_system):
+    await crash(actor_system)
+
+@pytest.mark.holdfast(crashes=2, dead_letters=1)
+async def test_too_few(actor_system):
+    await crash(actor_system)
+""")
+    result.assert_outcomes(passed=3, errors=1)
+    result.stdout.fnmatch_lines(["*1 crashes (2 expected*"])
+
+
+def test_the_configuration_can_expect_for_all_tests(suite) -> None:
+    result = suite(
+        """
+async def test_crashes(actor_system):
+    actor_system.spawn(hf.start(Counter)).tell(Add(-1))
+    await actor_system.node.settled()
+""",
+        holdfast_expect="crashes",
+    )
+    result.assert_outcomes(passed=1)
+
+
+def test_what_is_queued_when_the_test_ends_is_no_dead_letter(suite) -> None:
+    suite("""
+class Slow(hf.Actor):
+    @hf.on(Add)
+    async def add(self, message):
+        await asyncio.sleep(0.05)
+
+async def test_does_not_wait(actor_system):
+    slow = actor_system.spawn(hf.start(Slow))
+    for _ in range(3):
+        slow.tell(Add(1))
+""").assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize(
+    ("leak", "text"),
+    [
+        ("kept.append(asyncio.ensure_future(asyncio.sleep(3600)))", "a task was left running: *sleep*"),
+        ("kept.extend(open('/dev/null') for _ in range(9))", "a descriptor was left open: /dev/null*"),
+        (
+            "import subprocess; kept.append(subprocess.Popen(['sleep', '3600']))",
+            "a process was left running: * sleep 3600*",
+        ),
+    ],
+)
+def test_a_leak_fails_the_test(suite, leak: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("holdfast.testing.leaks.GRACE", 0.1)
+    result = suite(f"""
+kept = []
+
+async def test_leaks(actor_system):
+    {leak}
+
+def test_cleans_up():
+    for one in kept:
+        if hasattr(one, "close"): one.close()
+        if hasattr(one, "wait"): one.wait()
+""")
+    result.assert_outcomes(passed=2, errors=1)
+    result.stdout.fnmatch_lines([f"*{text}*"])
+
+
+def test_leaks_can_be_expected(suite) -> None:
+    suite("""
+@pytest.mark.holdfast(leaks=True)
+async def test_leaks(actor_system):
+    asyncio.ensure_future(asyncio.sleep(0.0))
+    kept.append(asyncio.ensure_future(asyncio.sleep(3600)))
+
+kept = []
+""").assert_outcomes(passed=1)
+
+
+def test_each_system_of_the_factory_is_isolated_and_ended(suite) -> None:
+    result = suite("""
+@pytest.mark.holdfast(intensity=7)
+async def test_two(actor_systems):
+    one, other = await actor_systems("one"), await actor_systems("other", intensity=9)
+    counter = one.spawn(hf.start(Counter), "counter")
+    assert await counter.ask(Add(1)) == 1
+    assert (one.tree(), other.tree()) == (["/one", "/one/counter"], ["/other"])
+    assert (one._flags.intensity, other._flags.intensity) == (7, 9)
+    running.extend([one, other])
+
+def test_ended():
+    assert [system.tree() for system in running] == [["/one"], ["/other"]]
+    assert all(system.node.root.is_dead for system in running)
+
+running = []
+""")
+    result.assert_outcomes(passed=2)
+
+
+def test_a_message_that_is_mutated_by_its_receiver_is_found(suite) -> None:
+    result = suite("""
+async def test_mutates(actor_system):
+    counter = actor_system.spawn(hf.start(Counter), "counter")
+    await counter.ask(Many([1]))
+""")
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines(
+        ["*from the test to /app/counter: sent Many(items=[[]1]), after its turn it was Many(items=[[]1, 1])*"]
+    )
+
+
+def test_a_message_that_several_get_is_compared_after_each_turn(suite) -> None:
+    result = suite("""
+class Reader(hf.Actor):
+    @hf.on(Many)
+    def read(self, message):
+        pass
+
+async def test_mutates(actor_system):
+    message = Many([1])
+    for kind in (Reader, Counter):
+        actor_system.spawn(hf.start(kind), kind.__name__).tell(message)
+    await actor_system.node.settled()
+""")
+    result.assert_outcomes(passed=1, errors=1)
+    result.stdout.fnmatch_lines(["*from the test to /app/Counter: sent Many(items=[[]1])*"])
+
+
+def test_a_message_that_is_mutated_by_its_sender_is_found(suite) -> None:
+    result = suite("""
+class Reader(hf.Actor):
+    @hf.on(Many)
+    def read(self, message):
+        pass
+
+async def test_mutates(actor_system):
+    reader = actor_system.spawn(hf.start(Reader), "reader")
+    items = [1]
+    reader.tell(Many(items))
+    items.clear()
+    await actor_system.node.settled()
+
+@pytest.mark.holdfast(sends=True)
+async def test_may(actor_system):
+    reader = actor_system.spawn(hf.start(Reader), "reader")
+    items = [1]
+    reader.tell(Many(items))
+    items.clear()
+    await actor_system.node.settled()
+""")
+    result.assert_outcomes(passed=2, errors=1)
+    result.stdout.fnmatch_lines(["*sent Many(items=[[]1]), after its turn it was Many(items=[[]])*"])
+
+
+def test_a_message_of_the_wrong_types_is_refused_where_it_is_sent(suite) -> None:
+    result = suite("""
+@pytest.mark.parametrize("way", ["tell", "ask", "send", "publish"])
+async def test_sends(actor_system, way):
+    counter = actor_system.spawn(hf.start(Counter), "counter")
+    actor_system.node.topics.subscribe("/adds", counter._cell)
+    with pytest.raises(hf.BadMessage, match="Expected `int`, got `str`"):
+        if way == "publish":
+            await actor_system.publish("/adds", Add("5"))
+        elif way == "send":
+            await counter.send(Add("5"))
+        else:
+            getattr(counter, way)(Add("5"))
+
+async def test_without_the_plugin_nothing_is_checked():
+    async with hf.ActorSystem(log=False) as system:
+        counter = system.spawn(hf.start(Counter), "counter")
+        with pytest.raises(hf.RemoteCrash):
+            await counter.ask(Add("5"))
+""")
+    result.assert_outcomes(passed=5)
+
+
+def test_tests_run_under_the_loops_that_are_configured(suite) -> None:
+    tests = """
+async def test_loop(actor_system):
+    print("loop", type(asyncio.get_running_loop()).__module__)
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_virtual(actor_system):
+    print("loop", type(asyncio.get_running_loop()).__module__)
+    await asyncio.sleep(3600)
+"""
+    result = suite(tests, "-s", holdfast_loops="uvloop asyncio")
+    result.assert_outcomes(passed=3)
+    result.stdout.fnmatch_lines(["*loop uvloop*", "*loop asyncio.*", "*loop holdfast.testing.clock*"])
+
+
+def test_an_unknown_option_is_refused(suite) -> None:
+    result = suite("", holdfast_loops="trio")
+    result.stderr.fnmatch_lines(["*holdfast_loops: 'trio' is none of uvloop, asyncio*"])
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+
+
+def test_a_process_is_refused_under_the_virtual_clock(suite) -> None:
+    result = suite(
+        """
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_process(actor_system):
+    actor_system.expect_crashes()
+    with pytest.raises(hf.HoldfastError, match="'c' with isolation='process' cannot run under the virtual clock"):
+        await actor_system.start(hf.child("c", hf.start(Counter), isolation="process"))
+""",
+        holdfast_loops="asyncio",
+    )
+    result.assert_outcomes(passed=1)
+
+
+def test_the_entry_point_and_a_conftest_that_names_the_plugin_go_together(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it is once the package is installed; where it is already, this changes nothing."""
+    installed = pytester.mkdir("installed")
+    metadata = installed / "holdfast_plugin-1.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: holdfast-plugin\nVersion: 1\n")
+    (metadata / "entry_points.txt").write_text("[pytest11]\nholdfast = holdfast.testing.plugin\n")
+    monkeypatch.setenv("PYTHONPATH", f"{installed}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    pytester.makeconftest(CONFTEST)
+    pytester.makepyfile("import pytest\n@pytest.mark.asyncio\nasync def test_it(probe): assert probe.waiting == ()")
+    done = pytester.runpytest_subprocess("-p", "no:cacheprovider", "--trace-config")
+    done.assert_outcomes(passed=1)
+    registered = [line for line in done.outlines if "PLUGIN registered" in line and "holdfast.testing.plugin" in line]
+    assert len(registered) == 1
+
+
+def test_without_pytest_asyncio_the_plugin_loads_and_its_fixtures_say_what_they_need(
+    pytester: pytest.Pytester,
+) -> None:
+    pytester.makeconftest(CONFTEST)
+    pytester.makepyfile(test_them="def test_a(actor_system): pass\ndef test_b(): pass")
+    pytester.makepyfile(pytest_asyncio="raise ImportError('as if it were not installed')")
+    script = pytester.makepyfile(
+        run_it="import pytest, sys\n"
+        "sys.exit(pytest.main(['-p', 'no:asyncio', '-p', 'no:cacheprovider', 'test_them.py']))"
+    )
+    done = pytester.runpython(script)
+    done.assert_outcomes(passed=1, errors=1)
+    done.stdout.fnmatch_lines(["*need pytest-asyncio: pip install 'holdfast[[]testing]'*"])
+
+
+def test_loading_the_plugin_imports_no_other_module_of_testing(pytester: pytest.Pytester) -> None:
+    done = pytester.run(
+        sys.executable,
+        "-c",
+        "import sys, holdfast.testing.plugin\n"
+        "print(sorted(name for name in sys.modules if name.startswith('holdfast.testing')))",
+    )
+    assert done.outlines == ["['holdfast.testing', 'holdfast.testing.plugin']"]
