@@ -36,20 +36,24 @@ class StashError(HoldfastError):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asking", "_random", "_turn", "cell", "closed", "item")
+    __slots__ = ("_asking", "_random", "_turn", "cell", "closed")
 
     may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
 
     def __init__(self, cell: Cell) -> None:
         self.cell = cell
-        self.item: Any = None  # what is being handled
         self.closed = False
         self._asking: Any = None
         self._turn = 0
         self._random: random.Random | None = None
 
     # -- who, when --------------------------------------------------------------------------------------------------
+
+    @property
+    def item(self) -> Any:
+        """What is being handled, or was last. (It stands in the cell: a turn that asks nothing of `ctx` leaves it cold.)"""
+        return None if self.closed else self.cell.item
 
     @property
     def ref(self) -> ActorRef[Any]:
@@ -158,7 +162,7 @@ class ActorContext:
         if isinstance(item, Ask):
             cell: Cell = to._cell
             cell.require(item.message)
-            self.item = Stashed.of(item)
+            self.cell.item = Stashed.of(item)
             cell.admit(cell, item)
         elif isinstance(item, Envelope):
             to._cell.admit(to._cell, Envelope(item.message, item.sender))
@@ -247,7 +251,7 @@ class ActorContext:
         more.stash.append(item)
         if isinstance(item, Item):
             item.stashed()
-        self.item = Stashed.of(item)
+        self.cell.item = Stashed.of(item)
 
     def unstash(self) -> None:
         """Put all stashed messages back, in order, in front of what is queued."""

@@ -150,7 +150,7 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
     ctx = context_type(cell)
     actor = kind.__new__(kind)
     actor.ctx = ctx
-    cell.actor, cell.ctx, cell.table, cell.context = actor, ctx, kind._table, None
+    cell.actor, cell.ctx, cell.table, cell.context, cell.item = actor, ctx, kind._table, None, None
     try:
         actor.__init__(*start.args, **start.kwargs)
     except BaseException as error:
@@ -368,7 +368,7 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     actor = cell.actor
     if actor is not None and type(actor).on_undelivered is not Actor.on_undelivered:
         cell.extra().last = actor  # It may yet be handed what was queued.
-    cell.actor = cell.ctx = cell.context = None
+    cell.actor = cell.ctx = cell.context = cell.item = None
     if more is not None:
         starting, more.starting = more.starting, None
         error, more.start_error = more.start_error, None

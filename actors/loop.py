@@ -210,7 +210,7 @@ class RunLoop:
             turn.then()
         elif turn.killed or error is not None:
             # What follows is again user code, maybe: it runs on the run queue, not in this runner's name.
-            turn.item = turn.item if cell.ctx is None else cell.ctx.item  # It may have been forwarded or stashed.
+            turn.item = turn.item if cell.ctx is None else cell.item  # It may have been forwarded or stashed.
             mailbox.queue_of(cell).appendleft(TurnEnded(turn, error))
             self.make_ready(cell)
         elif cell.queue:
@@ -252,14 +252,14 @@ clock: Callable[[], float] = time.monotonic
 
 def run_turns(cell: Cell, most: int) -> bool:
     """Run up to `most` turns of one actor, in its own context. False: it left the run queue."""
-    queue, actor, table, ctx = cell.queue, cell.actor, cell.table, cell.ctx
-    if queue is None or ctx is None:
+    queue, actor, table = cell.queue, cell.actor, cell.table
+    if queue is None or actor is None:
         return True
     count = len(queue)
     item: Any = None
     try:
         for _ in range(count if count < most else most):
-            ctx.item = item = queue.popleft()
+            cell.item = item = queue.popleft()
             result = table[type(item)](actor, item)
             if result is None:
                 continue
@@ -281,7 +281,7 @@ def run_turns(cell: Cell, most: int) -> bool:
     except BaseException as error:  # Whatever user code raises ends this life, and only this life.
         if isinstance(error, KeyboardInterrupt):
             raise
-        lives.crash(cell, ctx.item, error)  # Not `item`: that may have been forwarded or stashed.
+        lives.crash(cell, cell.item, error)  # Not `item`: that may have been forwarded or stashed.
         return False
     return True
 

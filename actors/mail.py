@@ -140,8 +140,7 @@ class Ask(Item, msgspec.Struct, eq=False):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        ctx: ActorContext = actor.ctx
-        cell = ctx.cell
+        cell: Cell = actor.ctx.cell
         if item.deadline <= cell.node.now:  # Nobody waits any more: not run (unless the wait was only cancelled).
             item.expire()
             return None
@@ -157,8 +156,8 @@ class Ask(Item, msgspec.Struct, eq=False):
             item.fail(no)
             return None
         if type(result) is Coroutine_:
-            return _finish(ctx, item, result)
-        if ctx.item is item:  # Else the ask was forwarded or stashed: it is not ours to answer any more.
+            return _finish(cell, item, result)
+        if cell.item is item:  # Else the ask was forwarded or stashed: it is not ours to answer any more.
             item.answer(result)
         return None
 
@@ -190,14 +189,14 @@ class Ask(Item, msgspec.Struct, eq=False):
         self.fail(cell.stopped_error(reason))
 
 
-async def _finish(ctx: ActorContext, ask: Ask, handler: Coroutine[Any, Any, object]) -> None:
+async def _finish(cell: Cell, ask: Ask, handler: Coroutine[Any, Any, object]) -> None:
     """The turn of an async handler that was asked."""
     try:
         reply = await handler
     except Refusal as no:
         ask.fail(no)
     else:
-        if ctx.item is ask:
+        if cell.item is ask:
             ask.answer(reply)
 
 

@@ -71,9 +71,9 @@ async def message_growth(run: Run) -> None:
         async with hf.ActorSystem("bench", log=False) as system:
             gate = Gate(size)
             refs = [system.spawn(hf.start(Counter, gate, 1 + count // size)) for _ in range(size)]
-            for ref in refs:  # The first message makes the queue.
+            for ref in refs:  # The first message makes the queue, the first turn the context.
                 ref.tell(TICK)
-            await asyncio.sleep(0.1)
+            await system.node.settled()
             around, length = itertools.cycle(refs), min(size, BURST)
             bursts = [list(itertools.islice(around, length)) for _ in range(count // length)]
             began = time.perf_counter()

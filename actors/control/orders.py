@@ -243,7 +243,7 @@ def status_of(cell: Cell) -> Status:
     """The status of an actor in this process."""
     more, parent = cell.more, cell.parent
     turn = more.turn if more is not None else None
-    item = cell.ctx.item if turn is not None and cell.ctx is not None else None
+    item = cell.item if turn is not None and cell.ctx is not None else None
     start = more.start if more is not None else None
     kind = type(cell.actor) if cell.actor is not None else start.kind if start is not None else None
     return Status(
