@@ -143,7 +143,7 @@ class More:
 
 
 class _Hot:
-    """What every message touches, in a class of its own: slots lie side by side per class, and memory is read in lines."""
+    """What every message touches: the slots of one class lie side by side, and memory is read in lines."""
 
     __slots__ = ("actor", "admit", "context", "item", "node", "queue", "scheduled", "table")
 

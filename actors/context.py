@@ -52,7 +52,7 @@ class ActorContext:
 
     @property
     def item(self) -> Any:
-        """What is being handled, or was last. (It stands in the cell: a turn that asks nothing of `ctx` leaves it cold.)"""
+        """What is being handled, or was last; it stands in the cell, so that most turns need not touch this object."""
         return None if self.closed else self.cell.item
 
     @property
