@@ -18,7 +18,8 @@ import holdfast as hf
 from holdfast.actors.events import DeadLetter
 from holdfast.actors.mailbox import Bound
 from holdfast.checkpoint.bound import HomeBound
-from tests.actors.process.players import Add, Block, Note, Notes, Observer, Publish, Send, Slow, Total, Worker
+from tests.actors.process.observers import Observer, Publish, Send
+from tests.actors.process.players import Add, Block, Note, Notes, Slow, Total, Worker
 from tests.actors.process.waiting import until
 
 Busy = Callable[..., Awaitable[hf.ActorRef[Any]]]

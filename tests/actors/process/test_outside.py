@@ -13,26 +13,20 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.actors.process.players import (
+from tests.actors.process.observers import (
     AskPort,
     Cancel,
-    Fail,
     Heard,
     HeardSome,
-    Note,
-    Notebook,
-    Notes,
     Observer,
-    Pass,
     Publish,
     Spawn,
     StopChild,
     Subscribe,
     Trap,
     Watch,
-    Where,
-    WhoSent,
 )
+from tests.actors.process.players import Fail, Note, Notebook, Notes, Pass, Where, WhoSent
 from tests.actors.process.waiting import until
 
 Make = Callable[..., Awaitable[hf.ActorRef[Observer]]]

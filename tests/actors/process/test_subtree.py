@@ -12,25 +12,8 @@ import pytest
 import holdfast as hf
 from holdfast.actors.events import ChildRestarted, ProcessDied, SupervisorGaveUp
 from holdfast.supervision.admin import WhichChildren
-from tests.actors.process.players import (
-    Account,
-    Add,
-    AskPort,
-    Fail,
-    Heard,
-    HeardSome,
-    Introduce,
-    Note,
-    Notebook,
-    Notes,
-    Observer,
-    Picky,
-    Publish,
-    Send,
-    Total,
-    Watch,
-    Where,
-)
+from tests.actors.process.observers import AskPort, Heard, HeardSome, Observer, Publish, Send, Watch
+from tests.actors.process.players import Account, Add, Fail, Introduce, Note, Notebook, Notes, Picky, Total, Where
 from tests.actors.process.waiting import next_event, until
 
 
