@@ -115,6 +115,13 @@ class Fragile(hf.Actor):
         return self.handled
 
 
+class Doomed(Fragile):
+    """Crashes as soon as it is up."""
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.ref.tell(Boom())
+
+
 class Echo(hf.Actor):
     """Lives in a process of its own."""
 
