@@ -117,6 +117,8 @@ from holdfast.supervision.partition import (
     partition_of,
     partitions,
 )
+from holdfast.supervision.registrar import KeyFreed, KeyRegistered, NotAnActor, NotUnique, RegistryActor
+from holdfast.supervision.registry import AlreadyRegistered, Registry, RegistryEntry, registry
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
@@ -134,6 +136,7 @@ __all__ = [
     "ActorStopped",
     "ActorSystem",
     "AlreadyPresent",
+    "AlreadyRegistered",
     "AlreadyStarted",
     "AskDeadlock",
     "AskFailed",
@@ -167,6 +170,8 @@ __all__ = [
     "Hung",
     "Ignore",
     "KILLED",
+    "KeyFreed",
+    "KeyRegistered",
     "Killed",
     "Limits",
     "LogLine",
@@ -187,8 +192,10 @@ __all__ = [
     "NoSuchActor",
     "NoSuchChild",
     "Normal",
+    "NotAnActor",
     "NotSupported",
     "NotSuspended",
+    "NotUnique",
     "Opaque",
     "OutOfMemory",
     "PartitionSupervisor",
@@ -200,6 +207,9 @@ __all__ = [
     "Recovered",
     "RecoveryFailed",
     "Refusal",
+    "Registry",
+    "RegistryActor",
+    "RegistryEntry",
     "RemoteCrash",
     "ReplayDiverged",
     "ReplyHandle",
@@ -243,6 +253,7 @@ __all__ = [
     "on",
     "partition_of",
     "partitions",
+    "registry",
     "rule",
     "run",
     "start",
