@@ -109,6 +109,7 @@ from holdfast.supervision.admin import (
 from holdfast.supervision.backoff import Backoff
 from holdfast.supervision.config import load_tree, tree_from
 from holdfast.supervision.dynamic import DynamicSupervisor, dynamic
+from holdfast.supervision.jobs import TaskSupervisor
 from holdfast.supervision.partition import (
     CountPartitions,
     PartitionSupervisor,
@@ -122,6 +123,7 @@ from holdfast.supervision.registry import AlreadyRegistered, Registry, RegistryE
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
+from holdfast.supervision.tasks import Failed, Job, Ok, Tasks, tasks
 from holdfast.supervision.tree import supervisor
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem
@@ -164,11 +166,13 @@ __all__ = [
     "EventStream",
     "ExitReason",
     "Exited",
+    "Failed",
     "Flags",
     "GetChildSpec",
     "HoldfastError",
     "Hung",
     "Ignore",
+    "Job",
     "KILLED",
     "KeyFreed",
     "KeyRegistered",
@@ -196,6 +200,7 @@ __all__ = [
     "NotSupported",
     "NotSuspended",
     "NotUnique",
+    "Ok",
     "Opaque",
     "OutOfMemory",
     "PartitionSupervisor",
@@ -233,6 +238,8 @@ __all__ = [
     "Status",
     "Supervisor",
     "SupervisorGaveUp",
+    "TaskSupervisor",
+    "Tasks",
     "TerminateChild",
     "Timer",
     "TreeFailed",
@@ -259,5 +266,6 @@ __all__ = [
     "start",
     "subscribe",
     "supervisor",
+    "tasks",
     "tree_from",
 ]

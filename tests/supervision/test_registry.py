@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.testing import idle
 from tests.supervision.family import Boom, Leave, refused
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
@@ -225,7 +226,7 @@ class Witness(hf.Actor):
             self.ctx.monitor(other)
 
     async def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
-        self.found.append(await self.names.lookup("k"))
+        self.found.append(await self.names.select(lambda entry: entry.holder == source))
 
     @hf.on(Kept)
     def kept(self, message: Kept) -> list[Any]:
@@ -250,7 +251,7 @@ async def test_who_hears_of_an_end_finds_nothing_any_more(how: Any) -> None:
                 assert await names.whereis("k") is None
             case reason:
                 holder.tell(Leave(reason))
-        await system.node.settled()
+        await idle(system)
         assert await witness.ask(Kept()) == [[]]
         assert await names.count() == 0
 
@@ -263,10 +264,10 @@ async def test_a_dead_holders_key_is_had_before_its_down_has_come() -> None:
         await by(old, lambda: names.register("k", 1))
         await system.suspend(names.ref)
         taken = by(new, lambda: names.register("k", 2))
-        found = names.lookup("k")
-        await system.node.settled()
+        found = asyncio.ensure_future(names.lookup("k"))
+        await idle(system)
         old.kill()
-        await system.node.settled()
+        await idle(system)
         await system.resume(names.ref)  # Its queue: the new one's register, and behind it the old one's DOWN.
         await taken
         assert [entry.holder for entry in await found] == [new]
@@ -280,7 +281,7 @@ async def test_an_ask_that_outlives_its_asker_registers_nothing() -> None:
         holder = system.ref("/app/top/h", Holder)
         await system.suspend(names.ref)
         lost = by(holder, lambda: names.register("k", 1))
-        await system.node.settled()
+        await idle(system)
         holder.kill()
         with pytest.raises(hf.AskFailed):
             await lost
@@ -358,7 +359,7 @@ async def test_a_restarted_registry_has_lost_nothing_but_the_dead() -> None:
         assert (await names.meta("since"), names.ref._cell.life) == (2, 2)
         assert await refused(by(living, lambda: names.register(living.path))) == hf.AlreadyRegistered(living.path, living)
         living.kill()
-        await system.node.settled()
+        await idle(system)
         assert await names.count() == 0, "the new life watches them too"
 
 
@@ -377,10 +378,10 @@ async def test_locks_outlive_a_restart_of_the_registry() -> None:
         async with asyncio.TaskGroup() as group:
             for name in "ab":
                 group.create_task(work(name))
-                await system.node.settled()
+                await idle(system)
             names.ref.kill()
             go_on["b"].set()
-            await system.node.settled()
+            await idle(system)
             go_on["a"].set()
         assert order == ["+a", "-a", "+b", "-b"]
 
@@ -399,6 +400,7 @@ async def test_a_registry_that_is_given_up_is_empty_when_it_comes_again() -> Non
         await by(stranger, lambda: names.register("stranger", 1))
         top = system.ref("/app/top", hf.Supervisor)
         top.kill()
+        await idle(system)
         holder = system.ref("/app/top/h", Finder)
         assert await holder.ask(Kept()) == []
         again = hf.Registry[str, int](system.ref("/app/top/names", hf.RegistryActor))
@@ -426,7 +428,7 @@ async def test_a_lock_is_had_by_one_at_a_time_in_order_of_asking() -> None:
         async def work(n: int) -> None:
             async with names.lock("k"):
                 inside.append(n)
-                await system.node.settled()
+                await idle(system)
                 assert inside[-1] == n
                 inside.append(n)
 
@@ -462,7 +464,7 @@ async def test_a_lock_is_free_again_when_its_holder_has_ended(how: str) -> None:
         held = by(holder, hold)
         await has_it.wait()
         waiting = asyncio.ensure_future(names.lock("k").__aenter__())
-        await system.node.settled()
+        await idle(system)
         assert not waiting.done()
         if how == "kill":
             holder.kill()
@@ -509,7 +511,7 @@ async def test_who_waits_too_long_for_a_lock_neither_has_it_nor_keeps_it_from_ot
                     raise AssertionError
             cancelled = asyncio.ensure_future(names.lock("k", timeout=60.0).__aenter__())
             patient = asyncio.ensure_future(names.lock("k", timeout=60.0).__aenter__())
-            await system.node.settled()
+            await idle(system)
             cancelled.cancel()
         await patient
         assert asyncio.get_running_loop().time() == 2.0
@@ -643,7 +645,7 @@ async def test_actors_in_other_processes_hold_keys_like_any_other(where: str) ->
         near = system.spawn(hf.start(Holder), "near")
         await by(near, lambda: names.register("near", 0))
         isolation: Any = "process" if where == "subtree" else "task"
-        await system.start(hf.supervisor("top", children=[child], isolation=isolation))
+        await system.start(hf.supervisor("top", children=[child], isolation=isolation, intensity=9))
         far = system.ref("/app/top/far", Far)
         watch = system.spawn(hf.start(Witness, names, far))
 
@@ -662,7 +664,7 @@ async def test_actors_in_other_processes_hold_keys_like_any_other(where: str) ->
         await act("register")
         far.kill()
         while len(await watch.ask(Kept())) < 1:
-            await system.node.settled()
+            await idle(system)
         assert await act("look") == "[]"
         assert await names.keys(near) == ["near"]
 
@@ -678,5 +680,5 @@ async def test_a_registry_inside_a_process_serves_those_outside() -> None:
         assert [await names.whereis(key) for key in (("far", inner.path), "o")] == [inner, outer]
         outer.kill()
         while await names.count() > 1:
-            await system.node.settled()
+            await idle(system)
         assert await names.keys(inner) == [("far", inner.path)]
