@@ -283,7 +283,7 @@ class Tasks:
             Its ref, to watch, stop or kill it.
         """
         spec = self._spec(function, args, isolation, shutdown, restart=restart, is_awaited=False)
-        return cast("ActorRef[Actor]", await self._ask_start(spec))
+        return await self._ask_start(spec)
 
     @overload
     def stream(
@@ -350,16 +350,21 @@ class Tasks:
         return _stream(begin, items, most, ordered, timeout, on_timeout)
 
     async def outcomes(
-        self, jobs: Iterable[Job[R]], timeout: float | None = None, *, on_timeout: Literal["leave", "kill_task"] = "leave"
+        self,
+        jobs: Iterable[Job[R]],
+        timeout: float | None = None,
+        *,
+        on_timeout: Literal["leave", "kill_task"] = "leave",
     ) -> list[Ok[None, R] | Failed[None] | None]:
         """How several jobs ended, in their order; None for those that are not over after `timeout` seconds."""
         every = list(jobs)
         if every:
             await asyncio.wait([job._future for job in every], timeout=timeout)
+        over = [job.is_done for job in every]
         if on_timeout == "kill_task":
             for job in every:
                 job.kill()
-        return [await job.outcome() if job.is_done else None for job in every]
+        return [await job.outcome() if is_over else None for job, is_over in zip(every, over, strict=True)]
 
     async def children(self) -> list[ActorRef[Actor]]:
         """The jobs that there are now, oldest first."""
@@ -374,7 +379,12 @@ class Tasks:
         return self._begin(function, (item,), linked, isolation, shutdown)
 
     def _begin(
-        self, function: Callable[..., Any], args: tuple[Any, ...], linked: bool, isolation: Isolation, shutdown: Shutdown
+        self,
+        function: Callable[..., Any],
+        args: tuple[Any, ...],
+        linked: bool,
+        isolation: Isolation,
+        shutdown: Shutdown,
     ) -> Job[Any]:
         """Start a job, and a task that follows it; that task ends with the caller's life."""
         spec = self._spec(function, args, isolation, shutdown, restart="temporary", is_awaited=True)
@@ -384,46 +394,15 @@ class Tasks:
         node = self.ref._cell.node
         kind = _returned(function) if isolation == "process" else None
         job: Job[Any] = Job(self.ref.path, shutdown, node.loop.create_future(), kind)
-        # In nobody's name: neither does a journal hear of it, nor is the caller's turn in the way.
-        follow = node.loop.create_task(
-            self._follow(job, spec, ctx if linked else None), name=f"job of {self.ref.path}", context=node.base_context.copy()
-        )
+        started = self._ask_start(spec)
+        started.add_done_callback(_seen)
+        work = _follow(job, started, ctx if linked else None)
+        follow = node.loop.create_task(work, name=f"job of {self.ref.path}", context=node.base_context.copy())
         keep = (self.ref._cell if ctx is None else ctx.cell).extra().tasks
         keep.add(follow)
         follow.add_done_callback(keep.discard)
+        follow.add_done_callback(functools.partial(_followed, job, started))
         return job
-
-    async def _follow(self, job: Job[Any], spec: ChildSpec, linked: ActorContext | None) -> None:
-        started = asyncio.ensure_future(self._ask_start(spec))
-        try:
-            await asyncio.wait((started,))
-            if job.is_done:  # It was ended meanwhile.
-                started.add_done_callback(_end_started)
-                return
-            cell = job._cell = cast("Cell", started.result()._cell)
-            if linked is not None:
-                if linked.closed:
-                    raise asyncio.CancelledError
-                link(linked.cell, cell)
-            value = await _result(cell)
-            if job.kind is not None:
-                value = _decoded(cell, job.kind, value)
-            if not job.is_done:
-                job._future.set_result(value)
-        except asyncio.CancelledError:
-            why, cell = "its caller has ended", job._cell
-            if cell is None:
-                started.add_done_callback(_end_started)
-            elif cell.state in (DOWN, GONE):
-                why = str(cell.extra().reason)
-            job.cancel()
-            job._fail(AskFailed(job.path, why))
-            raise
-        except HoldfastError as error:
-            job._fail(error)
-        finally:
-            if job._timer is not None and (job._cell is None or job._cell.state in (DOWN, GONE)):
-                job._timer.cancel()
 
     def _spec(
         self,
@@ -449,9 +428,52 @@ class Tasks:
         start = Start(JobActor, (_label(function), packed, args, is_awaited, is_coded))
         return ChildSpec(NAMELESS, start, restart, shutdown, isolation)
 
-    async def _ask_start(self, spec: ChildSpec) -> ActorRef[Any]:
+    def _ask_start(self, spec: ChildSpec) -> asyncio.Future[ActorRef[Any]]:
+        """In nobody's name: neither does a journal hear of it, nor is the caller's turn in the way."""
         context = self.ref._cell.node.base_context.copy()
-        return cast("ActorRef[Any]", await context.run(self.ref.ask, StartChild(spec), FOREVER))
+        return cast("asyncio.Future[ActorRef[Any]]", context.run(self.ref.ask, StartChild(spec), FOREVER))
+
+
+async def _follow(job: Job[Any], started: asyncio.Future[ActorRef[Any]], linked: ActorContext | None) -> None:
+    """See a job to its end. This task ends with the caller's life."""
+    try:
+        await asyncio.wait((started,))
+        if job.is_done:  # It was ended meanwhile.
+            started.add_done_callback(_end_started)
+            return
+        cell = job._cell = cast("Cell", started.result()._cell)
+        if linked is not None:
+            link(linked.cell, cell)
+        value = await _result(cell)
+        if job.kind is not None:
+            value = _decoded(cell, job.kind, value)
+        if not job.is_done:
+            job._future.set_result(value)
+    except HoldfastError as error:
+        job._fail(error)
+
+
+def _followed(job: Job[Any], started: asyncio.Future[ActorRef[Any]], follow: asyncio.Task[None]) -> None:
+    """Nobody follows it any more; if that is because the caller has ended, so does the job."""
+    cell = job._cell
+    if follow.cancelled():
+        why = "its caller has ended"
+        if cell is None:
+            started.add_done_callback(_end_started)
+        elif cell.state in (DOWN, GONE):
+            why = str(cell.extra().reason)
+        job.cancel()
+        job._fail(AskFailed(job.path, why))
+    elif job._timer is not None:
+        job._timer.cancel()
+    if not job.is_done:  # A bug of ours must not leave anybody waiting.
+        job._fail(AskFailed(job.path, str(follow.exception())))
+
+
+def _seen(future: asyncio.Future[Any]) -> None:
+    """If nobody waits for it any more, asyncio need not complain of a failure."""
+    if not future.cancelled():
+        future.exception()
 
 
 def _end_started(started: asyncio.Future[ActorRef[Any]]) -> None:
@@ -466,6 +488,7 @@ async def _result(cell: Cell) -> Any:
     Raises whatever it failed with; AskFailed if it was ended.
     """
     reply = cell.ref.ask(Work(), FOREVER)
+    reply.add_done_callback(_seen)
     if cell.state is not DOWN:  # Else its process is coming up: if that fails, so does the ask.
         gone = cell.ended()
         await asyncio.wait((reply, gone), return_when=asyncio.FIRST_COMPLETED)

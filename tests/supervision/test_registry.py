@@ -109,7 +109,9 @@ async def test_a_value_is_changed_by_its_holder_only() -> None:
         assert await by(one, lambda: names.update_value("nobody", lambda value: value + 1)) is None
         assert await by(one, lambda: names.update_value("k", lambda value: value + 1)) == (2, 1)
         assert await names.values("k") == [2]
-        assert isinstance(await refused(by(one, lambda: names.update_value("k", lambda value: value["x"]))), hf.RemoteCrash)
+        assert isinstance(
+            await refused(by(one, lambda: names.update_value("k", lambda value: value["x"]))), hf.RemoteCrash
+        )
 
 
 async def test_who_is_no_actor_holds_nothing() -> None:
@@ -357,7 +359,9 @@ async def test_a_restarted_registry_has_lost_nothing_but_the_dead() -> None:
         again.kill()  # Restarted, but it is another life that never registered.
         assert [entry.holder for entry in await names.select(lambda entry: True)] == [living]
         assert (await names.meta("since"), names.ref._cell.life) == (2, 2)
-        assert await refused(by(living, lambda: names.register(living.path))) == hf.AlreadyRegistered(living.path, living)
+        assert await refused(by(living, lambda: names.register(living.path))) == hf.AlreadyRegistered(
+            living.path, living
+        )
         living.kill()
         await idle(system)
         assert await names.count() == 0, "the new life watches them too"
