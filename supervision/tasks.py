@@ -89,12 +89,13 @@ class Job(Generic[R]):
     Cancelling that wait does not end the job; `cancel`, `stop` and `kill` do.
     """
 
-    __slots__ = ("_cell", "_future", "_shutdown", "_timer", "_where", "kind")
+    __slots__ = ("_cell", "_future", "_is_unwanted", "_shutdown", "_timer", "_where", "kind")
 
     def __init__(self, where: str, shutdown: Shutdown, future: asyncio.Future[R], kind: Any) -> None:
         self._where, self._shutdown, self._future, self.kind = where, shutdown, future, kind
         self._cell: Cell | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._is_unwanted = False  # it is to be ended as soon as it is there
 
     def __await__(self) -> Any:
         return asyncio.shield(self._future).__await__()
@@ -139,11 +140,10 @@ class Job(Generic[R]):
         return outcome
 
     def _end(self, shutdown: Shutdown) -> None:
-        self._shutdown = shutdown  # If it is not there yet, it is ended as soon as it is.
         cell = self._cell
+        if cell is None:
+            self._is_unwanted = True
         if self._future.done() or cell is None:
-            if not self._future.done():
-                self._fail(AskFailed(self._where, "the job was ended before it began"))
             return
         if shutdown == "brutal_kill":
             cell.kill()
@@ -438,10 +438,12 @@ async def _follow(job: Job[Any], started: asyncio.Future[ActorRef[Any]], linked:
     """See a job to its end. This task ends with the caller's life."""
     try:
         await asyncio.wait((started,))
-        if job.is_done:  # It was ended meanwhile.
-            started.add_done_callback(_end_started)
-            return
-        cell = job._cell = cast("Cell", started.result()._cell)
+        cell: Cell = started.result()._cell
+        job._cell = cell
+        if job._is_unwanted:
+            cell.kill()
+            await cell.ended()
+            raise AskFailed(job.path, "it was ended before it began")
         if linked is not None:
             link(linked.cell, cell)
         value = await _result(cell)
@@ -611,13 +613,14 @@ async def _stream(
             while len(window) < most and (found := source.take()):
                 deadline = math.inf if timeout is None else loop.time() + timeout
                 window.append(_Slot(found[0], begin(found[0]), deadline, done))
+            for slot in done:
+                if slot.is_refused and isinstance(slot.result, Failed):
+                    raise slot.result.error
             ready = window if ordered else done
             if ready and (result := ready[0].result) is not None:
                 slot = ready[0]
                 window.remove(slot)
                 done.remove(slot)
-                if slot.is_refused and isinstance(result, Failed):
-                    raise result.error
                 yield result
                 continue
             waited: list[asyncio.Future[Any]] = [slot.job._future for slot in window if slot.result is None]

@@ -276,7 +276,7 @@ async def test_shutdown_is_a_ladder() -> None:
     async with opened() as (system, jobs):
         loop = asyncio.get_running_loop()
         polite, stubborn, brutal = Gate(), Gate(), Gate()
-        handles = [jobs.start(polite, None, 2.0), jobs.start(stubborn, None, 100.0), jobs.start(brutal, None, 100.0)]
+        handles = [jobs.start(polite, None, 2.0), jobs.start(stubborn, None, 100.0), jobs.start(brutal)]
         for gate in (polite, stubborn, brutal):
             await gate.begun.wait()
         times: list[float] = []
