@@ -40,7 +40,7 @@ from .registrar import (
 from .spec import ChildSpec, Restart, Shutdown
 
 if TYPE_CHECKING:
-    from collections.abc import AsyncIterator
+    from collections.abc import AsyncGenerator
 
 K = TypeVar("K", default=Any)
 V = TypeVar("V", default=Any)
@@ -223,7 +223,7 @@ class Registry(Generic[K, V]):
     # -- locks ------------------------------------------------------------------------------------------------------
 
     @asynccontextmanager
-    async def lock(self, key: K, timeout: float | None = None) -> AsyncIterator[None]:
+    async def lock(self, key: K, timeout: float | None = None) -> AsyncGenerator[None, None]:
         """`async with names.lock(key):` one at a time, in the order in which they asked; not re-entrant.
 
         A lock is independent of whether anybody holds the key. It is given back at the end of the block, or by the

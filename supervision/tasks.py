@@ -11,7 +11,16 @@ import functools
 import math
 import os
 from collections import deque
-from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Callable, Coroutine, Iterable, Iterator
+from collections.abc import (
+    AsyncGenerator,
+    AsyncIterable,
+    AsyncIterator,
+    Callable,
+    Coroutine,
+    Generator,
+    Iterable,
+    Iterator,
+)
 from typing import Any, Generic, Literal, cast, get_args, get_type_hints, overload
 
 import msgspec
@@ -92,12 +101,13 @@ class Job(Generic[R]):
     __slots__ = ("_cell", "_future", "_is_unwanted", "_shutdown", "_timer", "_where", "kind")
 
     def __init__(self, where: str, shutdown: Shutdown, future: asyncio.Future[R], kind: Any) -> None:
-        self._where, self._shutdown, self._future, self.kind = where, shutdown, future, kind
+        self._where, self._future, self.kind = where, future, kind
+        self._shutdown: Shutdown = shutdown
         self._cell: Cell | None = None
         self._timer: asyncio.TimerHandle | None = None
         self._is_unwanted = False  # it is to be ended as soon as it is there
 
-    def __await__(self) -> Any:
+    def __await__(self) -> Generator[Any, Any, R]:
         return asyncio.shield(self._future).__await__()
 
     def __repr__(self) -> str:
@@ -210,7 +220,7 @@ class Tasks:
         isolation: Isolation = ...,
         shutdown: Shutdown = ...,
     ) -> R: ...
-    async def run(
+    async def run(  # type: ignore[misc]  # mypy does not see that *Any takes any *Ts
         self,
         function: Callable[..., Any],
         *args: Any,
@@ -258,7 +268,7 @@ class Tasks:
         isolation: Isolation = ...,
         shutdown: Shutdown = ...,
     ) -> Job[R]: ...
-    def start(
+    def start(  # type: ignore[misc]  # as in `run`
         self,
         function: Callable[..., Any],
         *args: Any,
