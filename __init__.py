@@ -106,6 +106,7 @@ from holdfast.supervision.admin import (
     TerminateChild,
     WhichChildren,
 )
+from holdfast.supervision.awaited import Failed, Job, Ok
 from holdfast.supervision.backoff import Backoff
 from holdfast.supervision.config import load_tree, tree_from
 from holdfast.supervision.dynamic import DynamicSupervisor, dynamic
@@ -123,7 +124,7 @@ from holdfast.supervision.registry import AlreadyRegistered, Registry, RegistryE
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
-from holdfast.supervision.tasks import Failed, Job, Ok, Tasks, tasks
+from holdfast.supervision.tasks import Tasks, tasks
 from holdfast.supervision.tree import supervisor
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem

@@ -50,11 +50,12 @@ class RegistryMachine(RuleBasedStateMachine):
         try:
             self.by(holder, lambda: self.names.register(key, value))
         except hf.AlreadyRegistered as no:
-            assert self.is_unique
-            assert [no.holder] == [self.holders[name] for name in has_it]
+            refusal: hf.AlreadyRegistered | None = no
         else:
-            assert not (self.is_unique and has_it)
+            refusal = None
             self.model.append((known, holder, value))
+        expected = [self.holders[name] for name in has_it] if self.is_unique else []
+        assert ([] if refusal is None else [refusal.holder]) == expected
 
     @rule(holder=HOLDERS, key=KEYS)
     def unregister(self, holder: str, key: Any) -> None:

@@ -1,13 +1,11 @@
-"""Task supervisors: jobs that are awaited, started, spawned (otp.md 1.14; Elixir's task/supervisor_test.exs re-told)."""
+"""Task supervisors: jobs that are awaited, started or spawned (otp.md 1.14; Elixir's supervisor_test.exs re-told)."""
 
 import asyncio
 import functools
-import os
 import threading
-import time
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from typing import Any
+from typing import Any, assert_type
 
 import pytest
 
@@ -56,7 +54,7 @@ class Gate:
 
 
 @asynccontextmanager
-async def opened(**options: Any) -> AsyncIterator[tuple[hf.ActorSystem, hf.Tasks]]:
+async def opened(**options: Any) -> AsyncGenerator[tuple[hf.ActorSystem, hf.Tasks], None]:
     async with hf.ActorSystem(log=False, intensity=9) as system:
         yield system, hf.Tasks(await system.start(hf.tasks("jobs", **options)))
 
@@ -86,7 +84,7 @@ async def refuse() -> int:
 
 @pytest.mark.parametrize("function", [add, add_slowly, functools.partial(add, b=1), lambda a: a + 1, lambda a: add(a)])
 async def test_run_returns_what_the_function_returns(function: Callable[[int], Any]) -> None:
-    async with opened() as (system, jobs):
+    async with opened() as (_, jobs):
         assert await jobs.run(function, 2) == 3
         assert await jobs.children() == []
 
@@ -237,7 +235,7 @@ async def test_stopping_the_task_supervisor_stops_its_jobs_each_in_its_time() ->
 
 
 async def test_a_killed_task_supervisor_fails_its_jobs() -> None:
-    async with opened() as (system, jobs):
+    async with opened() as (_, jobs):
         gate = Gate()
         job = jobs.start(gate)
         await gate.begun.wait()
@@ -273,7 +271,7 @@ async def _await(job: hf.Job[Any]) -> Any:
 
 @virtual
 async def test_shutdown_is_a_ladder() -> None:
-    async with opened() as (system, jobs):
+    async with opened() as (_, jobs):
         loop = asyncio.get_running_loop()
         polite, stubborn, brutal = Gate(), Gate(), Gate()
         handles = [jobs.start(polite, None, 2.0), jobs.start(stubborn, None, 100.0), jobs.start(brutal)]
@@ -315,7 +313,7 @@ async def test_a_job_that_is_killed_before_it_began_never_begins() -> None:
 @virtual
 async def test_outcomes_of_many() -> None:
     """Elixir: Task.yield_many."""
-    async with opened() as (system, jobs):
+    async with opened() as (_, jobs):
         gate = Gate()
         many = [jobs.start(add, 1), jobs.start(fail, "no"), jobs.start(gate)]
         first, second, third = await jobs.outcomes(many, 2.0)
@@ -448,89 +446,12 @@ async def test_what_cannot_be_a_job_is_refused_by_name() -> None:
         hf.tasks("jobs", max_children=-1)
 
 
-# -- processes ------------------------------------------------------------------------------------------------------
-
-
-def pid_and(pair: tuple[int, str]) -> tuple[int, tuple[int, str]]:
-    return os.getpid(), pair
-
-
-async def pid_later() -> int:
-    await asyncio.sleep(0)
-    return os.getpid()
-
-
-def say_nothing() -> object:
-    return object()
-
-
-def block_for_ever(path: str) -> None:
-    with open(path, "w") as begun:
-        begun.write(str(os.getpid()))
-    while True:
-        time.sleep(60.0)
-
-
-def die(code: int) -> None:
-    os._exit(code)
-
-
-async def test_a_job_in_a_process_of_its_own() -> None:
+async def test_results_have_the_functions_type() -> None:
+    """Checked by mypy and pyright, which read the tests too."""
     async with opened() as (_, jobs):
-        pid, pair = await jobs.run(pid_and, (1, "x"), isolation="process")
-        assert (pid != os.getpid(), pair) == (True, (1, "x")), "decoded as the function says, so a tuple is one"
-        assert await jobs.run(pid_later, isolation="process") != os.getpid()
-        crash = await refused(jobs.run(fail, "far", isolation="process"))
-        assert isinstance(crash, hf.RemoteCrash)
-        assert (crash.type_name, crash.text) == ("ValueError", "far")
-        assert await refused(jobs.run(refuse, isolation="process")) == Short(by=3)
-        assert isinstance(await refused(jobs.run(say_nothing, isolation="process")), hf.BadMessage)
-        assert isinstance(await refused(jobs.run(die, 3, isolation="process")), hf.AskFailed)
-        assert await jobs.children() == []
-
-
-async def test_blocking_work_in_a_process_can_be_killed(tmp_path: Any) -> None:
-    path = tmp_path / "begun"
-    async with opened() as (system, jobs):
-        job = jobs.start(block_for_ever, str(path), isolation="process")
-        async with asyncio.timeout(30.0):
-            while not (path.exists() and path.read_text()):
-                await job.outcome(0.02)
-        job.kill()
-        error = await refused(job)
-        assert isinstance(error, hf.AskFailed)
-        assert error.reason == "killed"
-        with pytest.raises(ProcessLookupError):
-            os.kill(int(path.read_text()), 0)
-
-
-async def test_processes_come_up_side_by_side_and_the_supervisor_answers_meanwhile() -> None:
-    async with opened() as (_, jobs):
-        many = [jobs.start(pid_later, isolation="process") for _ in range(3)]
-        assert await jobs.run(add, 1) == 2
-        assert not any(job.is_done for job in many)
-        assert len({await job for job in many}) == 3
-
-
-class Ask(hf.Message[str]):
-    at: hf.ActorRef[hf.Actor]
-
-
-class Far(hf.Actor):
-    """In a process of its own, with a task supervisor there."""
-
-    @hf.on(Ask)
-    async def ask(self, message: Ask) -> str:
-        try:
-            await hf.Tasks(message.at).run(pid_later)  # type: ignore[arg-type]
-        except hf.SpecError as error:
-            there = str(error)
-        own = hf.Tasks(self.ctx.spawn(hf.tasks("jobs").start, "jobs"))
-        same = await own.run(pid_later) == os.getpid()
-        return f"{same} {there}"
-
-
-async def test_an_actor_in_a_process_has_its_own_task_supervisor() -> None:
-    async with opened() as (system, jobs):
-        far = await system.start(hf.child("far", hf.start(Far), isolation="process"))
-        assert (await far.ask(Ask(jobs.ref))).startswith("True job: /app/jobs lives in another process")
+        assert_type(await jobs.run(add, 1), int)
+        assert_type(await jobs.run(add_slowly, 1, 2, timeout=9.0), int)
+        assert_type(jobs.start(refuse), hf.Job[int])
+        async for result in jobs.stream(str, [1]):
+            assert_type(result, hf.Ok[int, str] | hf.Failed[int])
+            assert result == hf.Ok(1, "1")
