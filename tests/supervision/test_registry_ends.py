@@ -204,7 +204,7 @@ async def test_a_registry_that_is_given_up_is_empty_when_it_comes_again() -> Non
         again = hf.Registry[str, int](system.ref("/app/top/names", hf.RegistryActor))
         assert [(entry.key, entry.holder) for entry in await again.select(lambda entry: True)] == [("finder", holder)]
         again.ref.kill()
-        await holder.ask(Kept())
+        await idle(system)
         assert (await again.values("finder"), holder._cell.life) == ([2], 2)
 
 
