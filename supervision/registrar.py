@@ -162,7 +162,6 @@ class Claim:
     ticket: str
     holder: Cell | None  # None: not an actor, so only it can give the lock back
     life: int
-    ask: Any
     handle: ReplyHandle[Any]
 
 
@@ -293,7 +292,7 @@ class RegistryActor(Actor):
         sender = item.sender if isinstance(item, Ask) else None
         if sender is not None and not is_living(sender, message.life):
             return None
-        claim = Claim(message.key, message.ticket, sender, message.life, item, handle)
+        claim = Claim(message.key, message.ticket, sender, message.life, handle)
         waiting = self._book.locks.setdefault(message.key, deque())
         waiting.append(claim)
         if sender is not None:
@@ -320,15 +319,7 @@ class RegistryActor(Actor):
         if not waiting:
             del self._book.locks[claim.key]
         elif had_it:
-            self._grant(waiting[0])
-
-    def _grant(self, claim: Claim) -> None:
-        """It is the first now; one that does not wait any more gives it up, which lets the next one have it."""
-        dead = claim.holder is not None and not is_living(claim.holder, claim.life)
-        if dead or claim.ask.is_done or claim.ask.deadline <= self.ctx.cell.node.loop.time():
-            self._give_up(claim)
-        else:
-            claim.handle.reply(None)
+            waiting[0].handle.reply(None)  # If it does not wait any more, its `Unlock` or DOWN is on the way.
 
     # -- metadata ---------------------------------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ import pytest
 import holdfast as hf
 from holdfast.testing import idle
 from tests.supervision.family import Boom, Leave, refused
-from tests.supervision.test_registry import Holder, Kept, Names, Note, by, open_names
+from tests.supervision.test_registry import Holder, Kept, Listener, Names, Next, Note, by, open_names
 
 # -- ends -----------------------------------------------------------------------------------------------------------
 
@@ -72,7 +72,8 @@ async def test_a_dead_holders_key_is_had_before_its_down_has_come() -> None:
 
 async def test_an_ask_that_outlives_its_asker_registers_nothing() -> None:
     async with hf.ActorSystem(log=False) as system:
-        names = await open_names(system)
+        names = await open_names(system, listeners=["/app/listener"])
+        listener = system.spawn(hf.start(Listener), "listener")
         await system.start(hf.supervisor("top", children=[hf.child("h", hf.start(Holder))]))
         holder = system.ref("/app/top/h", Holder)
         await system.suspend(names.ref)
@@ -84,6 +85,8 @@ async def test_an_ask_that_outlives_its_asker_registers_nothing() -> None:
         assert await holder.ask(Kept()) == []  # The next life, which never asked for the key.
         await system.resume(names.ref)
         assert await names.lookup("k") == []
+        await by(holder, lambda: names.register("other", 2))
+        assert await listener.ask(Next()) == "+other 2 top/h"
 
 
 async def test_a_restarted_holder_registers_anew() -> None:
@@ -141,7 +144,8 @@ async def test_an_actor_with_recovery_holds_its_keys_over_a_crash() -> None:
 
 async def test_a_restarted_registry_has_lost_nothing_but_the_dead() -> None:
     async with hf.ActorSystem(log=False) as system:
-        names = await open_names(system, meta={"since": 1})
+        names = await open_names(system, meta={"since": 1}, listeners=["/app/listener"])
+        listener = system.spawn(hf.start(Listener), "listener")
         await system.start(hf.supervisor("top", children=[hf.child("again", hf.start(Holder))]))
         again = system.ref("/app/top/again", Holder)
         living, dying = (system.spawn(hf.start(Holder), name) for name in ("living", "dying"))
@@ -156,9 +160,12 @@ async def test_a_restarted_registry_has_lost_nothing_but_the_dead() -> None:
         assert await refused(by(living, lambda: names.register(living.path))) == hf.AlreadyRegistered(
             living.path, living
         )
+        heard = [await listener.ask(Next()) for _ in range(5)]
+        assert [text.partition(" ")[0] for text in heard] == [
+            *("+/app/living", "+/app/dying", "+/app/top/again", "-/app/dying", "-/app/top/again")
+        ]
         living.kill()
-        await idle(system)
-        assert await names.count() == 0, "the new life watches them too"
+        assert await listener.ask(Next()) == "-/app/living living ended", "the new life watches them too"
 
 
 async def test_locks_outlive_a_restart_of_the_registry() -> None:
