@@ -48,7 +48,7 @@ async def test_who_hears_of_an_end_finds_nothing_any_more(how: Any) -> None:
             case reason:
                 holder.tell(Leave(reason))
         await idle(system)
-        assert await witness.ask(Kept()) == [[]]
+        assert str(await witness.ask(Kept())) == "[[]]"
         assert await names.count() == 0
 
 

@@ -39,7 +39,7 @@ def die(code: int) -> None:
 
 
 async def test_a_job_in_a_process_of_its_own() -> None:
-    async with opened() as (_, jobs):
+    async with opened(max_children=1) as (_, jobs):  # Its place is free when `run` returns.
         pid, pair = await jobs.run(pid_and, (1, "x"), isolation="process")
         assert (pid != os.getpid(), pair) == (True, (1, "x")), "decoded as the function says, so a tuple is one"
         assert await jobs.run(pid_later, isolation="process") != os.getpid()

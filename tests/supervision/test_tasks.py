@@ -194,7 +194,7 @@ async def test_jobs_are_children_named_by_their_function() -> None:
         assert [ref.path for ref in await jobs.children()] == [*(job.path for job in started), spawned.path]
         assert await jobs.ref.ask(hf.CountChildren()) == hf.ChildCounts(3, 3, 0, 3)
         gate.open.set()
-        assert [await job for job in started] == [None, None]
+        assert [await job.outcome() for job in started] == [hf.Ok(None, None)] * 2
 
 
 async def test_no_more_than_max_children_and_a_place_is_free_when_run_returns() -> None:
