@@ -106,9 +106,11 @@ from holdfast.supervision.admin import (
     TerminateChild,
     WhichChildren,
 )
+from holdfast.supervision.awaited import Failed, Job, Ok
 from holdfast.supervision.backoff import Backoff
 from holdfast.supervision.config import load_tree, tree_from
 from holdfast.supervision.dynamic import DynamicSupervisor, dynamic
+from holdfast.supervision.jobs import TaskSupervisor
 from holdfast.supervision.partition import (
     CountPartitions,
     PartitionSupervisor,
@@ -117,9 +119,12 @@ from holdfast.supervision.partition import (
     partition_of,
     partitions,
 )
+from holdfast.supervision.registrar import KeyFreed, KeyRegistered, NotAnActor, NotUnique, RegistryActor
+from holdfast.supervision.registry import AlreadyRegistered, Registry, RegistryEntry, registry
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
+from holdfast.supervision.tasks import Tasks, tasks
 from holdfast.supervision.tree import supervisor
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem
@@ -134,6 +139,7 @@ __all__ = [
     "ActorStopped",
     "ActorSystem",
     "AlreadyPresent",
+    "AlreadyRegistered",
     "AlreadyStarted",
     "AskDeadlock",
     "AskFailed",
@@ -161,12 +167,16 @@ __all__ = [
     "EventStream",
     "ExitReason",
     "Exited",
+    "Failed",
     "Flags",
     "GetChildSpec",
     "HoldfastError",
     "Hung",
     "Ignore",
+    "Job",
     "KILLED",
+    "KeyFreed",
+    "KeyRegistered",
     "Killed",
     "Limits",
     "LogLine",
@@ -187,8 +197,11 @@ __all__ = [
     "NoSuchActor",
     "NoSuchChild",
     "Normal",
+    "NotAnActor",
     "NotSupported",
     "NotSuspended",
+    "NotUnique",
+    "Ok",
     "Opaque",
     "OutOfMemory",
     "PartitionSupervisor",
@@ -200,6 +213,9 @@ __all__ = [
     "Recovered",
     "RecoveryFailed",
     "Refusal",
+    "Registry",
+    "RegistryActor",
+    "RegistryEntry",
     "RemoteCrash",
     "ReplayDiverged",
     "ReplyHandle",
@@ -223,6 +239,8 @@ __all__ = [
     "Status",
     "Supervisor",
     "SupervisorGaveUp",
+    "TaskSupervisor",
+    "Tasks",
     "TerminateChild",
     "Timer",
     "TreeFailed",
@@ -243,10 +261,12 @@ __all__ = [
     "on",
     "partition_of",
     "partitions",
+    "registry",
     "rule",
     "run",
     "start",
     "subscribe",
     "supervisor",
+    "tasks",
     "tree_from",
 ]

@@ -7,6 +7,7 @@ import contextvars
 import itertools
 import random
 import time
+import weakref
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -45,6 +46,7 @@ class Node(RunLoop):
         self.events = EventHub(self._watch)
         self.topics = Topics()
         self.names: dict[str, Cell] = {}
+        self.kept: weakref.WeakKeyDictionary[Cell, Any] = weakref.WeakKeyDictionary()  # what outlives an actor's lives
         self.dead_letters = 0
         self.late_replies = 0
         self.wall: Callable[[], float] = time.time
