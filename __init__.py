@@ -123,6 +123,8 @@ from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tree import supervisor
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem
+from holdfast.actors.process.kept import ProgramFailed
+from holdfast.supervision.program import Program, ProgramInfo, ProgramStatus, program
 
 __all__ = [
     "Actor",
@@ -196,6 +198,10 @@ __all__ = [
     "ProcessDied",
     "ProcessStarted",
     "ProcessUnavailable",
+    "Program",
+    "ProgramFailed",
+    "ProgramInfo",
+    "ProgramStatus",
     "Quarantined",
     "Recovered",
     "RecoveryFailed",
@@ -243,6 +249,7 @@ __all__ = [
     "on",
     "partition_of",
     "partitions",
+    "program",
     "rule",
     "run",
     "start",

@@ -45,6 +45,7 @@ class Node(RunLoop):
         self.events = EventHub(self._watch)
         self.topics = Topics()
         self.names: dict[str, Cell] = {}
+        self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.dead_letters = 0
         self.late_replies = 0
         self.wall: Callable[[], float] = time.time
