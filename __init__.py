@@ -83,6 +83,7 @@ from holdfast.actors.links import Monitor
 from holdfast.actors.mail import ReplyHandle
 from holdfast.actors.mailbox import bounded
 from holdfast.actors.message import Message, Refusal
+from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
@@ -117,14 +118,13 @@ from holdfast.supervision.partition import (
     partition_of,
     partitions,
 )
+from holdfast.supervision.program import Program, ProgramInfo, ProgramStatus, program
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tree import supervisor
 from holdfast.system.run import run
 from holdfast.system.system import ActorSystem
-from holdfast.actors.process.kept import ProgramFailed
-from holdfast.supervision.program import Program, ProgramInfo, ProgramStatus, program
 
 __all__ = [
     "Actor",
