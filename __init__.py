@@ -118,7 +118,7 @@ from holdfast.supervision.partition import (
     partition_of,
     partitions,
 )
-from holdfast.supervision.program import Program, ProgramInfo, ProgramStatus, program
+from holdfast.supervision.program import InputRefused, Program, ProgramInfo, ProgramInput, ProgramStatus, program
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
@@ -168,6 +168,7 @@ __all__ = [
     "HoldfastError",
     "Hung",
     "Ignore",
+    "InputRefused",
     "KILLED",
     "Killed",
     "Limits",
@@ -201,6 +202,7 @@ __all__ = [
     "Program",
     "ProgramFailed",
     "ProgramInfo",
+    "ProgramInput",
     "ProgramStatus",
     "Quarantined",
     "Recovered",

@@ -8,9 +8,9 @@ import os
 import re
 import signal
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeGuard
 
 import msgspec
 
@@ -20,11 +20,13 @@ from ..actors.cell import Cell
 from ..actors.errors import SpecError
 from ..actors.events import HookFailed, LogLine, ProcessDied, ProcessStarted
 from ..actors.exits import ExitReason
-from ..actors.message import Message
+from ..actors.message import Message, Refusal
 from ..actors.process.kept import Kept, ProgramFailed
+from ..actors.process.launch import outside_environment
 from ..actors.process.limits import Limits
 from .backoff import Backoff
-from .ready import Ready, Sign, reached
+from .ready import Ready, Sign, by_name, reached
+from .rules import Rule
 from .spec import ChildSpec, Restart, Shutdown, child
 
 Stop: TypeAlias = int | Sequence[str] | Callable[[int], Awaitable[object] | object]
@@ -32,7 +34,7 @@ Stop: TypeAlias = int | Sequence[str] | Callable[[int], Awaitable[object] | obje
 
 LINES = 20
 """Lines of output that are remembered."""
-SLACK = 10.0
+SLACK = 5.0
 """Seconds that a program's actor may take longer than `shutdown`: it is not to be killed before its program is."""
 
 
@@ -48,6 +50,23 @@ class ProgramInfo(Message[ProgramStatus]):
     """Asks a `Program` how it is."""
 
 
+class ProgramInput(Message[None]):
+    """Something for a `Program` to read: `text` (as UTF-8), then `data`; after `end` it finds the end of its input.
+
+    The reply says that it is on its way, not that it has been read.
+    """
+
+    text: str = ""
+    data: bytes = b""
+    end: bool = False
+
+
+class InputRefused(Refusal):
+    """The program takes no input; `why` says whether it never does, no more, or not now."""
+
+    why: str
+
+
 @dataclasses.dataclass(frozen=True, slots=True)
 class Order:
     """What a program is and how it is started and stopped. Made by `program`."""
@@ -60,6 +79,7 @@ class Order:
     env: dict[str, str | None]
     cwd: str | None
     limits: Limits | None
+    stdin: bool
 
 
 class Program(Actor):
@@ -72,6 +92,7 @@ class Program(Actor):
         self._kept: Kept | None = None
         self._is_up = False
         self._lines: deque[str] = deque(maxlen=LINES)
+        self._parts: dict[str, str] = {}  # of lines that have no end yet, by stream
         self._sign: Sign | None = None
         self._since = 0.0
 
@@ -84,7 +105,7 @@ class Program(Actor):
             await asyncio.wait(left)  # The last life was killed: its program must be gone before the next one begins.
         order = self._order
         self._sign = None if order.ready is None else Sign(order.ready)
-        kept = self._kept = self._keep(order.command)
+        kept = self._kept = self._keep(order.command, stdin=order.stdin)
         self._since = self._now()
         kept.ended.add_done_callback(self._ended)
         pid = await asyncio.shield(kept.started)
@@ -95,15 +116,17 @@ class Program(Actor):
         if kept.ended.done():  # At once: nobody was there yet to be told.
             self.ctx.stop(kept.ended.result())
 
-    def _keep(self, command: Sequence[str]) -> Kept:
+    def _keep(self, command: Sequence[str], more: Mapping[str, str] | None = None, *, stdin: bool = False) -> Kept:
         order = self._order
         kept = Kept(
             self.ctx.cell.node,
             command,
-            env=_environment(order.env),
+            env={**_environment(order.env), **(more or {})},
             cwd=order.cwd,
             limits=order.limits,
             on_line=self._line,
+            on_part=self._part,
+            stdin=stdin,
         )
         _Leash(self.ctx.cell, kept)
         return kept
@@ -128,22 +151,34 @@ class Program(Actor):
             except Exception as error:
                 raise self._failed(f"`ready` raised {type(error).__name__}: {error}") from error
         finally:
-            waiting.cancel()
+            if not waiting.cancel() and not waiting.cancelled():
+                waiting.exception()  # Seen: the end of the program came at the same time, and says more.
             sign.close()
 
     def _failed(self, why: str) -> ProgramFailed:
-        last = "\n".join(self._lines)
+        last = "\n".join(self._last())
         return ProgramFailed(self._order.command[0], f"{why}; its last lines:\n{last}" if last else why)
 
     # -- while it runs ----------------------------------------------------------------------------------------------
 
     def _line(self, stream: str, text: str) -> None:
         self._lines.append(text)
+        self._parts.pop(stream, None)
         node = self.ctx.cell.node
         if node.watched:
             node.emit(LogLine(self.ctx.path, stream, text))
         if self._sign is not None:
             self._sign.line(text)
+
+    def _part(self, stream: str, text: str) -> None:
+        """A line that has no end yet; it comes again, whole."""
+        self._parts[stream] = text
+        if text and self._sign is not None:
+            self._sign.line(text)
+
+    def _last(self) -> list[str]:
+        """What it said last."""
+        return [*self._lines, *(text for text in self._parts.values() if text)][-LINES:]
 
     def _ended(self, ended: asyncio.Future[ExitReason]) -> None:
         """Nothing of the program is left: our life ends for the reason it ended for."""
@@ -158,7 +193,20 @@ class Program(Actor):
     def info(self, message: ProgramInfo) -> ProgramStatus:
         """How it is."""
         kept = self._kept
-        return ProgramStatus(-1 if kept is None else kept.pid, self._now() - self._since, list(self._lines))
+        return ProgramStatus(-1 if kept is None else kept.pid, self._now() - self._since, self._last())
+
+    @on(ProgramInput)
+    def feed(self, message: ProgramInput) -> None:
+        """Give it something to read."""
+        into = None if self._kept is None else self._kept.input
+        if into is None:
+            raise InputRefused("it has no standard input: make it with program(..., stdin=True)")
+        if not into.is_open:
+            raise InputRefused("its standard input is closed")
+        if not into.write(message.text.encode("utf-8", "replace") + message.data):
+            raise InputRefused(f"it does not read: {into.waiting} bytes wait for it")
+        if message.end:
+            into.end()
 
     def _now(self) -> float:
         return self.ctx.cell.node.loop.time()
@@ -171,6 +219,8 @@ class Program(Actor):
         if kept is None or kept.ended.done():
             return
         patience = _seconds(self._order.shutdown)
+        if kept.pid < 0:  # It has never run: there is nobody to be asked, and no pid to be given to anybody.
+            patience = 0
         if patience != 0 and not await self._asked(kept, None if patience is None else patience / 2):
             kept.signal(signal.SIGTERM, group=True)
             await asyncio.wait({kept.ended}, timeout=None if patience is None else patience / 2)
@@ -207,7 +257,9 @@ class Program(Actor):
         Raises:
             ProgramFailed: it cannot be run, or ends badly.
         """
-        kept = self._keep(command)
+        running = self._kept
+        assert running is not None
+        kept = self._keep(command, {"MAINPID": str(running.pid)})
         try:
             reason = await kept.wait()
         finally:
@@ -247,10 +299,13 @@ def program(
     stop: Stop = signal.SIGTERM,
     env: Mapping[str, str | None] | None = None,
     cwd: str | Path | None = None,
+    stdin: bool = False,
     restart: Restart = "permanent",
     shutdown: Shutdown = 5.0,
     backoff: Backoff | None = None,
     limits: Limits | None = None,
+    significant: bool = False,
+    rules: Iterable[Rule] = (),
 ) -> ChildSpec:
     """An external program as a child.
 
@@ -261,41 +316,59 @@ def program(
     Args:
         command: the program and its arguments; it is looked for in PATH, and no shell sees it.
         id: the last part of the address; the program's name if left out.
-        ready: what says that it is up: text or a pattern to be found in a line of its output, a `Path` that appears
-            (or a Unix socket there that takes connections), `(host, port)` that takes connections, seconds that it
-            lives, or a function that returns True; if left out, that it runs.
+        ready: what says that it is up: a regular expression to be found in a line of its output, a `Path` (seen from
+            `cwd`) where a file appears or changes, or a Unix socket takes connections, `(host, port)` that takes
+            connections, seconds that it lives, or a function that returns True, asked again and again; may be
+            `async`. If left out: that it runs.
         ready_timeout: seconds it may take to be ready, > 0.
-        stop: how it is asked to end: a signal, a command, or a function that is given its pid. After half the time of
-            `shutdown` its process group gets SIGTERM.
+        stop: how it is asked to end: a signal, a command (which finds its pid in MAINPID), or a function that is given
+            its pid; may be `async`. After half the time of `shutdown`, or if that cannot be done, its process group
+            gets SIGTERM.
         env: variables besides those of this process; None takes one away.
         cwd: its working directory.
-        restart, backoff: as in `child`.
+        stdin: whether it reads what `ProgramInput` brings; else its standard input is empty.
+        restart, backoff, significant, rules: as in `child`.
         shutdown: seconds it may take to end before it is ended by SIGKILL, "brutal_kill" or "infinity".
         limits: of the program itself; `hung_after` does not apply.
 
     Raises:
         SpecError: naming the option and what it may be.
     """
-    if isinstance(command, (str, bytes)) or not command or not all(isinstance(part, str) for part in command):
-        raise SpecError("program", f"the command must be a list of texts, ['name', 'argument'], not {command!r}")
-    name = os.path.basename(command[0]) if id is None else id
+    words = _command_in("program", "the command", command)
+    name = os.path.basename(words[0]) if id is None else id
     where = f"program {name!r}"
-    if not isinstance(ready_timeout, (int, float)) or not ready_timeout > 0:
-        raise SpecError(where, f"ready_timeout must be seconds > 0, not {ready_timeout!r}")
+    if not _is_number(ready_timeout) or not 0 < ready_timeout < float("inf"):
+        raise SpecError(where, f"ready_timeout must be a finite number of seconds > 0, not {ready_timeout!r}")
+    if not isinstance(stdin, bool):
+        raise SpecError(where, f"stdin must be True or False, not {stdin!r}")
+    if limits is not None and not isinstance(limits, Limits):
+        raise SpecError(where, f"limits must be Limits(...) or left out, not {limits!r}")
     if limits is not None and limits.hung_after is not None:
         raise SpecError(where, "limits.hung_after is for actors: a program has no heartbeat")
+    directory = _directory_in(where, cwd)
+    if isinstance(ready, Path) and directory is not None:
+        ready = Path(directory, ready)
     order = Order(
-        tuple(command),
+        words,
         None if ready is None else Ready.of(where, ready),
         float(ready_timeout),
         _stop_in(where, stop),
         shutdown,
-        dict(env or {}),
-        None if cwd is None else os.fspath(cwd),
+        _changes_in(where, env),
+        directory,
         limits,
+        stdin,
     )
     # The actor does the counting, for a kill of the actor must not come before that of the program.
-    own = child(name, start(Program, order), restart=restart, shutdown=shutdown, backoff=backoff)
+    own = child(
+        name,
+        start(Program, order),
+        restart=restart,
+        shutdown=shutdown,
+        backoff=backoff,
+        significant=significant,
+        rules=rules,
+    )
     patience: Shutdown = "infinity" if isinstance(shutdown, str) else shutdown + SLACK
     return dataclasses.replace(own, shutdown=patience)
 
@@ -304,14 +377,51 @@ def _stop_in(where: str, stop: Any) -> Any:
     if isinstance(stop, int) and not isinstance(stop, bool) and stop in signal.valid_signals():
         return int(stop)
     if callable(stop):
-        return stop
-    if isinstance(stop, Sequence) and not isinstance(stop, (str, bytes)) and stop:
-        return tuple(stop)
+        return by_name(stop)
+    if isinstance(stop, (list, tuple)):
+        return _command_in(where, "stop", stop)
     raise SpecError(where, f"stop must be a signal, a command as a list of texts, or a function, not {stop!r}")
 
 
+def _command_in(where: str, what: str, command: Any) -> tuple[str, ...]:
+    words = tuple(command) if isinstance(command, (list, tuple)) else ()
+    if not words or not all(_is_text(word) for word in words) or not words[0]:
+        raise SpecError(where, f"{what} must be a list of texts, ['name', 'argument'], not {command!r}")
+    return words
+
+
+def _directory_in(where: str, cwd: Any) -> str | None:
+    if cwd is None:
+        return None
+    path = os.fspath(cwd) if isinstance(cwd, (str, os.PathLike)) else None
+    if not _is_text(path):
+        raise SpecError(where, f"cwd must be a path, not {cwd!r}")
+    return path
+
+
+def _changes_in(where: str, env: Any) -> dict[str, str | None]:
+    changes: dict[Any, Any] = dict(env) if isinstance(env, Mapping) else {}
+    if env is not None and not isinstance(env, Mapping):
+        raise SpecError(where, f"env must be a mapping of names to texts, not {env!r}")
+    for name, value in changes.items():
+        if not _is_text(name) or not name or "=" in name or not (value is None or _is_text(value)):
+            raise SpecError(
+                where, f"env must map names to texts (or None, to take one away), not {name!r} to {value!r}"
+            )
+    return changes
+
+
+def _is_text(value: object) -> TypeGuard[str]:
+    """Whether the kernel takes it: it has no text with a NUL in it."""
+    return isinstance(value, str) and "\0" not in value
+
+
+def _is_number(value: object) -> TypeGuard[float]:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
 def _environment(changes: Mapping[str, str | None]) -> dict[str, str]:
-    merged = {**os.environ, **changes}
+    merged = {**outside_environment(), **changes}
     return {name: value for name, value in merged.items() if value is not None}
 
 

@@ -5,11 +5,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
+import importlib
 import os
 import re
 import socket
 import stat
-from collections.abc import Awaitable
+import sys
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -49,7 +51,7 @@ class Ready:
             case int() | float() if 0 <= ready < float("inf"):
                 return cls("seconds", float(ready))
             case _ if callable(ready):
-                return cls("call", ready)
+                return cls("call", by_name(ready))
             case _:
                 pass
         raise SpecError(
@@ -57,17 +59,46 @@ class Ready:
         )
 
 
-def _pattern(where: str, ready: str | re.Pattern[Any]) -> str:
-    text = ready if isinstance(ready, str) else ready.pattern
-    flags = 0 if isinstance(ready, str) else ready.flags & ~re.UNICODE
+def _pattern(where: str, ready: str | re.Pattern[Any]) -> tuple[str, int]:
+    """As text and flags it can be sent to another process."""
+    text: object = ready if isinstance(ready, str) else ready.pattern
+    flags = 0 if isinstance(ready, str) else int(ready.flags & ~re.UNICODE)
     if not isinstance(text, str):
         raise SpecError(where, "ready must be a pattern for text, not for bytes: output is decoded")
     try:
         re.compile(text, flags)
     except re.error as error:
         raise SpecError(where, f"ready is no regular expression: {error}") from error
-    marks = "".join(mark for mark, flag in zip("imsxa", (re.I, re.M, re.S, re.X, re.A), strict=True) if flags & flag)
-    return f"(?{marks}){text}" if marks else text  # As text it can be sent to another process.
+    return text, flags
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Named:
+    """A function by its name: as such it can be sent to another process."""
+
+    module: str
+    name: str
+
+    def __call__(self, *args: Any) -> Any:
+        function = _found(self.module, self.name)
+        if function is None:
+            raise LookupError(f"there is no {self.module}.{self.name} here")
+        return function(*args)
+
+
+def by_name(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, by its name if it can be found by that; a lambda, say, stays as it is, and in this process."""
+    module, name = getattr(function, "__module__", None), getattr(function, "__qualname__", None)
+    if isinstance(module, str) and isinstance(name, str) and _found(module, name) is function:
+        return Named(module, name)
+    return function
+
+
+def _found(module: str, name: str) -> Any:
+    found: Any = sys.modules.get(module) or importlib.import_module(module)
+    for part in name.split("."):
+        found = getattr(found, part, None)
+    return found
 
 
 class Sign:
@@ -76,11 +107,11 @@ class Sign:
     def __init__(self, ready: Ready) -> None:
         self.ready = ready
         self.seen = asyncio.Event()  # a line with the pattern has come
-        self._pattern = re.compile(ready.value) if ready.kind == "line" else None
+        self._pattern = re.compile(*ready.value) if ready.kind == "line" else None
         self.before = _stamp(ready.value) if ready.kind == "path" else None
 
     def line(self, text: str) -> None:
-        """A line of output."""
+        """A line of output, or the beginning of one: a prompt has no end."""
         if self._pattern is not None and self._pattern.search(text):
             self.seen.set()
 
@@ -108,8 +139,11 @@ async def _there(sign: Sign) -> bool:
     if sign.ready.kind == "port":
         return await _answers(socket.AF_UNSPEC, value)
     if sign.ready.kind == "call":
-        found = value()
-        return bool(await found if isinstance(found, Awaitable) else found)
+        found: object = value()
+        answer = await found if isinstance(found, Awaitable) else found
+        if not isinstance(answer, bool):
+            raise TypeError(f"it must return True or False, not {answer!r}")
+        return answer
     stamp = _stamp(value)
     if stamp is None:
         return False

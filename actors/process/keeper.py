@@ -74,6 +74,7 @@ class Keeper:
             self._tell(FAILED + why)
             return
         self._tell(STARTED + b"%d" % self._pid)
+        self._let_go_of_input()
         poll = select.poll()
         # The end of the socket is not enough: what the owner forked without exec holds a copy of the other end.
         for fd in (self._control, owner_fd, self._wake_out):
@@ -104,6 +105,12 @@ class Keeper:
         os.close(failed_in)
         with open(failed_out, "rb") as file:
             return file.read()  # Ends with the exec.
+
+    def _let_go_of_input(self) -> None:
+        """The program alone shall hold it: whoever writes there when it has closed it is to hear of that."""
+        null = os.open("/dev/null", os.O_RDONLY | os.O_CLOEXEC)
+        os.dup2(null, 0)
+        os.close(null)
 
     def _become(self, failed: int) -> NoReturn:
         """Become the program. What is open besides the standard streams closes with the exec."""

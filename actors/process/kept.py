@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from ..errors import HoldfastError, ProcessUnavailable
 from ..exits import NORMAL, Exited, ExitReason, Hung, OutOfMemory, Signal
 from . import keeper
+from .input import InputWriter
 from .limits import Limits
 from .output import OutputReader
 from .watch import Watch, oom_kills
@@ -53,12 +54,16 @@ class Kept:
         cwd: str | None,
         limits: Limits | None,
         on_line: Callable[[str, str], None],
+        on_part: Callable[[str, str], None] | None = None,
+        stdin: bool = False,
     ) -> None:
         """Begin the start.
 
         Args:
             env: the whole environment.
             on_line: called with "stdout" or "stderr" and each line.
+            on_part: called with that and what has come of a line that has no end yet.
+            stdin: whether it gets something to read (`input`); else its standard input is at its end.
 
         Raises:
             ProcessUnavailable: there is no keeper to be had.
@@ -74,13 +79,20 @@ class Kept:
         self._status: int | None = None
         self._oom_before = oom_kills()
         self._watch: Watch | None = None
+        self.input: InputWriter | None = None
         order = {"command": list(command), "env": dict(env), "cwd": cwd, "limits": _own_limits(limits)}
         try:
-            self._exec(marshal.dumps(order), on_line)
+            self._exec(marshal.dumps(order), on_line, on_part, stdin)
         except OSError as error:
             raise ProcessUnavailable(f"the keeper of {self._name} cannot be started: {error}") from error
 
-    def _exec(self, order: bytes, on_line: Callable[[str, str], None]) -> None:
+    def _exec(
+        self,
+        order: bytes,
+        on_line: Callable[[str, str], None],
+        on_part: Callable[[str, str], None] | None,
+        stdin: bool,
+    ) -> None:
         with contextlib.ExitStack() as theirs, contextlib.ExitStack() as undo:
             self._control, control = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             undo.callback(self._control.close)
@@ -92,9 +104,10 @@ class Kept:
                 file.write(order)
             os.lseek(order_fd, 0, os.SEEK_SET)
             (out, out_in), (err, err_in) = _pipe(undo, theirs), _pipe(undo, theirs)
+            in_out, into = _input_pipe(undo, theirs) if stdin else (subprocess.DEVNULL, -1)
             self._keeper = subprocess.Popen(
                 keeper_command(control.fileno(), order_fd),
-                stdin=subprocess.DEVNULL,
+                stdin=in_out,
                 stdout=out_in,
                 stderr=err_in,
                 pass_fds=(control.fileno(), order_fd),
@@ -106,8 +119,16 @@ class Kept:
             undo.pop_all()
         loop = self._loop
         self._outputs = [
-            OutputReader(loop, fd, functools.partial(on_line, name)) for name, fd in (("stdout", out), ("stderr", err))
+            OutputReader(
+                loop,
+                fd,
+                functools.partial(on_line, name),
+                None if on_part is None else functools.partial(on_part, name),
+            )
+            for name, fd in (("stdout", out), ("stderr", err))
         ]
+        if into >= 0:
+            self.input = InputWriter(loop, into)
         loop.add_reader(self._control, self._read)
         loop.add_reader(self._pidfd, self._bury)
 
@@ -181,7 +202,7 @@ class Kept:
         while self._read():  # What it said last.
             pass
         self._control.close()
-        self._keeper.wait()
+        code = self._keeper.wait()
         reason = self._reason()
         if self._status is None and self.pid > 0:  # It was killed, and the program with it; not what that had started.
             with contextlib.suppress(ProcessLookupError, PermissionError):
@@ -190,7 +211,9 @@ class Kept:
             output.close()
         if self._watch is not None:
             self._watch.close()
-        self._fail(f"it ended at once: {reason}")
+        if self.input is not None:
+            self.input.close()
+        self._fail(f"its keeper ended with code {code}")
         if not self.ended.done():
             self.ended.set_result(reason)
 
@@ -224,6 +247,14 @@ def _own_limits(limits: Limits | None) -> dict[str, int]:
         return {}
     wanted = {name: getattr(limits, name) for name in ("address_space_bytes", "open_files", "niceness")}
     return {name: value for name, value in wanted.items() if value}
+
+
+def _input_pipe(undo: contextlib.ExitStack, theirs: contextlib.ExitStack) -> tuple[int, int]:
+    out, into = os.pipe2(os.O_CLOEXEC)
+    undo.callback(os.close, into)
+    theirs.callback(os.close, out)
+    os.set_blocking(into, False)
+    return out, into
 
 
 def _pipe(undo: contextlib.ExitStack, theirs: contextlib.ExitStack) -> tuple[int, int]:
