@@ -40,11 +40,11 @@ time.sleep(99)
 
 
 def sh(script: str, **options: Any) -> hf.ChildSpec:
-    return hf.program(["sh", "-c", script], **{"id": "it", **options})
+    return hf.program(["sh", "-c", script], id=options.pop("id", "it"), **options)
 
 
 def python(script: str, **options: Any) -> hf.ChildSpec:
-    return hf.program([*PYTHON, script], **{"id": "it", **options})
+    return hf.program([*PYTHON, script], id=options.pop("id", "it"), **options)
 
 
 @pytest.fixture
@@ -65,7 +65,8 @@ async def refused(system: hf.ActorSystem, spec: hf.ChildSpec) -> str:
 
 def keeper_of(pid: int) -> psutil.Process:
     found = psutil.Process(pid).parent()
-    assert found is not None and "keeper.py" in " ".join(found.cmdline())
+    assert found is not None
+    assert "keeper.py" in " ".join(found.cmdline())
     return found
 
 
@@ -528,8 +529,7 @@ async def test_megabytes_of_input_arrive_whole(system: hf.ActorSystem) -> None:
             while True:
                 try:
                     await ref.ask(hf.ProgramInput(data=data, end=number == 199))
-                except hf.InputRefused as no:
-                    assert "it does not read" in no.why
+                except hf.InputRefused:  # It does not read yet.
                     await asyncio.sleep(0.005)
                 else:
                     break
@@ -537,17 +537,21 @@ async def test_megabytes_of_input_arrive_whole(system: hf.ActorSystem) -> None:
         assert (await next_event(events, hf.LogLine)).text.strip() == str(sent)
 
 
+async def feed(ref: hf.ActorRef[hf.Program], message: hf.ProgramInput) -> None:
+    """The first ones may still be taken, by the pipe."""
+    for _ in range(3):
+        await ref.ask(message)
+
+
 async def test_input_that_cannot_be_had_is_refused(system: hf.ActorSystem) -> None:
     for options, why in (({}, "program(..., stdin=True)"), ({"stdin": True}, "it does not read: ")):
         name = f"it-{len(options)}"
         ref = await system.start(sh("exec sleep 99", id=name, **options))
         with pytest.raises(hf.InputRefused, match=re.escape(why)):
-            for _ in range(3):
-                await ref.ask(hf.ProgramInput(data=b"x" * 1_000_000))
+            await feed(ref, hf.ProgramInput(data=b"x" * 1_000_000))
     ref = await system.start(sh("exec <&-; echo closed; exec sleep 99", id="closed", stdin=True, ready="closed"))
     with pytest.raises(hf.InputRefused, match="its standard input is closed"):
-        for _ in range(3):
-            await ref.ask(hf.ProgramInput("x"))
+        await feed(ref, hf.ProgramInput("x"))
 
 
 async def test_without_input_it_finds_the_end_at_once(system: hf.ActorSystem) -> None:
