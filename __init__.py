@@ -118,7 +118,9 @@ from holdfast.supervision.partition import (
     partition_of,
     partitions,
 )
+from holdfast.supervision.pool import PoolInfo, PoolStatus, PoolSupervisor, ResizePool, pool, pool_of
 from holdfast.supervision.program import InputRefused, Program, ProgramInfo, ProgramInput, ProgramStatus, program
+from holdfast.supervision.routing import NoRoute
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
@@ -187,6 +189,7 @@ __all__ = [
     "NameTaken",
     "NoPartitions",
     "NoProc",
+    "NoRoute",
     "NoSuchActor",
     "NoSuchChild",
     "Normal",
@@ -196,6 +199,9 @@ __all__ = [
     "OutOfMemory",
     "PartitionSupervisor",
     "Plan",
+    "PoolInfo",
+    "PoolStatus",
+    "PoolSupervisor",
     "ProcessDied",
     "ProcessStarted",
     "ProcessUnavailable",
@@ -212,6 +218,7 @@ __all__ = [
     "ReplayDiverged",
     "ReplyHandle",
     "ResizePartitions",
+    "ResizePool",
     "RestartChild",
     "Route",
     "Rule",
@@ -251,6 +258,8 @@ __all__ = [
     "on",
     "partition_of",
     "partitions",
+    "pool",
+    "pool_of",
     "program",
     "rule",
     "run",

@@ -373,9 +373,7 @@ async def test_it_is_asked_to_end_as_it_wants_to_be(system: hf.ActorSystem) -> N
     assert await said_at_its_end(system, stop=signal.SIGINT) == "SIGINT"
     assert await said_at_its_end(system, stop=lambda pid: os.kill(pid, signal.SIGUSR1)) == "SIGUSR1"
     assert await said_at_its_end(system, stop=interrupt) == "SIGUSR1"
-    assert await said_at_its_end(system, stop=["sh", "-c", "echo stopping; kill -INT $MAINPID"]) == (
-        "stopping SIGINT"
-    )
+    assert await said_at_its_end(system, stop=["sh", "-c", "echo stopping; kill -INT $MAINPID"]) == ("stopping SIGINT")
     assert await said_at_its_end(system, shutdown="brutal_kill") == ""
 
 
