@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from collections.abc import Iterable
 from typing import Any, Protocol, TypeVar, get_args
 
 import msgspec
@@ -211,7 +212,7 @@ def pool(
     period: float = 5.0,
     restart: Restart = "permanent",
     shutdown: Shutdown = "infinity",
-    rules: tuple[Rule, ...] = (),
+    rules: Iterable[Rule] = (),
 ) -> ChildSpec:
     """Several workers of one class and a router in front of them, as a spec. `pool_of` gives a ref to it.
 

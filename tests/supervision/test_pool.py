@@ -119,7 +119,8 @@ async def begin(
     system: hf.ActorSystem, worker: Any = None, size: int = 3, **options: Any
 ) -> tuple[hf.ActorRef[Any], hf.ActorRef[Worker]]:
     """The pool's supervisor, and the pool."""
-    top = await system.start(hf.pool("w", worker or hf.start(Worker), size, **{"intensity": 99, **options}))
+    options.setdefault("intensity", 99)
+    top = await system.start(hf.pool("w", worker or hf.start(Worker), size, **options))
     return top, hf.pool_of(system, "/app/w", Worker)
 
 
