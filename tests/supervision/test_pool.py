@@ -425,6 +425,25 @@ async def test_full_workers_are_passed_over_and_then_the_router_waits_for_room()
             assert numbers == sorted(numbers), "in their order"
 
 
+async def test_room_that_the_router_does_not_take_is_for_others_who_wait() -> None:
+    gate = Gate()
+    worker = hf.child(None, hf.start(Worker, gate), mailbox=hf.bounded(1))
+    async with hf.ActorSystem(log=False) as system:
+        _, pool = await begin(system, worker, size=2)
+        for number in range(2):
+            one(system, number).tell(Job(waits=True))
+            await settled(system)
+            one(system, number).tell(Note("full"))
+        await pool.send(Note("routed"))
+        await settled(system)
+        direct = [asyncio.ensure_future(one(system, number).send(Note("direct"))) for number in range(2)]
+        await settled(system)
+        gate.event.set()
+        await asyncio.wait_for(asyncio.gather(*direct), 10)
+        notes = [await one(system, number).ask(Notes()) for number in range(2)]
+        assert sorted(notes) == [["full", "direct"], ["full", "routed", "direct"]]
+
+
 # -- size ----------------------------------------------------------------------------------------------------------
 
 

@@ -345,12 +345,12 @@ async def test_limits_are_those_of_the_program(system: hf.ActorSystem) -> None:
 async def said_at_its_end(system: hf.ActorSystem, **options: Any) -> str:
     """What a program hears when it is stopped."""
     script = """
-    import os, signal, sys, time
+    import os, signal, time
     def hear(number, frame):
-        print(signal.Signals(number).name, flush=True)
-        sys.exit()
+        os.write(1, signal.Signals(number).name.encode() + b'\\n')
+        os._exit(0)
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1): signal.signal(number, hear)
-    print('up', flush=True)
+    os.write(1, b'up\\n')
     time.sleep(99)
     """
     ref = await system.start(python(textwrap.dedent(script), ready="up", **options))
@@ -425,6 +425,24 @@ async def test_the_next_one_begins_when_the_last_one_of_a_killed_actor_is_gone(
             after = (await next_event(events, hf.ProcessStarted)).pid
         assert after != before.pid
         assert not [one for one in (before, *below) if one.is_running()]
+
+
+async def test_however_long_that_takes(system: hf.ActorSystem) -> None:
+    ref = await system.start(sh("exec sleep 99"))
+    before = (await info(system)).pid
+    keeper = keeper_of(before)
+    keeper.suspend()  # It ends nothing now.
+    with system.events() as events:
+        try:
+            ref.kill()
+            await next_event(events, hf.ActorStarted)
+            for _ in range(10):
+                await asyncio.sleep(0)
+            assert psutil.Process().children() == [keeper], "nothing else is started"
+        finally:
+            keeper.resume()
+        assert (await next_event(events, hf.ProcessDied)).pid == before
+        assert (await next_event(events, hf.ProcessStarted)).pid == (await info(system)).pid
 
 
 async def test_a_stop_while_it_starts_ends_it(system: hf.ActorSystem, ends: Ends) -> None:
