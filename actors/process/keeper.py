@@ -74,7 +74,6 @@ class Keeper:
             self._tell(FAILED + why)
             return
         self._tell(STARTED + b"%d" % self._pid)
-        self._let_go_of_input()
         poll = select.poll()
         # The end of the socket is not enough: what the owner forked without exec holds a copy of the other end.
         for fd in (self._control, owner_fd, self._wake_out):
@@ -102,6 +101,7 @@ class Keeper:
         self._pid = os.fork()
         if self._pid == 0:
             self._become(failed_in)
+        self._let_go_of_input()
         os.close(failed_in)
         with open(failed_out, "rb") as file:
             return file.read()  # Ends with the exec.
