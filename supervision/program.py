@@ -107,9 +107,9 @@ class Program(Actor):
         self._sign = None if order.ready is None else Sign(order.ready)
         kept = self._kept = self._keep(order.command, stdin=order.stdin)
         self._since = self._now()
+        kept.started.add_done_callback(self._started)
         kept.ended.add_done_callback(self._ended)
-        pid = await asyncio.shield(kept.started)
-        self.ctx.cell.node.emit(ProcessStarted(self.ctx.path, pid))
+        await asyncio.shield(kept.started)
         if self._sign is not None:
             await self._until_ready(kept, self._sign)
         self._is_up = True
@@ -179,6 +179,11 @@ class Program(Actor):
     def _last(self) -> list[str]:
         """What it said last."""
         return [*self._lines, *(text for text in self._parts.values() if text)][-LINES:]
+
+    def _started(self, started: asyncio.Future[int]) -> None:
+        """It runs. Told from here, for it may have ended before `on_start` goes on."""
+        if not started.cancelled() and started.exception() is None:
+            self.ctx.cell.node.emit(ProcessStarted(self.ctx.path, started.result()))
 
     def _ended(self, ended: asyncio.Future[ExitReason]) -> None:
         """Nothing of the program is left: our life ends for the reason it ended for."""

@@ -231,9 +231,9 @@ class Kept:
         code = os.waitstatus_to_exitcode(status)
         return Exited(code) if code else NORMAL
 
-    def hung(self, silent: float) -> None:
+    def hung(self, seconds: float) -> None:
         """Programs have no heartbeat."""
-        self.kill(Hung(silent))
+        self.kill(Hung(seconds))
 
 
 def keeper_command(control: int, order: int) -> list[str]:

@@ -495,13 +495,13 @@ if __name__ == "__main__":
 async def test_all_of_it_ends_with_a_root_that_is_killed(tmp_path: Path, ends: Ends, apart: bool) -> None:
     script = tmp_path / "root.py"
     script.write_text(ROOT_PROGRAM.format(family=FAMILY, apart=apart))
-    root = await asyncio.create_subprocess_exec(sys.executable, str(script), stdout=subprocess.PIPE)
-    assert root.stdout is not None
-    count = 4 if apart else 3  # its process, the two below it, and the supervisor's
-    pids = [int(await asyncio.wait_for(root.stdout.readline(), 30)) for _ in range(count)]
-    ends.add(*pids)
-    root.kill()
-    await root.wait()
+    with subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE) as root:
+        assert root.stdout is not None
+        count = 4 if apart else 3  # its process, the two below it, and the supervisor's
+        async with asyncio.timeout(30):
+            lines = [await asyncio.to_thread(root.stdout.readline) for _ in range(count)]
+        ends.add(*map(int, lines))
+        root.kill()
     await ends.all()
 
 
