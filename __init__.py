@@ -83,6 +83,7 @@ from holdfast.actors.links import Monitor
 from holdfast.actors.mail import ReplyHandle
 from holdfast.actors.mailbox import bounded
 from holdfast.actors.message import Message, Refusal
+from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
@@ -119,8 +120,11 @@ from holdfast.supervision.partition import (
     partition_of,
     partitions,
 )
+from holdfast.supervision.pool import PoolInfo, PoolStatus, PoolSupervisor, ResizePool, pool, pool_of
+from holdfast.supervision.program import InputRefused, Program, ProgramInfo, ProgramInput, ProgramStatus, program
 from holdfast.supervision.registrar import KeyFreed, KeyRegistered, NotAnActor, NotUnique, RegistryActor
 from holdfast.supervision.registry import AlreadyRegistered, Registry, RegistryEntry, registry
+from holdfast.supervision.routing import NoRoute
 from holdfast.supervision.rules import Rule, rule
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
@@ -173,6 +177,7 @@ __all__ = [
     "HoldfastError",
     "Hung",
     "Ignore",
+    "InputRefused",
     "Job",
     "KILLED",
     "KeyFreed",
@@ -194,6 +199,7 @@ __all__ = [
     "NameTaken",
     "NoPartitions",
     "NoProc",
+    "NoRoute",
     "NoSuchActor",
     "NoSuchChild",
     "Normal",
@@ -206,9 +212,17 @@ __all__ = [
     "OutOfMemory",
     "PartitionSupervisor",
     "Plan",
+    "PoolInfo",
+    "PoolStatus",
+    "PoolSupervisor",
     "ProcessDied",
     "ProcessStarted",
     "ProcessUnavailable",
+    "Program",
+    "ProgramFailed",
+    "ProgramInfo",
+    "ProgramInput",
+    "ProgramStatus",
     "Quarantined",
     "Recovered",
     "RecoveryFailed",
@@ -220,6 +234,7 @@ __all__ = [
     "ReplayDiverged",
     "ReplyHandle",
     "ResizePartitions",
+    "ResizePool",
     "RestartChild",
     "Route",
     "Rule",
@@ -261,6 +276,9 @@ __all__ = [
     "on",
     "partition_of",
     "partitions",
+    "pool",
+    "pool_of",
+    "program",
     "registry",
     "rule",
     "run",

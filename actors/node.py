@@ -47,6 +47,7 @@ class Node(RunLoop):
         self.topics = Topics()
         self.names: dict[str, Cell] = {}
         self.kept: weakref.WeakKeyDictionary[Cell, Any] = weakref.WeakKeyDictionary()  # what outlives an actor's lives
+        self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.dead_letters = 0
         self.late_replies = 0
         self.wall: Callable[[], float] = time.time

@@ -153,6 +153,8 @@ class ActorSystem(Controls):
 
     async def _close(self, root: Cell, node: Node) -> None:
         await lives.stop_and_wait(root)
+        if node.remains:
+            await asyncio.wait(set(node.remains))
         self._watch.close()
         await self._workers.close()
         await node.close()

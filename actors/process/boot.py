@@ -24,6 +24,7 @@ HEADER = struct.Struct("<BIi")  # kind, number, value; a text may follow
 PACKET_BYTES = 64 * 1024  # a packet is header and text; longer texts are cut
 PAGE_BYTES = 64 * 1024  # only what is touched takes memory
 SERVER_VARIABLE = "HOLDFAST_FORK_SERVER"  # pid of the fork server, set in it and seen by all its descendants
+OWNER_VARIABLE = "HOLDFAST_PROCESS"  # number of the actor process, set in it and seen by the programs it starts
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 

@@ -11,7 +11,7 @@ import sysconfig
 
 from ..errors import ProcessUnavailable
 from . import boot
-from .boot import SERVER_VARIABLE, Config
+from .boot import OWNER_VARIABLE, SERVER_VARIABLE, Config
 
 # Without these, messages of a megabyte cost a page fault per page each time: 4 to 5 times slower.
 _MALLOC = {
@@ -22,10 +22,19 @@ _MALLOC = {
 # Native thread pools: their threads would not survive the fork, and bit-identical replay needs one thread.
 _THREADS = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
 
+ADDED_VARIABLE = "HOLDFAST_ADDED"  # names of the variables above that the fork server was given
+
 
 def server_environment() -> dict[str, str]:
     """Our environment; what the user has set stays as it is."""
-    return {**_MALLOC, **_THREADS, **os.environ}
+    added = {name: value for name, value in {**_MALLOC, **_THREADS}.items() if name not in os.environ}
+    return {**added, **os.environ, ADDED_VARIABLE: " ".join(added)}
+
+
+def outside_environment() -> dict[str, str]:
+    """The environment as it is outside of holdfast's processes: for programs that have nothing to do with it."""
+    ours = {OWNER_VARIABLE, ADDED_VARIABLE, *os.environ.get(ADDED_VARIABLE, "").split()}
+    return {name: value for name, value in os.environ.items() if name not in ours}
 
 
 def check_can_start() -> None:

@@ -13,10 +13,16 @@ LAST_READS = 16
 
 
 class OutputReader:
-    """Reads a pipe and hands on each line."""
+    """Reads a pipe and hands on each line, and to `on_part`, if given, what is there of one that has no end yet."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, fd: int, on_line: Callable[[str], None]) -> None:
-        self._loop, self._fd, self._on_line = loop, fd, on_line
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        fd: int,
+        on_line: Callable[[str], None],
+        on_part: Callable[[str], None] | None = None,
+    ) -> None:
+        self._loop, self._fd, self._on_line, self._on_part = loop, fd, on_line, on_part
         self._rest = b""
         loop.add_reader(fd, self._read)
 
@@ -37,6 +43,8 @@ class OutputReader:
             self._rest = self._rest[end:]
         for line in lines:
             self._on_line(line.decode("utf-8", "replace"))
+        if self._on_part is not None:
+            self._on_part(self._rest.decode("utf-8", "replace"))
 
     def close(self) -> None:
         """Take what is still in the pipe, then let go of it; a second call changes nothing."""

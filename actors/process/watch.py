@@ -5,19 +5,30 @@ from __future__ import annotations
 import asyncio
 import signal
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
-from ..exits import OutOfMemory, Signal
+from ..exits import ExitReason, OutOfMemory, Signal
 from .limits import Limits
 
 if TYPE_CHECKING:
-    from .workers import Worker
+    from ..node import Node
+
+
+class Watched(Protocol):
+    """A process as the watch knows it."""
+
+    @property
+    def node(self) -> Node: ...
+    @property
+    def pid(self) -> int: ...
+    def kill(self, reason: ExitReason, /) -> None: ...
+    def hung(self, seconds: float, /) -> None: ...
 
 
 class Watch:
     """Ends a process that hangs or takes more than its limits allow."""
 
-    def __init__(self, worker: Worker, limits: Limits) -> None:
+    def __init__(self, worker: Watched, limits: Limits) -> None:
         import psutil  # only where something is watched
 
         self.limits = limits

@@ -26,11 +26,9 @@ import types
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, NoReturn
 
-from .boot import HEADER, PR_SET_CHILD_SUBREAPER, PR_SET_PDEATHSIG, Config, Kind, bind_prctl, receive
+from .boot import HEADER, OWNER_VARIABLE, PR_SET_CHILD_SUBREAPER, PR_SET_PDEATHSIG, Config, Kind, bind_prctl, receive
 from .children import ProcessTable, send_signal
 from .preload import attempt, find_entry, load, load_main
-
-OWNER_VARIABLE = "HOLDFAST_PROCESS"  # number of the actor process, set in it and seen by the programs it starts
 
 # A service manager or a terminal signals whole groups; when and how to end is for the parent to decide.
 _BLOCKED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
