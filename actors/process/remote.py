@@ -429,6 +429,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
     """What an actor process wants done to an address, or tells of its own."""
     cell = node.cell_at(worker.connection.name_in(frame.to))
     match frame.verb:
+        case "move":
+            worker.on_move(frame.data)
         case "subscribe":
             node.topics.subscribe(text(frame, "topic"), cell)
         case "unsubscribe":
