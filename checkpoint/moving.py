@@ -99,13 +99,11 @@ class RecordedToProcess(ToProcess):
         if isinstance(record, Live):
             if self.given_up.done() or self._up.done():
                 return  # Too late: the process is being ended.
-            self._switch_over(worker)
-        switch.from_life(record)
-        if isinstance(record, Live):  # What waited has been fed.
-            worker.connection.flush()
-            self.gone_on_at = now()
+            self._switch_over(switch, record, worker)
+        else:
+            switch.from_life(record)
 
-    def _switch_over(self, worker: Worker) -> None:
+    def _switch_over(self, switch: Switch, live: Live, worker: Worker) -> None:
         """From here on the new life is the one."""
         cell, host, old_host = self.cell, self.host, self._old
         assert self.transit is not None
@@ -122,9 +120,12 @@ class RecordedToProcess(ToProcess):
         host.clock = None
         if tap is not None:
             tap.attach()
+        self._up.set_result(None)
+        switch.from_life(live)  # What waits is fed.
+        worker.connection.flush()
+        self.gone_on_at = now()
         self.transit.over(cell, host)
         obey_commands(cell, commands)
-        self._up.set_result(None)
         farewell(old, StopRecorded(old_host.life, self.reason()))
         self.moved()
 

@@ -74,11 +74,18 @@ class Moves:
             if origin == isolation:
                 return
             spec = _spec_there(cell, isolation, limits)
-            if not cell.host.is_up(cell):
-                await order(cell, Ready(), timeout)  # It is being restarted: its next life is moved.
-            move = self._made(cell, spec, timeout)
-            move.moved = lambda: replace_place(cell, spec)
-            await move.run()
+            end = self._node.loop.time() + timeout
+            while True:
+                if not cell.host.is_up(cell):
+                    await order(cell, Ready(), timeout)  # It is being restarted: its next life is moved.
+                move = self._made(cell, spec, timeout)
+                move.moved = lambda: replace_place(cell, spec)
+                try:
+                    await move.run()
+                    break
+                except CannotMove:
+                    if not move.is_late or cell.is_dead or self._node.loop.time() > end:
+                        raise
             if self._node.watched:
                 self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
 

@@ -14,7 +14,7 @@ from ..cell import RUNNING, Cell, Host
 from ..codec import Parcel
 from ..context import Piped
 from ..errors import HoldfastError, error_text
-from ..lives import LOCAL, Kill, Stop
+from ..lives import LOCAL, Kill
 from ..mail import LEAVE, Ask, Envelope, Item
 from ..process.relay import RelayedAsk
 from ..timers import Tick
@@ -46,9 +46,9 @@ class Take(Item):
     def run(actor: Any, item: Any) -> object:
         take: Take = item
         ctx = actor.ctx
-        if take.is_void or ctx.postpones(take):
-            return None
         cell: Cell = ctx.cell
+        if take.is_void or ctx.postpones(take) or any(map(_ends, cell.extra().urgent or ())):
+            return None
         take.why = _busy(cell)
         if take.why:
             cell.node.loop.call_later(LOOK_AGAIN, take._again, cell, cell.life)
@@ -69,6 +69,11 @@ class Take(Item):
     def _again(self, cell: Cell, life: int) -> None:
         if not self.is_void and cell.state is RUNNING and cell.life == life:
             lives.urge(cell, self)
+
+
+def _ends(command: Item) -> bool:
+    """Whether a command is one to stop or to be killed."""
+    return isinstance(command, Kill) or hasattr(command, "reason")
 
 
 def _busy(cell: Cell) -> str:
@@ -262,8 +267,8 @@ def obey_commands(cell: Cell, commands: list[Item]) -> None:
             cell.host.control(cell, command)
         elif isinstance(command, Kill):
             cell.host.kill(cell)
-        elif isinstance(command, Stop) or hasattr(command, "reason"):
-            cell.host.stop(cell, command.reason)  # type: ignore[attr-defined]  # both kinds of stop have one
+        elif _ends(command):
+            cell.host.stop(cell, command.reason)  # type: ignore[attr-defined]  # each kind of stop has one
 
 
 def decoded(cell: Cell, item: Any) -> Any:

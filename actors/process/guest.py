@@ -28,6 +28,9 @@ from .moves import GuestMoves
 from .recipe import unpack_recipe
 from .relay import Arrived, OutsideHost, Peer, RelayedAsk, named, obey, text
 
+ENDED_WITHIN = 1.0
+"""Seconds that an ended process waits for the root to read why it has ended."""
+
 _BODIES = msgspec.msgpack.Decoder(list[frames.Raw])
 
 Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
@@ -333,8 +336,12 @@ class Guest(Peer):
         """The process's own actor has ended: tell why, and end with it."""
         self._on_up()
         told = pack_exit(reason if reason is not None else exits.SHUTDOWN)
+        sys.stdout.flush()
+        sys.stderr.flush()
         self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
-        self.connection.close()
+        self.connection.flush()
+        # The root ends us when it has read this. If we closed, and it wrote to us just then, it would read no more.
+        self.node.loop.call_later(ENDED_WITHIN, self.connection.close)
 
     def on_lost(self, error: Exception | None) -> None:
         """The root is gone, or we have closed: nothing is left to live for."""

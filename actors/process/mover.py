@@ -30,7 +30,7 @@ from ..control.moving import (
     twin,
 )
 from ..errors import AskFailed, BadMessage, CannotMove, StartFailed, error_text
-from ..exits import ExitReason, Shutdown
+from ..exits import KILLED, ExitReason, Shutdown
 from ..links import Monitor
 from ..lives import PATIENCE, Stop
 from ..mail import Ask
@@ -60,6 +60,7 @@ class Move:
         self.transit: Transit | None = None
         self.rest_at = self.gone_on_at = 0.0
         self.is_done = False
+        self.is_late = False  # its life has ended before it was at rest
         self.moved: Callable[[], None] = lambda: None  # called at once when the new life is the one
         self._start = cell.extra().start
 
@@ -70,7 +71,7 @@ class Move:
             CannotMove, StartFailed, ProcessUnavailable: why it stays; it goes on as if nothing had been.
         """
         ended = self.cell.ended()
-        ended.add_done_callback(lambda _: self.give_up("its life has ended"))
+        ended.add_done_callback(self._life_ended)
         try:
             await self.prepare()
             await self.take()
@@ -85,6 +86,10 @@ class Move:
             enders = self.cell.extra().enders
             if ended in enders:
                 enders.remove(ended)
+
+    def _life_ended(self, ended: asyncio.Future[ExitReason]) -> None:
+        self.is_late = True
+        self.give_up("its life has ended")
 
     async def prepare(self) -> None:
         """Make the new place ready."""
@@ -355,6 +360,8 @@ class FromProcess(Move):
     def old_died(self, cell: Cell, reason: ExitReason) -> None:
         """The old process ends while its actor is being carried over: that matters only if it was to stay."""
         self.dead = reason
+        if reason == KILLED:
+            self.give_up("it is killed")
         if not self.taken.done():
             self.give_up(f"its process has died ({reason})")
 
@@ -370,6 +377,9 @@ class FromProcess(Move):
             if not call.ask.is_done:
                 call.ask.started = False
                 cell.host.control(cell, call)
+        old = self.transit.old if self.transit is not None else None
+        if isinstance(old, ProcessHost) and old.stop_sent is not None:  # It came when the actor was at rest already.
+            cell.host.stop(cell, old.stop_sent)
 
 
 class ToTask(FromProcess):

@@ -83,7 +83,7 @@ class GuestMoves:
             case "luggage":
                 self._luggage = self._incoming.take(data)
             case "stash":
-                self._admit, cell.admit = cell.admit, lambda cell, item: self._stash.append(item)
+                self._admit, cell.admit = cell.admit, self._put_aside
             case "go":
                 self._go(cell, suspended=bool(data["suspended"]))
             case "take":
@@ -98,6 +98,11 @@ class GuestMoves:
                 self._leave(cell, data)
             case step:
                 raise BadFrame(f"a move has no step {step!r}")
+
+    def _put_aside(self, cell: Cell, item: Any) -> None:
+        if isinstance(item, Item):
+            item.stashed()  # It has no place in the order of arrival.
+        self._stash.append(item)
 
     # -- arriving ---------------------------------------------------------------------------------------------------
 
