@@ -103,7 +103,6 @@ class LocalHome:
             self.shut()
             self._host.over(self._cell, -1, ENDED, ordered=True)
 
-
     def shut(self) -> None:
         """What the life says from now on is not heard, nor its end: it has been moved away."""
         self._is_open = False

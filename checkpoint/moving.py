@@ -13,7 +13,18 @@ from typing import TYPE_CHECKING, Any
 
 from ..actors import lives, mailbox
 from ..actors.cell import Cell
-from ..actors.control.moving import Settle, Transit, farewell, now, obey_commands, part, resume, settle, sorted_out, twin
+from ..actors.control.moving import (
+    Settle,
+    Transit,
+    farewell,
+    now,
+    obey_commands,
+    part,
+    resume,
+    settle,
+    sorted_out,
+    twin,
+)
 from ..actors.errors import StartFailed
 from ..actors.process.limits import Limits
 from ..actors.process.mover import FromProcess, ToProcess, dispose
@@ -246,7 +257,9 @@ class ArrivingHome(LocalHome):
     def fail(self, error: BaseException | None) -> None:
         """It will never be."""
         if error is not None and not self._settled.done():
-            self._settled.set_exception(error if isinstance(error, StartFailed) else StartFailed(self._cell.path, str(error)))
+            self._settled.set_exception(
+                error if isinstance(error, StartFailed) else StartFailed(self._cell.path, str(error))
+            )
             self._settled.exception()
 
     def closed(self) -> None:

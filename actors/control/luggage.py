@@ -138,7 +138,9 @@ def pack_rest(actor: Actor) -> dict[str, Any]:
     }
 
 
-def unpack(actor: Actor, state: bytes, rest: dict[str, Any], owed: Owed, watched: Callable[[str, bool], Monitor]) -> None:
+def unpack(
+    actor: Actor, state: bytes, rest: dict[str, Any], owed: Owed, watched: Callable[[str, bool], Monitor]
+) -> None:
     """Give a new life what the old one has packed; `owed` and `watched` find what its handles stand for.
 
     Raises:

@@ -164,7 +164,9 @@ class ToProcess(Move):
         self.workers.want(start.kind.__module__)
         self.recipe = pack_recipe(start, self.cell.path)
         worker = self.worker = await self.workers.take()
-        worker.reserve(self.cell, self.limits, lambda cell, reason: self.give_up(f"the new process has died ({reason})"))
+        worker.reserve(
+            self.cell, self.limits, lambda cell, reason: self.give_up(f"the new process has died ({reason})")
+        )
         worker.on_move = self._said
         await self.within(worker.prepare(self.cell, self.recipe), 60.0, lambda: "the new process was not ready")
 
@@ -327,7 +329,9 @@ class FromProcess(Move):
     async def take(self) -> None:
         self.worker.on_move = self._said
         self.say("take")
-        await self.within(self.taken, self.timeout, lambda: "it did not come to rest: a turn or background work goes on")
+        await self.within(
+            self.taken, self.timeout, lambda: "it did not come to rest: a turn or background work goes on"
+        )
 
     def say(self, step: str) -> None:
         """Tell the old process."""

@@ -266,9 +266,7 @@ async def test_an_ask_whose_handle_would_be_lost_keeps_the_actor_where_it_is(sys
     assert lives_in(system, one) == OTHER[here]
 
 
-async def test_background_work_is_waited_for(
-    system: hf.ActorSystem, recovery: Any, here: str, tmp_path: Path
-) -> None:
+async def test_background_work_is_waited_for(system: hf.ActorSystem, recovery: Any, here: str, tmp_path: Path) -> None:
     gate = tmp_path / "gate"
     one = await system.start(hf.child("one", hf.start(Worker), recovery=recovery, isolation=here))
     one.tell(Work(str(gate)))
