@@ -1,7 +1,7 @@
-"""How long does a live actor stand still when it is moved between a task and a process, and is anything lost on the way?
+"""How long does a live actor stand still when it is moved between a task and a process, and is anything lost?
 
-Several senders tell and ask without a break, each numbering its messages, while the actor is moved to and fro; in the end
-it says what it has got from whom.
+Several senders tell and ask without a break, each numbering its messages, while the actor is moved to and fro; in the
+end it says what it has got from whom.
 Baseline: none; the figures are absolute.
 Command: python benchmarks/bench_move.py [--quick]
 """

@@ -1,15 +1,15 @@
 """Moves of recorded actors: the home stays where it is, with all inputs; only the life goes elsewhere.
 
 The old life takes a last snapshot and comes to rest; its home feeds it nothing more. The new life restores, and at the
-instant at which it is live (nothing new has been fed to it yet) it is the one. If it does not come so far, the home goes on
-with the old one, and feeds it what has come since.
+instant at which it is live (nothing new has been fed to it yet) it is the one. If it does not come so far, the home
+goes on with the old one, and feeds it what has come since.
 """
 
 from __future__ import annotations
 
 import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..actors import lives, mailbox
 from ..actors.cell import Cell
@@ -20,14 +20,14 @@ from ..actors.control.moving import (
     now,
     obey_commands,
     part,
-    resume,
     settle,
     sorted_out,
     twin,
 )
 from ..actors.errors import StartFailed
 from ..actors.process.limits import Limits
-from ..actors.process.mover import FromProcess, ToProcess, dispose
+from ..actors.process.to_process import ToProcess
+from ..actors.process.to_task import FromProcess, dispose
 from ..actors.process.workers import Worker, Workers
 from .controller import FROM_LIFE, LocalHome, LocalLife, RecordedProcessHost, RemoteLife, TaskHost
 from .life import Life

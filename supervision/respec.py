@@ -1,4 +1,4 @@
-"""A child's start recipe or place, replaced at run time: no restart, not even of its supervisors, brings the old one back."""
+"""A child's recipe or place, replaced at run time: no restart, not even of its supervisors, brings the old one back."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from ..actors.actor import Start
 from ..actors.cell import Cell
 from .spec import ChildSpec
 from .supervisor import Supervisor
-
 
 Change = Callable[[ChildSpec], ChildSpec]
 
@@ -55,7 +54,7 @@ def _tell_parent(cell: Cell) -> None:
 
 
 def rebuilt(start: Start[Any], names: list[str], change: Change) -> Start[Any]:
-    """The recipe of a supervisor with another spec for the descendant at `names`; unchanged if that one is not in it."""
+    """The recipe of a supervisor with another spec for the descendant at `names`; unchanged if it has none there."""
     if not issubclass(start.kind, Supervisor) or len(start.args) != 2 or not isinstance(start.args[1], tuple):
         return start
     flags, specs = start.args

@@ -1,4 +1,4 @@
-"""Moving live actors between a task and an OS process of their own: which moves there are, one at a time for each actor."""
+"""Moving live actors between tasks and OS processes: which moves there are, one at a time for each actor."""
 
 from __future__ import annotations
 
@@ -15,8 +15,10 @@ from ..actors.events import Moved
 from ..actors.lives import LOCAL
 from ..actors.node import cell_kind
 from ..actors.process.limits import Limits
-from ..actors.process.mover import Move, ToProcess, ToTask
+from ..actors.process.mover import Move
 from ..actors.process.remote import ProcessHost
+from ..actors.process.to_process import ToProcess
+from ..actors.process.to_task import ToTask
 from ..actors.process.workers import Workers
 from ..actors.ref import current
 from ..checkpoint.controller import RecordedProcessHost, TaskHost

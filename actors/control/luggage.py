@@ -1,7 +1,7 @@
-"""What an actor takes along when it is moved between a task and an OS process: packed in one place, unpacked in the other.
+"""What an actor takes along when it is moved between a task and an OS process: packed here, unpacked there.
 
-Handles that only mean something at one place (timers, rights to reply, refs, watches) may be in the state: they are packed
-by what they stand for, and the actor finds handles of the same meaning in their place.
+Handles that only mean something at one place (timers, rights to reply, refs, watches) may be in the state: they are
+packed by what they stand for, and the actor finds handles of the same meaning in their place.
 """
 
 from __future__ import annotations
@@ -101,13 +101,13 @@ class StatePacker:
         if isinstance(value, Timer):
             return Held("timer", self._timers.index(value) if value in self._timers else -1)
         if type(value) is ReplyHandle:
-            ask = cast("ReplyHandle[Any]", value).ask
+            ask = value.ask
             if ask is None or ask.is_done:
                 return Held("reply", -1)
             self._owed.add(id(ask))
             return Held("reply", self._owe(ask))
         if isinstance(value, ActorRef):
-            return Held("ref", cast("ActorRef[Any]", value).path)
+            return Held("ref", value.path)
         if isinstance(value, Monitor):
             return Held("watch", [value.target.path, value.for_good])
         return value
@@ -126,9 +126,8 @@ def pack_rest(actor: Actor) -> dict[str, Any]:
         message, left, interval, queued = timer.packed()
         timers.append([message_name(type(message)), codec.encode(message, cell.path), left, interval, queued])
     watches = [[watch.target.path, watch.for_good] for watch in more.watching if watch.life == cell.life]
-    for item in cell.queue or ():
-        if type(item) is Down and item.watch.active and item.watch not in more.watching:
-            watches.append([item.watch.target.path, item.watch.for_good])
+    downs = [item.watch for item in cell.queue or () if type(item) is Down and item.watch.active]
+    watches += [[watch.target.path, watch.for_good] for watch in downs if watch not in more.watching]
     return {
         "timers": timers,
         "trap_exits": more.trap_exits,

@@ -1,4 +1,4 @@
-"""Moving a life: how the old one is brought to rest between two turns, and the new one is held until it is the only one.
+"""Moving a life: how the old one is brought to rest between two turns, and the new one held until it is the one.
 
 What both sides of a process border need is here; who decides is `system/moving.py`.
 """
@@ -168,7 +168,7 @@ class Transit:
 
 
 def twin(cell: Cell) -> Cell:
-    """Another cell at the same address, that nobody finds: for a life that is not the one there yet, or not any more."""
+    """Another cell at the same address, found by nobody: for a life that is not the one there yet, or any more."""
     other = Cell(cell.node, cell.parent, cell.name, LOCAL)
     other.table, other.life, other.state = cell.table, cell.life, RUNNING
     return other

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import functools
 import os
 import signal
@@ -24,6 +23,7 @@ from .connection import Connection
 from .forked import Forked, has_ended
 from .forkserver import ForkServer
 from .inner import Inner
+from .launch import keep_large_memory
 from .limits import Limits
 from .output import OutputReader
 from .relay import Peer
@@ -36,7 +36,6 @@ REAPED_WITHIN = 2.0
 """Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
 ORDER_TIMEOUT = 60.0
 """Seconds until it does not matter any more whether a new process counts for whoever wanted to know."""
-M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # as in malloc.h
 
 
 class Worker(Peer):
@@ -144,6 +143,11 @@ class Worker(Peer):
         self.cell = self._died = None
         self.take_pending()  # Whoever was to be answered from here still is, where the actor lives.
         self.gone()
+
+    @property
+    def is_killed(self) -> bool:
+        """Whether we have killed it; it may not have died yet."""
+        return self._killed_for is not None
 
     def on_death(self, died: Callable[[Cell, ExitReason], None]) -> None:
         """Who hears of its end from now on."""
@@ -346,22 +350,6 @@ def _limit_options(limits: Limits | None) -> dict[str, Any]:
         "niceness": limits.niceness,
         "beat": None if limits.hung_after is None else limits.hung_after / 4,
     }
-
-
-def keep_large_memory() -> None:
-    """Have malloc keep the memory of large messages instead of handing it back and faulting it in again each time.
-
-    The same settings as actor processes get through their environment; whoever set those variables has chosen already.
-    A message of 1 MiB otherwise costs four times as much.
-    """
-    if any(name.startswith("MALLOC_") for name in os.environ):
-        return
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):
-        return  # Not glibc.
-    for parameter, value in ((M_MMAP_THRESHOLD, 64 << 20), (M_TRIM_THRESHOLD, 128 << 20), (M_TOP_PAD, 16 << 20)):
-        mallopt(parameter, value)
 
 
 class Workers:

@@ -57,7 +57,7 @@ class Slow(Ledger):
     """Awaits something in each turn."""
 
     @hf.on(Note)
-    async def note(self, message: Note) -> None:
+    async def note(self, message: Note) -> None:  # type: ignore[override]  # as a handler it is one
         await asyncio.sleep(0)
         self.seen.setdefault(message.sender, []).append(message.n)
 

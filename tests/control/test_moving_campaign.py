@@ -12,12 +12,14 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process import mover
+from holdfast.actors.process.mover import Move
+from holdfast.actors.process.to_process import ToProcess
+from holdfast.actors.process.to_task import FromProcess, ToTask
 from holdfast.actors.process.workers import Worker
 from holdfast.checkpoint.moving import RecordedToProcess, RecordedToTask
 from tests.control.movers import Count, Ledger, Note, Seen, Slow
 
-OTHER = {"task": "process", "process": "task"}
+OTHER: dict[str, Any] = {"task": "process", "process": "task"}
 KINDS = {"plain": None, "recorded": hf.hybrid(interval=0.05)}
 
 
@@ -67,7 +69,7 @@ async def test_moves_under_load_lose_nothing(system: hf.ActorSystem, name: str, 
 @pytest.mark.parametrize("step", ["prepare", "take", "carry", "run"])
 @pytest.mark.parametrize("name", list(KINDS))
 async def test_a_process_killed_at_any_step_of_a_move_costs_nothing(
-    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, here: str, step: str, name: str
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, here: Any, step: str, name: str
 ) -> None:
     """The old or the new one, at a seeded instant of each step: the actor lives in one place.
 
@@ -77,13 +79,13 @@ async def test_a_process_killed_at_any_step_of_a_move_costs_nothing(
     seed = random.randrange(2**32)
     print("seed", seed)
     chance = random.Random(seed)
-    one = await system.start(hf.child("one", hf.start(Ledger), recovery=KINDS[name], isolation=here))  # type: ignore[arg-type]
+    one = await system.start(hf.child("one", hf.start(Ledger), recovery=KINDS[name], isolation=here))
     load = Load(one, chance, is_recorded=name == "recorded")
     for _ in range(4):
         place = "task" if system.pid_of(one) == os.getpid() else "process"
         struck = strike_at(monkeypatch, step, chance.choice((0, 1, 2, 3, 5, 8, 13)))
         try:
-            await system.set_isolation(one, OTHER[place], timeout=10.0)  # type: ignore[arg-type]
+            await system.set_isolation(one, OTHER[place], timeout=10.0)
         except (hf.CannotMove, hf.AskFailed) as error:
             print("not moved:", error)
         monkeypatch.undo()
@@ -118,7 +120,7 @@ def strike_at(monkeypatch: pytest.MonkeyPatch, step: str, ticks: int) -> list[as
 
         return struck
 
-    for kind in (mover.Move, mover.ToProcess, mover.FromProcess, mover.ToTask, RecordedToProcess, RecordedToTask):
+    for kind in (Move, ToProcess, FromProcess, ToTask, RecordedToProcess, RecordedToTask):
         if step in vars(kind):
             monkeypatch.setattr(kind, step, watched(vars(kind)[step]))
     return strikes
