@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from .. import lives, mailbox
-from ..cell import RUNNING, Cell, Host
+from ..cell import GONE, RUNNING, Cell, Host
 from ..codec import Parcel
 from ..context import Piped
 from ..errors import HoldfastError, error_text
@@ -209,7 +209,7 @@ def settle(twin: Cell, cell: Cell) -> None:
 def _forward(twin: Cell) -> None:
     """Whoever has a ref to the twin reaches the actor all the same."""
     twin.actor = twin.ctx = twin.context = twin.children = twin.queue = twin.more = None
-    twin.state, twin.admit = "gone", mailbox.admit_gone
+    twin.state, twin.admit = GONE, mailbox.admit_gone
 
 
 def part(cell: Cell) -> Cell:

@@ -296,3 +296,15 @@ class Picky(hf.Actor):
 
     def set_state(self, state: list[int]) -> None:
         self._values = list(state)
+
+
+class Large(hf.Actor):
+    """Its state grows by as many bytes as it is told."""
+
+    def __init__(self) -> None:
+        self.data = b""
+
+    @hf.on(Put)
+    def put(self, message: Put) -> int:
+        self.data += bytes(message.n)
+        return len(self.data)

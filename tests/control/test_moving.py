@@ -20,6 +20,7 @@ from tests.control.movers import (
     End,
     Friend,
     Fussy,
+    Large,
     Later,
     Ledger,
     Open,
@@ -310,8 +311,9 @@ async def test_links_watches_topics_bindings_and_names_stay(system: hf.ActorSyst
     linked.kill()
     watched.kill()
     async with asyncio.timeout(8.0):
-        while len(told := await one.ask(Downs())) < 4:
-            await asyncio.sleep(0.01)
+        told: list[str] = []
+        while len(told) < 4:
+            told = await one.ask(Downs())
     assert sorted(told) == ["down /app/watched", "exit /app/linked", "friend /app/watched", "heard 1"]
 
 
@@ -320,6 +322,15 @@ async def test_state_hooks_are_used(system: hf.ActorSystem, recovery: Any, here:
     assert await one.ask(Put(2)) == 3
     await system.set_isolation(one, OTHER[here])
     assert await one.ask(Put(3)) == 6
+
+
+async def test_a_state_larger_than_a_frame_goes_along(system: hf.ActorSystem, recovery: Any, here: Any) -> None:
+    one = await system.start(hf.child("one", hf.start(Large), recovery=recovery, isolation=here))
+    assert await one.ask(Put(20_000_000)) == 20_000_000
+    await system.set_isolation(one, OTHER[here], timeout=20.0)
+    assert await one.ask(Put(1)) == 20_000_001
+    await system.set_isolation(one, here, timeout=20.0)
+    assert await one.ask(Put(1)) == 20_000_002
 
 
 # -- what is refused -------------------------------------------------------------------------------------------------
