@@ -308,3 +308,13 @@ class Large(hf.Actor):
     def put(self, message: Put) -> int:
         self.data += bytes(message.n)
         return len(self.data)
+
+
+class Leaves(Account):
+    """Stops itself at the end of a turn that waits."""
+
+    @hf.on(Work)
+    async def work(self, message: Work) -> None:
+        Path(f"{message.path}.begun").touch()
+        await until(message.path)
+        self.ctx.stop()

@@ -22,6 +22,7 @@ from tests.control.movers import (
     Fussy,
     Large,
     Later,
+    Leaves,
     Ledger,
     Open,
     Picky,
@@ -469,6 +470,23 @@ async def test_stop_and_kill_reach_an_actor_on_its_way(system: hf.ActorSystem, r
             await asyncio.wait((moving,), timeout=8.0)
             assert moving.done()
             moving.exception()
+
+
+async def test_an_actor_that_stops_itself_in_the_turn_that_is_waited_for_stops(
+    system: hf.ActorSystem, recovery: Any, here: Any, tmp_path: Path
+) -> None:
+    gate = tmp_path / "gate"
+    one = await system.start(hf.child("one", hf.start(Leaves), recovery=recovery, isolation=here, restart="temporary"))
+    one.tell(Work(str(gate)))
+    await until_there(tmp_path / "gate.begun")
+    gone = one._cell.ended()
+    moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here]))
+    await asyncio.wait((moving,), timeout=0.3)  # The order has reached it, and waits for the end of the turn.
+    gate.touch()
+    async with asyncio.timeout(8.0):
+        assert await gone == hf.NORMAL
+    with pytest.raises(hf.CannotMove, match="its life has ended"):
+        await moving
 
 
 async def test_control_reaches_an_actor_on_its_way(system: hf.ActorSystem, recovery: Any, here: Any) -> None:
