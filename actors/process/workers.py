@@ -177,11 +177,8 @@ class Worker(Peer):
         data = {"step": "leave", "reason": pack_exit(reason)}
         connection.send(frames.Command(connection.name_out(cell.path), "move", data))
         connection.flush()
-        self.node.loop.call_later(seconds, self._kill_left)
-
-    def _kill_left(self) -> None:
-        if not self._buried:
-            self.kill(KILLED)
+        late = self.node.loop.call_later(seconds, self.kill, KILLED)
+        self._grave.add_done_callback(lambda _: late.cancel())
 
     def kill(self, why: ExitReason) -> None:
         """SIGKILL, by pidfd; its end is then called `why`."""
