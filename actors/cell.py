@@ -115,6 +115,7 @@ class More:
         "trap_exits",
         "turn",
         "urgent",
+        "watching",
     )
 
     def __init__(self) -> None:
@@ -140,6 +141,7 @@ class More:
         self.trap_exits = False
         self.turn: Suspended | None = None
         self.urgent: deque[Item] | None = None
+        self.watching: dict[Any, None] = {}  # whom we watch (links.Monitor)
 
 
 class _Hot:

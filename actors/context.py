@@ -21,7 +21,6 @@ from .topics import NOT_TAKEN
 if TYPE_CHECKING:
     from .actor import Actor, Start
     from .cell import Cell
-    from .control.calls import Call
     from .ref import ActorRef
 
 A = TypeVar("A", bound="Actor")
@@ -36,7 +35,7 @@ class StashError(HoldfastError):
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
-    __slots__ = ("_asking", "_random", "_turn", "cell", "closed")
+    __slots__ = ("_asking", "_promised", "_random", "_turn", "cell", "closed")
 
     may_fail_fast: ClassVar[bool] = True
     """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
@@ -47,6 +46,7 @@ class ActorContext:
         self._asking: Any = None
         self._turn = 0
         self._random: random.Random | None = None
+        self._promised: list[Ask] | None = None  # asks that may be answered later
 
     # -- who, when --------------------------------------------------------------------------------------------------
 
@@ -172,7 +172,21 @@ class ActorContext:
     def reply_handle(self) -> ReplyHandle[Any]:
         """The right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
         item = self.item
-        return ReplyHandle(item if isinstance(item, Ask) else None)
+        return self.promise(item) if isinstance(item, Ask) else ReplyHandle(None)
+
+    def promise(self, ask: Ask) -> ReplyHandle[Any]:
+        """A reply handle for an ask, which is remembered while it waits."""
+        promised = self._promised
+        if promised is None:
+            promised = self._promised = []
+        elif len(promised) >= 64 and len(promised) & (len(promised) - 1) == 0:  # At each power of two.
+            promised[:] = [one for one in promised if not one.is_done]
+        promised.append(ask)
+        return ReplyHandle(ask)
+
+    def promised(self) -> tuple[Ask, ...]:
+        """The asks for which there are reply handles; those that are over may be among them."""
+        return tuple(self._promised or ())
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
         """Publish from this actor; waits for room at bounded subscribers."""
@@ -332,7 +346,18 @@ class ActorContext:
 
     # -- control (called between two turns, by what carries orders out) --------------------------------------------
 
-    def postpones(self, call: Call) -> bool:
+    def depart(self, owe: Callable[[Ask], int]) -> bytes:
+        """Pack the state of an actor that is to be moved; a journaled one takes its last snapshot here instead.
+
+        Raises whatever keeps it from being packed.
+        """
+        from .control.luggage import StatePacker
+
+        actor = self.cell.actor
+        assert actor is not None
+        return StatePacker(actor, owe).pack()
+
+    def postpones(self, call: Item) -> bool:
         """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""
         return False
 

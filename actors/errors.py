@@ -18,6 +18,7 @@ HoldfastError
 ├── Ignore               raised by an actor that does not want to be started
 ├── ControlFailed        an order to a live actor could not be carried out; the actor is as before
 │   └── NotSuspended     the order is for suspended actors only
+├── CannotMove           an actor cannot be moved to another task or process; it goes on where it lives
 ├── NameTaken            a living actor has this name already
 ├── NoSuchActor          nobody lives at this address
 ├── WrongActor           another class lives at this address
@@ -242,6 +243,17 @@ class NotSuspended(ControlFailed):
     def __init__(self, actor: str, order: str) -> None:
         super().__init__(actor, order, "the actor must be suspended first")
         self.args = (actor, order)
+
+
+class CannotMove(HoldfastError):
+    """An actor was not moved to where it was to live; it goes on where it was, as it was."""
+
+    def __init__(self, actor: str, why: str) -> None:
+        super().__init__(actor, why)
+        self.actor, self.why = actor, why
+
+    def __str__(self) -> str:
+        return f"{self.actor} cannot be moved: {self.why}"
 
 
 class NameTaken(HoldfastError):

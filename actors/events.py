@@ -194,6 +194,17 @@ class MessageOut(Event, frozen=True, eq=False):
     message: Any
 
 
+class Moved(Event, frozen=True, eq=False):
+    """An actor lives elsewhere now: "task" is this process, "process" one of its own.
+
+    `pause_seconds` passed between its last turn there and when it could have its first one here.
+    """
+
+    origin: str
+    to: str
+    pause_seconds: float
+
+
 TRACED = (MessageIn, TurnBegan, TurnEnded, MessageOut)
 """What is told to those who trace the actor, and to nobody else."""
 

@@ -29,9 +29,15 @@ class Monitor:
         """No DOWN arrives after this, not even one that is queued already."""
         self.active = False
         target = self.target
+        self.forget()
         if target.more is not None and self in target.more.monitors:
             target.more.monitors.remove(self)
             target.host.told(target, "demonitor", {"watcher": self.watcher.path, "for_good": self.for_good})
+
+    def forget(self) -> None:
+        """It is over: its DOWN has been told, or is not wanted."""
+        if self.watcher.more is not None:
+            self.watcher.more.watching.pop(self, None)
 
 
 def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
@@ -41,6 +47,7 @@ def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
         watcher.push(Down(watch, NOPROC, recovering=False))
     else:
         target.extra().monitors.append(watch)
+        watcher.extra().watching[watch] = None
         target.host.told(target, "monitor", {"watcher": watcher.path, "for_good": for_good})
     return watch
 
@@ -103,6 +110,8 @@ def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
                 watch.watcher.push(Down(watch, reason, recovering))
                 if recovering:
                     stay.append(watch)
+                else:
+                    watch.forget()
         more.monitors = stay
 
 
@@ -114,6 +123,7 @@ def gone(cell: Cell, reason: ExitReason) -> None:
     watchers = [watch for watch in more.monitors if watch.for_good]
     more.monitors = [watch for watch in more.monitors if not watch.for_good]
     for watch in watchers:
+        watch.forget()
         watch.watcher.push(Down(watch, reason, recovering=False))
 
 
@@ -125,6 +135,8 @@ def down_arrived(watcher: Cell, target: Cell, reason: ExitReason, *, recovering:
             monitors.remove(watch)
             if recovering:
                 monitors.append(watch)  # Behind those like it: each gets its own DOWN.
+            else:
+                watch.forget()
             watcher.push(Down(watch, reason, recovering))
             return
 

@@ -409,6 +409,7 @@ def _undo(cell: Cell) -> None:
     for name in more.names:
         cell.node.names.pop(name, None)
     more.names.clear()
+    more.watching.clear()
     more.suspended = False
     queue = cell.queue
     if queue:

@@ -208,6 +208,11 @@ class ReplyHandle(Generic[R]):
     def __init__(self, ask: Ask | None) -> None:
         self._ask = ask
 
+    @property
+    def ask(self) -> Ask | None:
+        """What is to be answered; None if nobody waits."""
+        return self._ask
+
     def reply(self, value: R) -> None:
         """Answer; a second answer and one after the deadline are dropped."""
         if self._ask is not None:

@@ -124,6 +124,11 @@ class Bound:
                 self._lose_queued(cell, keep=0)
                 self.put(cell, item)
 
+    def inherit(self, old: Bound) -> Bound:
+        """Take over who waits at the bound that stood here before."""
+        self.count, self.waiting, self.senders = old.count, old.waiting, old.senders
+        return self
+
     def put(self, cell: Cell, item: Any) -> None:
         """Append, counted."""
         self.count += 1

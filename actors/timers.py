@@ -45,6 +45,45 @@ class Timer:
         if self._cell.more is not None:
             self._cell.more.timers.discard(self)
 
+    def pause(self) -> None:
+        """Its actor is being moved: nothing comes until `resume`."""
+        if self._handle is not None:
+            self._handle.cancel()  # Kept: what has a handle is armed again.
+
+    def resume(self) -> None:
+        """The actor stays after all."""
+        if self._handle is not None:
+            self._arm()
+
+    def packed(self) -> tuple[Message[Any], float | None, float | None, bool]:
+        """Message, seconds left (None: it has fallen due), interval, and whether a tick of it is queued."""
+        left = None if self._handle is None else max(0.0, self._due - self._cell.node.loop.time())
+        return self.message, left, self._interval, self._queued
+
+    @classmethod
+    def unpacked(
+        cls, cell: Cell, message: Message[Any], left: float | None, interval: float | None, queued: bool
+    ) -> Timer:
+        """The timer of an actor that has been moved here."""
+        timer = cls(cell, message, left or 0.0, interval)
+        timer.pause()
+        if left is None:
+            timer._handle = None
+        else:
+            timer._arm()
+        if queued:
+            timer._queued = True
+            cell.push(Tick(timer))
+        return timer
+
+    def ended(self, cell: Cell) -> None:
+        """Be a timer whose message has come, or never will."""
+        self._cell, self._handle, self._queued, self._interval, self._due = cell, None, False, None, 0.0
+
+    def belongs_to(self, cell: Cell) -> None:
+        """Its actor lives at this cell from now on."""
+        self._cell = cell
+
     def _arm(self) -> None:
         self._handle = self._cell.node.loop.call_at(self._due, self._fire)
 

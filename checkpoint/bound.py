@@ -145,6 +145,14 @@ class HomeBound:
             if not sender.done():
                 sender.set_result(None)
 
+    def in_hand(self) -> tuple[int, dict[int, Input]]:
+        """What the life has been fed, and what waits for that."""
+        return self._fed, dict(self._behind)
+
+    def take_up(self, in_hand: tuple[int, dict[int, Input]]) -> None:
+        """The life that was fed this goes on."""
+        self._fed, self._behind = in_hand
+
     # -- one at a time ----------------------------------------------------------------------------------------------
 
     def restart(self) -> None:

@@ -14,14 +14,13 @@ from ..actors.context import ActorContext, StashError
 from ..actors.errors import ControlFailed, HoldfastError, remote_crash
 from ..actors.exits import NORMAL, ExitReason
 from ..actors.links import Monitor
-from ..actors.mail import ReplyHandle
+from ..actors.mail import Ask, Item, ReplyHandle
 from ..actors.message import Message, message_name
 from ..actors.ref import ActorRef, current
 from .records import Feed, PipeDone
 from .turns import Fed
 
 if TYPE_CHECKING:
-    from ..actors.control.calls import Call
     from .life import Life
 
 T = TypeVar("T")
@@ -273,7 +272,11 @@ class RecordedContext(ActorContext):
     def unsubscribe(self, topic: str) -> None:
         self.recorded.put("unsubscribe", topic)
 
-    def postpones(self, call: Call) -> bool:
+    def depart(self, owe: Callable[[Ask], int]) -> bytes:
+        self.recorded.last_snapshot()
+        return b""
+
+    def postpones(self, call: Item) -> bool:
         if self.recorded.is_live:
             return False
         self.recorded.postponed.append(call)

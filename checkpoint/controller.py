@@ -36,14 +36,14 @@ class TaskHost(HomeHost, lives.LocalHost):
 
     def __init__(self, homes: Homes, method: Method) -> None:
         super().__init__(homes, method)
-        self._life: Life | None = None
+        self.life: Life | None = None
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
         assert start is not None
         cell.table = start.kind._table
         switch, live, recovering = self.open(cell)
-        life = self._life = Life(cell, LocalHome(self, cell), self.method.interval, None)
+        life = self.life = Life(cell, LocalHome(self, cell), self.method.interval, None)
         for record in switch.restore_records():
             life.from_home(record)
         life.begin(start, switch.state_turn, switch.stash)
@@ -67,8 +67,8 @@ class TaskHost(HomeHost, lives.LocalHost):
         self.clock = None
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self._life is not None:
-            cell.urge(StopRecorded(self._life, reason))
+        if cell.state is RUNNING and self.life is not None:
+            cell.urge(StopRecorded(self.life, reason))
 
     def push(self, cell: Cell, item: Item) -> None:
         if isinstance(item, (links.Exit, links.Down)):
@@ -78,7 +78,7 @@ class TaskHost(HomeHost, lives.LocalHost):
             super().push(cell, item)
 
     def running(self, cell: Cell) -> int:
-        feed = self._life.feed if self._life is not None else None
+        feed = self.life.feed if self.life is not None else None
         return -1 if feed is None else feed.id
 
     def retired(self, cell: Cell) -> None:
@@ -100,8 +100,12 @@ class LocalHome:
 
     def closed(self) -> None:
         if self._is_open:
-            self._is_open = False
+            self.shut()
             self._host.over(self._cell, -1, ENDED, ordered=True)
+
+    def shut(self) -> None:
+        """What the life says from now on is not heard, nor its end: it has been moved away."""
+        self._is_open = False
 
 
 class LocalLife:

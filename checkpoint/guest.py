@@ -54,6 +54,9 @@ class RecordedGuest:
         port = self._port(cell.path)
         life = Life(cell, port, float(options["interval"]), self._guest.page)
         cell.host = OwnHost(self._guest, life)
+        if options.get("trap_exits"):  # It was moved here.
+            cell.extra().trap_exits = True
+        life.begins_suspended = bool(options.get("suspended"))
         port.begin(life, int(options["turn"]), list(options["stash"]))
 
     def host_for(self, spec: Any) -> Host:

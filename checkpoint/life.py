@@ -74,6 +74,7 @@ class Life:
         self.postponed: list[Item] = []  # orders from outside that wait until it is live
         self.is_live = False
         self.has_replayed = False
+        self.begins_suspended = False
         self.in_hook = False
         self._snapshot_turn = -1
         self._state: list[bytes] = []
@@ -258,6 +259,9 @@ class Life:
     def go_live(self) -> None:
         """Replay is over."""
         self.is_live = True
+        if self.begins_suspended:
+            self.cell.extra().suspended = True
+            mailbox.hold(self.cell)
         self.stash = [fed for fed in self.stash if fed.feed.id not in self.gone]
         for key in self.gone:
             self.returned.pop(key, None)
@@ -297,6 +301,18 @@ class Life:
             self.port.to_home(Unsaved(str(error)))
             return
         self._send_snapshot(data, begin)
+
+    def last_snapshot(self) -> None:
+        """Save the state for a life somewhere else.
+
+        Raises:
+            UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
+        """
+        actor = self.cell.actor
+        assert actor is not None
+        begin = time.perf_counter()
+        if self.turn != self._snapshot_turn:
+            self._send_snapshot(save_state(actor), begin)
 
     def may_replace(self) -> str:
         """Why the state cannot be replaced from outside now; "" if it can: a snapshot has to follow at once."""

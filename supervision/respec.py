@@ -1,14 +1,17 @@
-"""A child's start recipe, replaced at run time: no restart, not even of its supervisors, brings the old one back."""
+"""A child's recipe or place, replaced at run time: no restart, not even of its supervisors, brings the old one back."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 from ..actors.actor import Start
 from ..actors.cell import Cell
 from .spec import ChildSpec
 from .supervisor import Supervisor
+
+Change = Callable[[ChildSpec], ChildSpec]
 
 
 def respec(cell: Cell, start: Start[Any]) -> None:
@@ -18,13 +21,25 @@ def respec(cell: Cell, start: Start[Any]) -> None:
         SpecError: the child's spec does not allow it.
     """
     spec = None if cell.spec is None else dataclasses.replace(cell.spec, start=start)
-    cell.extra().start, cell.spec = start, spec
+    cell.extra().start = start
+    _change(cell, spec, lambda known: dataclasses.replace(known, start=start))
+
+
+def replace_place(cell: Cell, spec: ChildSpec) -> None:
+    """The next lives at `cell` are lived where `spec` says, also those under supervisors that are started anew."""
+    if cell.spec is not None and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
+        spec = dataclasses.replace(spec, start=cell.spec.start)
+    _change(cell, spec, lambda known: dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits))
+
+
+def _change(cell: Cell, spec: ChildSpec | None, change: Change) -> None:
+    cell.spec = spec
     _tell_parent(cell)
     names, above = [cell.name], cell.parent
     while above is not None:
         more = above.more
         if more is not None and more.start is not None:
-            more.start = rebuilt(more.start, names, start)
+            more.start = rebuilt(more.start, names, change)
             if isinstance(above.spec, ChildSpec):
                 above.spec = dataclasses.replace(above.spec, start=more.start)
                 _tell_parent(above)
@@ -38,17 +53,18 @@ def _tell_parent(cell: Cell) -> None:
         child.spec = cell.spec
 
 
-def rebuilt(start: Start[Any], names: list[str], new: Start[Any]) -> Start[Any]:
-    """The recipe of a supervisor with `new` for the descendant at `names`; unchanged if that one is not in it."""
-    if not issubclass(start.kind, Supervisor) or len(start.args) != 2:
+def rebuilt(start: Start[Any], names: list[str], change: Change) -> Start[Any]:
+    """The recipe of a supervisor with another spec for the descendant at `names`; unchanged if it has none there."""
+    if not issubclass(start.kind, Supervisor) or len(start.args) != 2 or not isinstance(start.args[1], tuple):
         return start
     flags, specs = start.args
-    changed = tuple(_changed(spec, names, new) for spec in specs)
+    changed = tuple(_changed(spec, names, change) for spec in specs)
     return Start(start.kind, (flags, changed), start.kwargs)
 
 
-def _changed(spec: ChildSpec, names: list[str], new: Start[Any]) -> ChildSpec:
+def _changed(spec: ChildSpec, names: list[str], change: Change) -> ChildSpec:
     if spec.id != names[0]:
         return spec
-    inner = new if len(names) == 1 else rebuilt(spec.start, names[1:], new)
-    return dataclasses.replace(spec, start=inner)
+    if len(names) == 1:
+        return change(spec)
+    return dataclasses.replace(spec, start=rebuilt(spec.start, names[1:], change))

@@ -27,6 +27,7 @@ from ..actors.control.tap import Statistics, tap_of
 from ..actors.errors import ActorStopped, AskTimeout, ControlFailed, HoldfastError, SpecError
 from ..actors.events import EventStream
 from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.process.limits import Limits
 from ..actors.process.recipe import unpack_recipe
 from ..actors.process.relay import OutsideHost
 from ..actors.process.remote import ProcessHost
@@ -34,6 +35,8 @@ from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
 from ..checkpoint.outputs import switch_of
 from ..checkpoint.switch import Switch
 from ..supervision.respec import respec
+from ..supervision.spec import Isolation
+from .moving import Moves, check_isolation
 
 if TYPE_CHECKING:
     from ..actors.node import Node
@@ -47,6 +50,8 @@ class Controls:
     Each call raises ActorStopped if nobody lives there, and AskTimeout if the actor does not come to it within
     `timeout` seconds: it is carried out between two turns. While an actor is restarted, its next life is waited for.
     """
+
+    _moves: Moves
 
     @property
     def node(self) -> Node:
@@ -177,6 +182,35 @@ class Controls:
         if isinstance(cell.host, (ProcessHost, OutsideHost)):
             tap.forget = lambda: _no_more(cell)
         return stream
+
+    async def set_isolation(
+        self,
+        ref: ActorRef[Any],
+        isolation: Isolation,
+        *,
+        limits: Limits | None = None,
+        timeout: float = DEFAULT_TIMEOUT,
+    ) -> None:
+        """Move a live actor between a task and an OS process of its own, with its state and all that waits for it.
+
+        Its next lives begin there too. Nothing is lost or doubled, asks are answered, and nobody hears of an end; the
+        actor begins with `__init__`, its state, and `on_start(restored=True)`. Where it lives already, nothing is done.
+
+        Args:
+            ref: the actor: a child of a supervisor in this process.
+            isolation: "task" or "process".
+            limits: of the process; left out, those of its spec.
+            timeout: seconds within which it must come to the end of its turn and of background work, and within which
+                its new life must be up. (Making the new place ready goes on beside its work.)
+
+        Whoever cancels this gives up waiting; the move itself comes to its end.
+
+        Raises:
+            CannotMove: why it stays where it was, as it was. ActorStopped: nobody lives there.
+            ProcessUnavailable: no process could be had.
+        """
+        check_isolation(isolation, limits, timeout)
+        await self._moves.move(self._living(ref), isolation, limits, timeout)
 
     async def terminate(
         self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, timeout: float = DEFAULT_TIMEOUT

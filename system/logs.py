@@ -17,6 +17,7 @@ from ..actors.events import (
     LifeAbandoned,
     LogLine,
     MessageQuarantined,
+    Moved,
     ProcessDied,
     Recovered,
     RecoveryFailed,
@@ -81,6 +82,7 @@ LEVELS: dict[type, str] = {
     SnapshotFailed: "error",
     JournalFull: "warning",
     LogLine: "info",
+    Moved: "info",
 }
 NAMES: dict[type, str] = {
     ActorCrashed: "actor crashed",
@@ -99,6 +101,7 @@ NAMES: dict[type, str] = {
     SnapshotFailed: "snapshot failed",
     JournalFull: "journal full",
     LogLine: "output",
+    Moved: "actor moved",
 }
 
 

@@ -34,6 +34,7 @@ from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
+from .moving import Moves
 
 A = TypeVar("A", bound=Actor)
 
@@ -106,6 +107,7 @@ class ActorSystem(Controls):
         self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
+        self._moves = Moves(node, self._workers)
         node.respec = respec
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
@@ -153,6 +155,7 @@ class ActorSystem(Controls):
 
     async def _close(self, root: Cell, node: Node) -> None:
         await lives.stop_and_wait(root)
+        await self._moves.close()
         if node.remains:
             await asyncio.wait(set(node.remains))
         self._watch.close()

@@ -29,6 +29,8 @@ ORDERED = Ordered()
 class OrderAsk(Ask, eq=False):
     """The ask of an order, where it was given."""
 
+    call: Any = None  # what was sent to another process: it may have to be sent elsewhere
+
     def answer(self, reply: object) -> None:
         """The reply came from another process."""
         try:
@@ -128,6 +130,8 @@ def send_call(peer: Peer, path: str, call: Call) -> None:
         SpecError: it cannot be sent.
     """
     data = encode_value(call.order.pack(path), where=f"{call.order.verb} of {path}")
+    if isinstance(call.ask, OrderAsk):
+        call.ask.call = call
     _send(peer, path, call.ask, call.order.verb, data)
 
 

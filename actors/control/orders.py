@@ -206,8 +206,17 @@ class Mark(Order):
         return None
 
 
+class Ready(Order):
+    """Do nothing, ahead of all messages: its turn says that a life is up."""
+
+    verb = "ready"
+
+    def run(self, cell: Cell, actor: Actor) -> None:
+        return None
+
+
 ORDERS: dict[str, type[Order]] = {
-    kind.verb: kind for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Look, Mark)
+    kind.verb: kind for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Look, Mark, Ready)
 }
 
 

@@ -24,8 +24,12 @@ from ..node import Node
 from ..topics import Topics
 from . import frames
 from .connection import BadFrame, Connection
+from .moves import GuestMoves
 from .recipe import unpack_recipe
 from .relay import Arrived, OutsideHost, Peer, RelayedAsk, named, obey, text
+
+ENDED_WITHIN = 1.0
+"""Seconds that an ended process waits for the root to read why it has ended."""
 
 _BODIES = msgspec.msgpack.Decoder(list[frames.Raw])
 
@@ -120,6 +124,7 @@ class Guest(Peer):
         super().__init__(Node("guest", loop))
         self.page: Any = page
         self.ended: asyncio.Future[int] = loop.create_future()
+        self.moves = GuestMoves(self)
         self.recovery: Any = None  # the recovery method's side in this process, if it has one
         self._launcher = launcher
         self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
@@ -265,6 +270,9 @@ class Guest(Peer):
 
     def _launch(self, frame: frames.Launch) -> None:
         path = self.connection.name_in(frame.to)
+        if frame.options.get("prepare"):
+            self._prepare(frame)
+            return
         limits = frame.options.get("limits") or {}
         if frame.options.get("bounded"):
             self.page = NudgingPage(self, self.page)
@@ -278,7 +286,10 @@ class Guest(Peer):
             cell.extra().start = unpack_recipe(frame.recipe)
             if limits.get("beat"):
                 self._beat(float(limits["beat"]))
-            up = self._launcher(self, cell, frame)
+            if frame.options.get("moved"):
+                up: asyncio.Future[None] | None = self.moves.begin(cell, unpack_recipe(frame.recipe))
+            else:
+                up = self._launcher(self, cell, frame)
         except Exception as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
             self._launched(frame.id, error)
             return
@@ -287,6 +298,15 @@ class Guest(Peer):
         else:
             self._starting = frame.id, up
             up.add_done_callback(lambda done: self._on_up())
+
+    def _prepare(self, frame: frames.Launch) -> None:
+        """An actor may be moved here."""
+        try:
+            self.moves.prepare(frame.recipe)
+        except Exception as error:  # Importing a module runs it.
+            self._launched(frame.id, error)
+        else:
+            self._launched(frame.id, None)
 
     def _on_up(self) -> None:
         """Tell how the start went, once; it may be over before the loop calls back."""
@@ -305,6 +325,8 @@ class Guest(Peer):
             cell.extra().bindings[text(frame, "port")] = named(self.node, frame, "target")
         elif frame.verb == "control":
             obey_order(self, cell, frame)
+        elif frame.verb == "move":
+            self.moves.obey(cell, frame.data)
         else:
             obey(self.node, cell, frame)
 
@@ -314,8 +336,12 @@ class Guest(Peer):
         """The process's own actor has ended: tell why, and end with it."""
         self._on_up()
         told = pack_exit(reason if reason is not None else exits.SHUTDOWN)
+        sys.stdout.flush()
+        sys.stderr.flush()
         self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
-        self.connection.close()
+        self.connection.flush()
+        # The root ends us when it has read this. If we closed, and it wrote to us just then, it would read no more.
+        self.node.loop.call_later(ENDED_WITHIN, self.connection.close)
 
     def on_lost(self, error: Exception | None) -> None:
         """The root is gone, or we have closed: nothing is left to live for."""

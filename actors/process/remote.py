@@ -204,6 +204,7 @@ class ProcessHost:
         self._options = options or {}
         self._starting: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
+        self.stop_sent: ExitReason | None = None  # the life in the process has been told to stop
 
     # -- beginning --------------------------------------------------------------------------------------------------
 
@@ -222,7 +223,7 @@ class ProcessHost:
 
     def begin(self, cell: Cell, start: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
         """Run the start of a life outside the supervisor's turn."""
-        self._stop_wanted = None
+        self._stop_wanted = self.stop_sent = None
         self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
         self._starting.add_done_callback(_seen)
         return self._starting
@@ -295,9 +296,9 @@ class ProcessHost:
             return
         self.send_stop(worker, cell, reason)
 
-    @staticmethod
-    def send_stop(worker: Worker, cell: Cell, reason: ExitReason) -> None:
+    def send_stop(self, worker: Worker, cell: Cell, reason: ExitReason) -> None:
         """Tell the process that its actor shall end."""
+        self.stop_sent = reason
         connection = worker.connection
         connection.send(frames.Command(connection.name_out(cell.path), "stop", {"reason": pack_exit(reason)}))
 
@@ -429,6 +430,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
     """What an actor process wants done to an address, or tells of its own."""
     cell = node.cell_at(worker.connection.name_in(frame.to))
     match frame.verb:
+        case "move":
+            worker.on_move(frame.data)
         case "subscribe":
             node.topics.subscribe(text(frame, "topic"), cell)
         case "unsubscribe":

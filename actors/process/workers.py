@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import functools
 import os
 import signal
@@ -17,13 +16,14 @@ from ..control.calls import order, send_call
 from ..control.orders import Look
 from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed, StartIgnored
 from ..events import TRACED, LogLine, ProcessDied, ProcessStarted
-from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, unpack_exit
+from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, pack_exit, unpack_exit
 from ..mail import Ask
 from . import frames
 from .connection import Connection
 from .forked import Forked, has_ended
 from .forkserver import ForkServer
 from .inner import Inner
+from .launch import keep_large_memory
 from .limits import Limits
 from .output import OutputReader
 from .relay import Peer
@@ -36,7 +36,6 @@ REAPED_WITHIN = 2.0
 """Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
 ORDER_TIMEOUT = 60.0
 """Seconds until it does not matter any more whether a new process counts for whoever wanted to know."""
-M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3  # as in malloc.h
 
 
 class Worker(Peer):
@@ -64,6 +63,7 @@ class Worker(Peer):
         self._oom_before = oom_kills()
         self._watch: Watch | None = None
         self._outputs: list[OutputReader] = []
+        self.on_move: Callable[[dict[str, Any]], None] = _nothing  # hears what the process says of a move
 
     # -- its life ---------------------------------------------------------------------------------------------------
 
@@ -88,10 +88,8 @@ class Worker(Peer):
 
     def adopt(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
         """This process is now that of the actor at `cell`."""
-        self.cell, self._died = cell, died
+        self.reserve(cell, limits, died)
         self._workers.by_cell[cell] = self
-        if limits is not None:
-            self._watch = Watch(self, limits)
         if self.node.watched:
             self.node.emit(ProcessStarted(cell.path, self.pid))
 
@@ -101,16 +99,19 @@ class Worker(Peer):
         Raises:
             StartFailed: the actor's `__init__` or `on_start` raised, or the process ended.
         """
-        self._last_id = key = self._last_id + 1
-        up = self._launches[key] = self.node.loop.create_future()
-        if self._buried:
-            raise StartFailed(cell.path, "its process has ended")
-        connection = self.connection
         limits = self._watch.limits if self._watch is not None else None
         bindings = {port: target.path for port, target in cell.extra().bindings.items()}
-        options = dict(options, limits=_limit_options(limits), bindings=bindings)
+        await self._ask_launch(cell, recipe, dict(options, limits=_limit_options(limits), bindings=bindings))
+
+    async def _ask_launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
+        self._last_id = key = self._last_id + 1
+        if self._buried:
+            raise StartFailed(cell.path, "its process has ended")
+        up = self._launches[key] = self.node.loop.create_future()
+        connection = self.connection
         connection.send(frames.Launch(key, connection.name_out(cell.path), cell.life, recipe, options), cell.path)
-        self._order_again(cell)
+        if "prepare" not in options:
+            self._order_again(cell)
         try:
             await up
         finally:
@@ -128,6 +129,56 @@ class Worker(Peer):
             wanted = more.tap.wanted
             seen = order(cell, Look(wanted["counting"], wanted["tracing"]), ORDER_TIMEOUT)
             seen.add_done_callback(_seen)
+
+    # -- an actor that is moved here, or leaves ---------------------------------------------------------------------
+
+    def reserve(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
+        """The actor at `cell` may be moved into this process, which counts as its own only when it is adopted."""
+        self.cell, self._died = cell, died
+        if limits is not None:
+            self._watch = Watch(self, limits)
+
+    def give_back(self) -> None:
+        """The actor is not moved into this process: it ends, and nobody is told."""
+        self.cell = self._died = None
+        self.take_pending()  # Whoever was to be answered from here still is, where the actor lives.
+        self.gone()
+
+    @property
+    def is_killed(self) -> bool:
+        """Whether we have killed it; it may not have died yet."""
+        return self._killed_for is not None
+
+    def on_death(self, died: Callable[[Cell, ExitReason], None]) -> None:
+        """Who hears of its end from now on."""
+        self._died = died
+
+    async def prepare(self, cell: Cell, recipe: bytes) -> None:
+        """Have the process import what the actor needs.
+
+        Raises:
+            StartFailed: it cannot, or has ended.
+        """
+        await self._ask_launch(cell, recipe, {"prepare": True})
+
+    def leave(self, cell: Cell, reason: ExitReason, seconds: float) -> None:
+        """The actor lives elsewhere now: what is left of it ends in good order, within `seconds`, and tells nobody."""
+        self._died = None
+        if self._workers.by_cell.get(cell) is self:
+            del self._workers.by_cell[cell]
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
+        self.on_move = _nothing
+        self.record_taker, self._record_takers = _no_record, {}
+        if self._buried:
+            return
+        connection = self.connection
+        data = {"step": "leave", "reason": pack_exit(reason)}
+        connection.send(frames.Command(connection.name_out(cell.path), "move", data))
+        connection.flush()
+        late = self.node.loop.call_later(seconds, self.kill, KILLED)
+        self._grave.add_done_callback(lambda _: late.cancel())
 
     def kill(self, why: ExitReason) -> None:
         """SIGKILL, by pidfd; its end is then called `why`."""
@@ -271,6 +322,15 @@ class Worker(Peer):
         return Exited(os.waitstatus_to_exitcode(status))
 
 
+def _nothing(data: dict[str, Any]) -> None:
+    """No move is under way."""
+
+
+def _no_record(path: str) -> frames.TakeRecord:
+    """What a life says that has been moved away is not kept."""
+    return lambda frame: None
+
+
 def _seen(done: asyncio.Future[Any]) -> None:
     """Nobody waits for it: asyncio need not complain of its failure."""
     if not done.cancelled():
@@ -287,22 +347,6 @@ def _limit_options(limits: Limits | None) -> dict[str, Any]:
         "niceness": limits.niceness,
         "beat": None if limits.hung_after is None else limits.hung_after / 4,
     }
-
-
-def keep_large_memory() -> None:
-    """Have malloc keep the memory of large messages instead of handing it back and faulting it in again each time.
-
-    The same settings as actor processes get through their environment; whoever set those variables has chosen already.
-    A message of 1 MiB otherwise costs four times as much.
-    """
-    if any(name.startswith("MALLOC_") for name in os.environ):
-        return
-    try:
-        mallopt = ctypes.CDLL(None).mallopt
-    except (OSError, AttributeError):
-        return  # Not glibc.
-    for parameter, value in ((M_MMAP_THRESHOLD, 64 << 20), (M_TRIM_THRESHOLD, 128 << 20), (M_TOP_PAD, 16 << 20)):
-        mallopt(parameter, value)
 
 
 class Workers:

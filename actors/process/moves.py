@@ -1,0 +1,247 @@
+"""Moves as an actor process sees them: an actor that arrives here, or leaves."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, cast
+
+from .. import lives, mailbox
+from ..actor import Actor, Start
+from ..cell import RUNNING, Cell
+from ..context import ActorContext
+from ..control.luggage import pack_items, pack_rest, unpack
+from ..control.moving import Settle, Take, now, resume
+from ..errors import HoldfastError, error_text
+from ..exits import unpack_exit
+from ..links import Monitor
+from ..mail import Ask, Item
+from ..values import decode_value, encode_value
+from . import frames
+from .connection import BadFrame, Connection
+from .recipe import unpack_recipe
+from .relay import Arrived, RelayedAsk
+
+if TYPE_CHECKING:
+    from ..cell import Admit
+    from .guest import Guest
+
+PIECE = 4 * 1024 * 1024
+"""Bytes of luggage per frame: it may be larger than a frame can be."""
+
+
+def send_luggage(connection: Connection, path: str, step: str, luggage: dict[str, Any]) -> None:
+    """Send what an actor takes along, in pieces."""
+    data = encode_value(luggage, where=path)
+    for at in range(0, len(data), PIECE):
+        part = {"step": step, "part": data[at : at + PIECE], "is_last": at + PIECE >= len(data)}
+        connection.send(frames.Command(connection.name_out(path), "move", part), path)
+
+
+class Luggage:
+    """What comes in pieces."""
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+
+    def take(self, data: dict[str, Any]) -> dict[str, Any] | None:
+        """One more piece; the whole if it was the last."""
+        self._parts.append(data["part"])
+        if not data["is_last"]:
+            return None
+        whole = b"".join(self._parts)
+        self._parts.clear()
+        return cast("dict[str, Any]", decode_value(whole))
+
+
+class GuestMoves:
+    """The moves of a process's own actor."""
+
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+        self._incoming = Luggage()
+        self._luggage: dict[str, Any] | None = None
+        self._take: Take | None = None
+        self._state = b""
+        self._stash: list[Any] = []
+        self._admit: Admit | None = None
+
+    def _say(self, step: str, **data: Any) -> None:
+        connection = self._guest.connection
+        root = self._guest.node.root
+        assert root is not None
+        connection.send(frames.Command(connection.name_out(root.path), "move", {"step": step, **data}))
+
+    def obey(self, cell: Cell, data: dict[str, Any]) -> None:
+        """Do the next step of a move.
+
+        Raises:
+            BadFrame: there is no such step.
+        """
+        match data.get("step"):
+            case "luggage":
+                self._luggage = self._incoming.take(data)
+            case "stash":
+                self._admit, cell.admit = cell.admit, self._put_aside
+            case "go":
+                self._go(cell, suspended=bool(data["suspended"]))
+            case "take":
+                take = self._take = Take(_number, self._taken, lambda why: self._say("refused", why=why))
+                if cell.state is RUNNING:
+                    lives.urge(cell, take)
+            case "pack":
+                self._pack(cell)
+            case "back":
+                self._back(cell)
+            case "leave":
+                self._leave(cell, data)
+            case step:
+                raise BadFrame(f"a move has no step {step!r}")
+
+    def _put_aside(self, cell: Cell, item: Any) -> None:
+        if isinstance(item, Item):
+            item.stashed()  # It has no place in the order of arrival.
+        self._stash.append(item)
+
+    # -- arriving ---------------------------------------------------------------------------------------------------
+
+    @staticmethod
+    def prepare(recipe: bytes) -> None:
+        """Import what an actor needs, and see whether it can be constructed.
+
+        Raises:
+            SpecError: its class cannot be imported. TypeError: its arguments do not fit.
+        """
+        unpack_recipe(recipe).check()
+
+    def begin(self, cell: Cell, start: Start[Any]) -> asyncio.Future[None]:
+        """Begin the life of an actor that is moved here; the future ends when it is up. It handles nothing yet.
+
+        Raises:
+            HoldfastError, or what `set_state` raises.
+        """
+        luggage, self._luggage = self._luggage, None
+        if luggage is None:
+            raise BadFrame("an actor came without its state")
+        cell.life += 1
+        lives.build(cell, start, ActorContext)
+        cell.state = RUNNING
+        actor, rest = cell.actor, luggage["rest"]
+        assert actor is not None
+        watches = [self._watch(cell, path, for_good) for path, for_good in rest["watches"]]
+        for path in rest["links"]:
+            peer = self._guest.node.cell_at(path)
+            cell.extra().links[peer] = peer.extra().links[cell] = None
+        unpack(actor, luggage["state"], rest, self._owed, lambda path, for_good: _found(watches, path, for_good))
+        return await_up(cell, start)
+
+    def _watch(self, cell: Cell, path: str, for_good: bool) -> Monitor:
+        """A watch that the root keeps already."""
+        watch = Monitor(cell, self._guest.node.cell_at(path), for_good)
+        watch.target.extra().monitors.append(watch)
+        cell.extra().watching[watch] = None
+        return watch
+
+    def _owed(self, key: int) -> Ask:
+        """An ask that the root waits with for its reply."""
+        return RelayedAsk(None, None, (), 0.0, 0.0, None, None, True, self._guest, key)
+
+    def _go(self, cell: Cell, *, suspended: bool) -> None:
+        if self._admit is not None:
+            cell.admit, self._admit = self._admit, None
+        more = cell.extra()
+        if self._stash:
+            more.stash, self._stash = deque(self._stash), []
+        if suspended:
+            more.suspended = True
+            mailbox.hold(cell)
+        lives.up(cell)
+        self._say("began", at=now())
+
+    # -- leaving ----------------------------------------------------------------------------------------------------
+
+    def _taken(self, actor: Actor, state: bytes) -> None:
+        self._state = state
+        more = actor.ctx.cell.extra()
+        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=more.suspended)
+
+    def _pack(self, cell: Cell) -> None:
+        """Nothing comes any more: send what there is."""
+        actor, page = cell.actor, self._guest.page
+        assert actor is not None
+
+        def entry(item: Item) -> list[Any] | None:
+            if isinstance(item, RelayedAsk):
+                return ["ask", item.id]
+            if isinstance(item, Arrived) and item.page is page:
+                return ["number", item.number]
+            return None
+
+        try:
+            luggage = {
+                "state": self._state,
+                "rest": pack_rest(actor),
+                "stash": pack_items(cell, cell.extra().stash or (), entry),
+                "queue": pack_items(cell, cell.queue or (), entry),
+            }
+            send_luggage(self._guest.connection, cell.path, "packed", luggage)
+        except Exception as error:  # Whatever a message of the actor's own raises while it is encoded.
+            self._say("refused", why=str(error) if isinstance(error, HoldfastError) else error_text(error))
+
+    def _back(self, cell: Cell) -> None:
+        """The actor stays after all, or is not to be taken any more."""
+        take, self._take, self._state = self._take, None, b""
+        if take is None:
+            return
+        take.is_void = True
+        if take.is_done and cell.state is RUNNING:
+            resume(cell)
+
+    def _leave(self, cell: Cell, data: dict[str, Any]) -> None:
+        """The actor lives elsewhere: what is left here ends, and tells nobody."""
+        more = cell.extra()
+        for kept in (more.links, more.topics, more.monitors):
+            kept.clear()
+        if cell.queue is not None:
+            cell.queue.clear()
+        more.urgent = more.stash = None
+        cell.request_stop(unpack_exit(data["reason"]))
+        lives.up(cell)
+
+
+def await_up(cell: Cell, start: Start[Any]) -> asyncio.Future[None]:
+    """Have `on_start(True)` run as the first turn of a built life, and the life hold still behind it."""
+    loop, more = cell.node.loop, cell.extra()
+    settled: asyncio.Future[None] = loop.create_future()
+    queue = mailbox.queue_of(cell)
+    queue.appendleft(Settle(settled))
+    if start.kind.on_start is not Actor.on_start:
+        more.starting = loop.create_future()
+        more.starting.add_done_callback(lambda done: _failed(done, settled))
+        queue.appendleft(lives.FirstTurn(True, more.starting))
+    cell.scheduled = False
+    cell.schedule()
+    return settled
+
+
+def _failed(started: asyncio.Future[None], settled: asyncio.Future[None]) -> None:
+    error = None if started.cancelled() else started.exception()
+    if error is not None and not settled.done():
+        settled.set_exception(error)
+        settled.exception()  # Seen: whoever waits may have given up.
+
+
+def _number(ask: Ask) -> int:
+    """The number under which the root knows an ask."""
+    if not isinstance(ask, RelayedAsk):
+        raise HoldfastError("it can answer itself only here")
+    return ask.id
+
+
+def _found(watches: list[Monitor], path: str, for_good: bool) -> Monitor:
+    return next(watch for watch in watches if watch.target.path == path and watch.for_good is for_good)
+
+
+Answered = Callable[[dict[str, Any]], None]
+"""Who hears at the root what a process says of a move."""

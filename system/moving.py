@@ -1,0 +1,146 @@
+"""Moving live actors between tasks and OS processes: which moves there are, one at a time for each actor."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import weakref
+from typing import TYPE_CHECKING, get_args
+
+from ..actors.cell import Cell, Host
+from ..actors.control.calls import order
+from ..actors.control.orders import Ready
+from ..actors.errors import CannotMove, SpecError
+from ..actors.events import Moved
+from ..actors.lives import LOCAL
+from ..actors.node import cell_kind
+from ..actors.process.limits import Limits
+from ..actors.process.mover import Move
+from ..actors.process.remote import ProcessHost
+from ..actors.process.to_process import ToProcess
+from ..actors.process.to_task import ToTask
+from ..actors.process.workers import Workers
+from ..actors.ref import current
+from ..checkpoint.controller import RecordedProcessHost, TaskHost
+from ..checkpoint.moving import RecordedToProcess, RecordedToTask
+from ..supervision.respec import replace_place
+from ..supervision.spec import ChildSpec, Isolation
+from ..supervision.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from ..actors.node import Node
+
+
+class Moves:
+    """The moves of one system."""
+
+    def __init__(self, node: Node, workers: Workers) -> None:
+        self._node, self._workers = node, workers
+        self._turns: weakref.WeakKeyDictionary[Cell, asyncio.Lock] = weakref.WeakKeyDictionary()
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    async def move(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+        """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
+
+        Raises:
+            CannotMove, ActorStopped, AskTimeout, ProcessUnavailable.
+        """
+        caller = current.get(None)
+        if caller is not None and caller.cell is cell and caller.in_turn():
+            raise CannotMove(cell.path, "a turn of its own waits for it; call this from outside, or from a task")
+        task = self._node.loop.create_task(
+            self._in_turn(cell, isolation, limits, timeout),
+            name=f"move of {cell.path}",
+            context=self._node.base_context.copy(),
+        )
+        self._tasks.add(task)
+        task.add_done_callback(self._over)
+        await asyncio.shield(task)
+
+    def _over(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled():
+            task.exception()  # Seen: whoever wanted it may not wait any more.
+
+    async def close(self) -> None:
+        """Undo what is under way."""
+        for task in list(self._tasks):
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks)
+
+    async def _in_turn(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+        lock = self._turns.setdefault(cell, asyncio.Lock())
+        async with lock:
+            origin = place_of(cell)
+            if origin == isolation:
+                return
+            spec = _spec_there(cell, isolation, limits)
+            end = self._node.loop.time() + timeout
+            while True:
+                if not cell.host.is_up(cell):
+                    await order(cell, Ready(), timeout)  # It is being restarted: its next life is moved.
+                move = self._made(cell, spec, timeout)
+                move.moved = lambda: replace_place(cell, spec)
+                try:
+                    await move.run()
+                    break
+                except CannotMove:
+                    if not move.is_late or cell.is_dead or self._node.loop.time() > end:
+                        raise
+            if self._node.watched:
+                self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
+
+    def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
+        """The move that brings the actor to where its spec says."""
+        old, new = cell.host, self._node.host_for(spec)
+        if isinstance(new, RecordedProcessHost):
+            return RecordedToProcess(cell, new, timeout, self._workers, spec.limits)
+        if isinstance(new, ProcessHost):
+            return ToProcess(cell, new, timeout, self._workers, spec.limits)
+        worker = old.worker_of(cell) if isinstance(old, ProcessHost) else None
+        if worker is None:
+            raise CannotMove(cell.path, "its process has ended")
+        if isinstance(new, TaskHost):
+            return RecordedToTask(cell, new, timeout, worker)
+        return ToTask(cell, new, timeout, worker)
+
+
+def check_isolation(isolation: object, limits: object, timeout: object) -> None:
+    """Raises SpecError: what a move is told is not valid."""
+    if isolation not in get_args(Isolation):
+        raise SpecError("set_isolation", f"isolation must be 'task' or 'process', not {isolation!r}")
+    if limits is not None and (not isinstance(limits, Limits) or isolation != "process"):
+        raise SpecError("set_isolation", f"limits must be Limits(...), of a process, or left out, not {limits!r}")
+    if not isinstance(timeout, (int, float)) or isinstance(timeout, bool) or not 0 < timeout < float("inf"):
+        raise SpecError("set_isolation", f"timeout must be a number of seconds > 0, not {timeout!r}")
+
+
+def place_of(cell: Cell) -> Isolation:
+    """Where an actor lives: in a process of its own, or as a task of whatever process."""
+    return "process" if isinstance(cell.host, ProcessHost) else "task"
+
+
+def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> ChildSpec:
+    """The spec of an actor that lives there.
+
+    Raises:
+        CannotMove: it cannot.
+    """
+    spec, kind = cell.spec, cell_kind(cell)
+    if kind is not None and issubclass(kind, Supervisor):
+        raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
+    if not _is_here(cell):
+        raise CannotMove(cell.path, "its supervisor lives in another process, which cannot have processes of its own")
+    if not isinstance(spec, ChildSpec):
+        raise CannotMove(cell.path, "nobody restarts it, so nobody knows how; start it as a child of a supervisor")
+    try:
+        return dataclasses.replace(spec, isolation=isolation, limits=limits if limits is not None else spec.limits)
+    except SpecError as error:
+        raise CannotMove(cell.path, str(error)) from error
+
+
+def _is_here(cell: Cell) -> bool:
+    """Whether it is this process that begins the lives of an actor."""
+    host: Host = cell.host
+    return host is LOCAL or isinstance(host, (ProcessHost, TaskHost))

@@ -1,0 +1,189 @@
+"""What may go wrong while an actor is moved: it lives on in one place."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.control.movers import (
+    Fussy,
+    Leaves,
+    Work,
+)
+from tests.control.players import Account, Add, Crash, Total, until_there
+
+KINDS = {"plain": None, "recorded": hf.hybrid(interval=3600.0)}
+OTHER: dict[str, Any] = {"task": "process", "process": "task"}
+
+
+@pytest.fixture(params=list(KINDS))
+def recovery(request: pytest.FixtureRequest) -> Any:
+    """Without recovery, and with it."""
+    return KINDS[request.param]
+
+
+@pytest.fixture(params=list(OTHER))
+def here(request: pytest.FixtureRequest) -> str:
+    """Where the actor lives first."""
+    return str(request.param)
+
+
+def lives_in(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> Any:
+    return "task" if system.pid_of(ref) == os.getpid() else "process"
+
+
+def moved(stream: hf.EventStream) -> list[tuple[str, str]]:
+    return [(event.origin, event.to) for event in stream.take() if isinstance(event, hf.Moved)]
+
+
+@pytest.mark.parametrize("how", ["raise", "hang", "exit"])
+async def test_if_the_new_life_does_not_come_up_the_old_one_goes_on(
+    system: hf.ActorSystem, recovery: Any, here: Any, how: str, tmp_path: Path
+) -> None:
+    if how == "exit" and here == "process":
+        how = "raise"  # The new place is the test itself.
+    gate = tmp_path / "gate"
+    one = await system.start(hf.child("one", hf.start(Fussy, str(gate), how), recovery=recovery, isolation=here))
+    assert await one.ask(Add(5)) == 5
+    pid = system.pid_of(one)
+    gate.touch()
+    moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here], timeout=0.5))
+    asks: list[asyncio.Future[int]] = []
+    while not moving.done():  # Also while it is at rest.
+        asks.append(one.ask(Add(1)))
+        await asyncio.sleep(0.0005)
+    with pytest.raises(hf.CannotMove):
+        await moving
+    count = len(asks)
+    assert await asyncio.gather(*asks) == list(range(6, 6 + count))
+    assert system.pid_of(one) == pid
+    status = await system.get_status(one)
+    assert (status.life, status.state) == (1, "running")
+    gate.unlink()
+    await system.set_isolation(one, OTHER[here])
+    assert await one.ask(Add(1)) == 6 + count
+    assert lives_in(system, one) == OTHER[here]
+
+
+async def test_moves_of_one_actor_go_one_after_another(system: hf.ActorSystem, recovery: Any) -> None:
+    one = await system.start(hf.child("one", hf.start(Account), recovery=recovery))
+    with system.events() as stream:
+        await asyncio.gather(*(system.set_isolation(one, to) for to in ("process", "task", "process", "process")))
+        assert moved(stream) == [("task", "process"), ("process", "task"), ("task", "process")]
+    assert await one.ask(Add(1)) == 1
+    assert lives_in(system, one) == "process"
+
+
+async def test_an_actor_that_is_being_restarted_is_moved_in_its_next_life(system: hf.ActorSystem, here: Any) -> None:
+    backoff = hf.Backoff(initial=0.2, jitter=0.0)
+    one = await system.start(hf.child("one", hf.start(Account), isolation=here, backoff=backoff))
+    with pytest.raises(hf.RemoteCrash):
+        await one.ask(Crash())
+    await system.set_isolation(one, OTHER[here])
+    assert lives_in(system, one) == OTHER[here]
+    assert (await system.get_status(one)).life == 2
+
+
+async def test_a_caller_that_gives_up_leaves_no_half_move(system: hf.ActorSystem, recovery: Any, here: Any) -> None:
+    one = await system.start(hf.child("one", hf.start(Account), recovery=recovery, isolation=here))
+    for steps in range(12):
+        moving = asyncio.ensure_future(system.set_isolation(one, OTHER[lives_in(system, one)]))
+        for _ in range(steps):
+            await asyncio.sleep(0)
+        moving.cancel()
+        assert await one.ask(Add(1)) == steps + 1
+    place = OTHER[lives_in(system, one)]
+    await system.set_isolation(one, place)
+    assert await one.ask(Total()) == 12
+    assert lives_in(system, one) == place
+
+
+async def test_a_system_that_ends_does_not_wait_for_moves(here: Any) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        one = await system.start(hf.child("one", hf.start(Account), isolation=here))
+        moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here]))
+        await asyncio.sleep(0)
+    done, _ = await asyncio.wait((moving,), timeout=8.0)
+    assert done
+    assert moving.cancelled() or moving.exception() is None or isinstance(moving.exception(), hf.HoldfastError)
+
+
+async def test_stop_and_kill_reach_an_actor_on_its_way(system: hf.ActorSystem, recovery: Any, here: Any) -> None:
+    for end in ("stop", "kill"):
+        for steps in range(0, 40, 4):
+            spec = hf.child(f"{end}-{steps}", hf.start(Account), recovery=recovery, isolation=here, restart="temporary")
+            one = await system.start(spec)
+            moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here]))
+            for _ in range(steps):
+                await asyncio.sleep(0)
+            gone = one._cell.ended()
+            getattr(one, end)()
+            async with asyncio.timeout(8.0):
+                assert await gone in (hf.SHUTDOWN, hf.KILLED)
+            await asyncio.wait((moving,), timeout=8.0)
+            assert moving.done()
+            moving.exception()
+
+
+async def test_an_actor_that_stops_itself_in_the_turn_that_is_waited_for_stops(
+    system: hf.ActorSystem, recovery: Any, here: Any, tmp_path: Path
+) -> None:
+    gate = tmp_path / "gate"
+    one = await system.start(hf.child("one", hf.start(Leaves), recovery=recovery, isolation=here, restart="temporary"))
+    one.tell(Work(str(gate)))
+    await until_there(tmp_path / "gate.begun")
+    gone = one._cell.ended()
+    moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here]))
+    await asyncio.wait((moving,), timeout=0.3)  # The order has reached it, and waits for the end of the turn.
+    gate.touch()
+    async with asyncio.timeout(8.0):
+        assert await gone == hf.NORMAL
+    with pytest.raises(hf.CannotMove, match="its life has ended"):
+        await moving
+
+
+async def test_control_reaches_an_actor_on_its_way(system: hf.ActorSystem, recovery: Any, here: Any) -> None:
+    one = await system.start(hf.child("one", hf.start(Account), recovery=recovery, isolation=here))
+    await one.ask(Add(4))
+    place = here
+    for _ in range(6):
+        place = OTHER[place]
+        moving = asyncio.ensure_future(system.set_isolation(one, place))
+        while not moving.done():
+            assert (await system.get_state(one))["total"] == 4
+        await moving
+
+
+async def test_statistics_and_trace_go_on(system: hf.ActorSystem, here: Any) -> None:
+    one = await system.start(hf.child("one", hf.start(Account), isolation=here))
+    await system.statistics(one, True)
+    with await system.trace(one) as stream:
+        await one.ask(Add(1))
+        await system.set_isolation(one, OTHER[here])
+        await one.ask(Add(1))
+        await system.set_isolation(one, here)
+        await one.ask(Add(1))
+        ends = [event for event in stream.take() if isinstance(event, hf.TurnEnded)]
+    assert len(ends) == 3
+    counts = await system.statistics(one)
+    assert counts is not None
+    assert (counts.messages_in, counts.restarts) == (3, 0)
+
+
+async def test_the_old_process_ends_after_a_move(system: hf.ActorSystem, recovery: Any) -> None:
+    one = await system.start(hf.child("one", hf.start(Account), recovery=recovery, isolation="process"))
+    pid = system.pid_of(one)
+    await system.set_isolation(one, "task")
+    async with asyncio.timeout(8.0):
+        while True:
+            try:
+                os.kill(pid, 0)
+            except ProcessLookupError:
+                break
+            await asyncio.sleep(0.01)
+    assert await one.ask(Add(1)) == 1
