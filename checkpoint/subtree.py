@@ -15,6 +15,7 @@ from ..actors.cell import DOWN, GONE, RUNNING, Cell
 from ..actors.control.calls import Call, send_call
 from ..actors.errors import HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
+from ..actors.keeper import child_key
 from ..actors.mail import Item
 from ..actors.mailbox import Bound
 from ..actors.process import frames
@@ -40,6 +41,8 @@ class SubtreeHost(ProcessHost):
 
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
         worker, recipe = await super().take(cell)
+        kept = self._homes.notes(child_key(cell.path, ""))
+        self._options = {"kept": kept, "known": self._homes.known(cell.path)}
         slots = Slots(len(worker.page))
 
         def taker(path: str) -> frames.TakeRecord:

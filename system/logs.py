@@ -20,8 +20,10 @@ from ..actors.events import (
     ProcessDied,
     Recovered,
     RecoveryFailed,
+    RolledBack,
     ShutdownError,
     SnapshotFailed,
+    StoreRefused,
     SupervisorGaveUp,
 )
 from ..actors.exits import Crash
@@ -77,9 +79,11 @@ LEVELS: dict[type, str] = {
     ProcessDied: "warning",
     Recovered: "info",
     RecoveryFailed: "error",
+    RolledBack: "error",
     MessageQuarantined: "error",
     SnapshotFailed: "error",
     JournalFull: "warning",
+    StoreRefused: "error",
     LogLine: "info",
 }
 NAMES: dict[type, str] = {
@@ -95,9 +99,11 @@ NAMES: dict[type, str] = {
     ProcessDied: "process died",
     Recovered: "actor recovered",
     RecoveryFailed: "recovery failed",
+    RolledBack: "rolled back",
     MessageQuarantined: "message quarantined",
     SnapshotFailed: "snapshot failed",
     JournalFull: "journal full",
+    StoreRefused: "store refused",
     LogLine: "output",
 }
 

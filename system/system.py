@@ -110,6 +110,7 @@ class ActorSystem(Controls):
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
         node.outside = self._homes.find
+        node.keeper = self._homes
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
         self._body = asyncio.current_task()
