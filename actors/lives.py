@@ -209,6 +209,11 @@ class FirstTurn(Item):
         if not self.started.done():
             self.started.set_result(None)
 
+    def ignored(self, cell: Cell, why: str) -> bool:
+        """`on_start` does not want the actor to live."""
+        start_fails(cell, self, StartIgnored(cell.path, why))
+        return True
+
     def undelivered(self, cell: Cell, reason: str) -> None:
         self.fail_start(StartFailed(cell.path, reason))
 
@@ -255,11 +260,20 @@ class Kill(Item):
 
 def crash(cell: Cell, item: Any, error: BaseException) -> None:
     """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
-    if isinstance(error, Ignore) and isinstance(item, FirstTurn):  # No crash: it does not want to live.
-        start_fails(cell, item, StartIgnored(cell.path, error.why))
-        finish(cell, NORMAL)
-        return
+    if isinstance(error, Ignore):
+        ignored = getattr(item, "ignored", None)
+        if ignored is not None and ignored(cell, error.why):  # No crash: it does not want to live.
+            finish(cell, NORMAL)
+            return
     reason = exits.crash(error)
+    if (
+        isinstance(error, StartFailed)
+        and isinstance(item, FirstTurn)
+        and getattr(type(cell.actor), "_supervises", False)
+    ):
+        start_fails(cell, item, StartFailed(cell.path, str(reason)))  # A child did not start: no crash of ours (OTP).
+        finish(cell, SHUTDOWN)
+        return
     fail = getattr(item, "fail", None)
     if fail is not None:
         fail(remote_crash(error))
@@ -378,7 +392,7 @@ def ended(cell: Cell, reason: ExitReason) -> None:
         _undo(cell)
     if cell.spec is not None and cell.parent is not None:
         if more is not None:
-            links.announce(cell, reason, recovering=cell.host.recovers(reason))
+            links.announce(cell, reason, recovering=cell.host.recovers(reason) and cell.spec.restarts(reason))
             tell_enders(more, reason)
         cell.parent.push(ChildExit(cell, cell.life, reason))
     else:

@@ -10,7 +10,7 @@ import msgspec
 
 from ..actors import exits, links, lives
 from ..actors.cell import DOWN, RUNNING, Cell, Host
-from ..actors.errors import StartFailed
+from ..actors.errors import StartFailed, StartIgnored
 from ..actors.exits import ExitReason, pack_exit
 from ..actors.keeper import child_key
 from ..actors.mail import Envelope, Item
@@ -256,13 +256,18 @@ class InnerLifeHost(LifeHost):
             self._up.exception()  # Nobody may be left to look.
 
     def _closed(self, cell: Cell) -> None:
-        self._life = None
+        life, self._life = self._life, None
         self._say_closed(cell)
-        self._fail(cell, StartFailed(cell.path, str(cell.extra().reason)))
+        if life is not None and life.ignored_why is not None:
+            self._fail(cell, StartIgnored(cell.path, life.ignored_why))
+        else:
+            self._fail(cell, StartFailed(cell.path, str(cell.extra().reason)))
 
     def _say_closed(self, cell: Cell) -> None:
         assert self._port is not None
-        self._port.to_home(Closed(self._number, pack_exit(cell.extra().reason)))
+        reason = cell.extra().reason
+        recovers = self.recovers(reason) and cell.spec is not None and cell.spec.restarts(reason)
+        self._port.to_home(Closed(self._number, pack_exit(reason), recovers))
 
     def kill(self, cell: Cell) -> None:
         if cell.state is DOWN and self._up is not None and not self._up.done():

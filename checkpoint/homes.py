@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from ..actors.cell import GONE, RUNNING, Cell
-from ..actors.errors import HoldfastError, StartFailed
+from ..actors.errors import HoldfastError, StartFailed, StartIgnored
 from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
@@ -235,7 +235,8 @@ class HomeHost:
             restore_seconds = await live
             clock.mark("replay", switch.live_at)
         except HoldfastError as error:
-            node.emit(RecoveryFailed(cell.path, str(error)))
+            if not isinstance(error, StartIgnored):
+                node.emit(RecoveryFailed(cell.path, str(error)))
             raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
         except asyncio.CancelledError:
             raise StartFailed(cell.path, "it was stopped while it started") from None

@@ -111,7 +111,7 @@ class SubtreeHome(HomeHost):
             self._begin(record)
         elif isinstance(record, Closed):
             if self._wanted is not None and record.number == self._wanted.number:
-                self._closed(unpack_exit(record.reason))
+                self._closed(unpack_exit(record.reason), recovers=record.recovers)
         elif self.switch is not None and self._wanted is not None:
             self.switch.from_life(record)
 
@@ -163,7 +163,13 @@ class SubtreeHome(HomeHost):
             RemoteLife(self.path, worker).to_life(Started(wanted.number, problem))
 
     def _closed(
-        self, reason: ExitReason, running: int = -1, *, ordered: bool = True, noticed: float | None = None
+        self,
+        reason: ExitReason,
+        running: int = -1,
+        *,
+        recovers: bool = True,
+        ordered: bool = True,
+        noticed: float | None = None,
     ) -> None:
         """The life is over: tell whom it concerns here; its supervisor decides what follows."""
         cell = self.cell
@@ -174,7 +180,7 @@ class SubtreeHome(HomeHost):
         cell.state = DOWN
         more = cell.extra()
         more.reason = reason
-        links.announce(cell, reason, recovering=self.recovers(reason))
+        links.announce(cell, reason, recovering=recovers and self.recovers(reason))
         lives.tell_enders(more, reason)
 
     def lost(self, worker: Worker, reason: ExitReason) -> None:

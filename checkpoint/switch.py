@@ -21,6 +21,7 @@ from ..actors.errors import (
     AskDeadlock,
     HoldfastError,
     ReplayDiverged,
+    StartIgnored,
 )
 from ..actors.events import RecoveryFailed, SnapshotFailed, SnapshotTaken
 from ..actors.exits import pack_exit
@@ -49,6 +50,7 @@ from .records import (
     Answer,
     Closed,
     Go,
+    Ignored,
     Live,
     Out,
     PipeDone,
@@ -335,6 +337,9 @@ class Switch:
                     self._pipe_done(record)
                 case Unsaved():
                     self.node.emit(SnapshotFailed(self.path, record.problem))
+                case Ignored():
+                    if self.live is not None and not self.live.done():
+                        self.live.set_exception(StartIgnored(self.path, record.why))
                 case Wanted() | Closed():
                     pass  # for whoever begins lives
         except ReplayDiverged as error:
