@@ -210,7 +210,6 @@ class FirstTurn(Item):
             self.started.set_result(None)
 
     def ignored(self, cell: Cell, why: str) -> bool:
-        """`on_start` does not want the actor to live."""
         start_fails(cell, self, StartIgnored(cell.path, why))
         return True
 
@@ -260,25 +259,18 @@ class Kill(Item):
 
 def crash(cell: Cell, item: Any, error: BaseException) -> None:
     """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
-    if isinstance(error, Ignore):
-        ignored = getattr(item, "ignored", None)
-        if ignored is not None and ignored(cell, error.why):  # No crash: it does not want to live.
-            finish(cell, NORMAL)
-            return
-    reason = exits.crash(error)
-    if (
-        isinstance(error, StartFailed)
-        and isinstance(item, FirstTurn)
-        and getattr(type(cell.actor), "_supervises", False)
-    ):
-        start_fails(cell, item, StartFailed(cell.path, str(reason)))  # A child did not start: no crash of ours (OTP).
-        finish(cell, SHUTDOWN)
+    if isinstance(error, Ignore) and hasattr(item, "ignored") and item.ignored(cell, error.why):
+        finish(cell, NORMAL)  # No crash: it does not want to live.
         return
+    reason = exits.crash(error)
     fail = getattr(item, "fail", None)
     if fail is not None:
         fail(remote_crash(error))
     elif isinstance(item, FirstTurn):
         start_fails(cell, item, StartFailed(cell.path, str(reason)))
+        if isinstance(error, StartFailed) and getattr(type(cell.actor), "_supervises", False):
+            finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).
+            return
     node = cell.node
     if node.watched:
         node.emit(ActorCrashed(cell.path, cell.life, reason, item))

@@ -37,7 +37,7 @@ PATIENCE = 5.0
 class Flags:
     """A supervisor's own settings: strategy, and at most `intensity` restarts within `period` seconds.
 
-    `auto_shutdown` says whether it ends with its significant children; `max_children` and `journal` are for dynamic ones.
+    `auto_shutdown` says whether it ends with its significant children; dynamic ones have `max_children` and `journal`.
     """
 
     strategy: Strategy = "one_for_one"

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from ..actors import lives
 from ..actors.actor import Actor, on
 from ..actors.cell import DOWN, GONE, Cell
-from ..actors.errors import HoldfastError, NoSuchActor, SpecError, StartFailed, StartIgnored
+from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
 from ..actors.exits import SHUTDOWN, ExitReason, unpack_exit
 from ..actors.mail import Item, ReplyHandle
@@ -38,7 +38,7 @@ from .admin import (
     opened,
 )
 from .change import check_place, new_plan, succession
-from .children import RECOVERING, RESTARTING, STOPPED, UP, Child, Retry, Row, StartOver
+from .children import RECOVERING, RESTARTING, STOPPED, UP, Child, Retry, Row, StartOver, new_cell
 from .decisions import affected, decide, is_reported
 from .intensity import admit_restart
 from .spec import ChildSpec, Flags, Plan, check_spec
@@ -116,28 +116,9 @@ class Supervisor(Actor):
         """
         cell = one.cell
         if cell is None or cell.state is GONE:
-            cell = one.cell = self._new_cell(one.spec)
+            cell = one.cell = new_cell(self.ctx.cell, one.spec)
             one.ignored_life = 0  # A new address counts its lives anew.
         return cell.host.start(cell)
-
-    def _new_cell(self, spec: ChildSpec) -> Cell:
-        own = self.ctx.cell
-        node = own.node
-        targets = {port: node.find(path) for port, path in spec.bindings.items()}
-        for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
-            if target is None:
-                missing = NoSuchActor(spec.bindings[port])
-                raise StartFailed(f"{own.path}/{spec.id}", f"binding {port!r}: {missing}") from missing
-        cell = node.cell_below(own, spec.id, node.host_for(spec))
-        cell.spec = spec
-        more = cell.extra()
-        more.start = spec.start
-        if spec.mailbox is not None:
-            node.bound(cell, spec.mailbox)
-        for port, target in targets.items():
-            assert target is not None
-            node.bind(cell, port, target)
-        return cell
 
     def _is_up(self, one: Child) -> None:
         one.state = UP
@@ -470,11 +451,7 @@ class Supervisor(Actor):
     @on(WhichChildren, readonly=True)
     def _which_children(self, message: WhichChildren) -> list[ChildInfo]:
         """What there is, in start order."""
-        own = self.ctx.path
-        return [
-            ChildInfo(one.spec.id, one.state, f"{own}/{one.spec.id}", one.spec.is_supervisor)
-            for one in self._children.values()
-        ]
+        return [one.info(self.ctx.path) for one in self._children.values()]
 
     @on(CountChildren, readonly=True)
     def _count_children(self, message: CountChildren) -> ChildCounts:
