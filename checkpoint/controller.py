@@ -128,12 +128,12 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         start = cell.extra().start
         assert start is not None
         cell.table = start.kind._table
-        return self.begin(cell, self._recover(cell))
+        # Now, not in the task: from here on what is sent is admitted by the home.
+        return self.begin(cell, self._recover(cell, *self.open(cell)))
 
-    async def _recover(self, cell: Cell) -> None:
+    async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
         start = cell.extra().start
         assert start is not None
-        switch, live, recovering = self.open(cell)
         clock = self.clock
         assert clock is not None
         worker, recipe = await self.take(cell)

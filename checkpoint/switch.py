@@ -344,9 +344,10 @@ class Switch:
                     pass  # for whoever begins lives
         except ReplayDiverged as error:
             self.diverged = error
-            self.node.emit(RecoveryFailed(self.path, str(error)))
             if self.live is not None and not self.live.done():
-                self.live.set_exception(error)
+                self.live.set_exception(error)  # Whoever waits for it tells of it.
+            else:
+                self.node.emit(RecoveryFailed(self.path, str(error)))
             if self.cell is not None:
                 self.cell.kill()
 
