@@ -1,7 +1,7 @@
 """A root process with a SQLite store, run by `test_meeting_root.py`: python meeting_player.py STORE SEED STEPS.
 
-It starts and ends journaled dynamic children, and teaches, stops, restarts and erases a ledger, by a seeded plan. What it
-is about to do and has done it says on stdout; it is killed in the middle of it. First it says what it has found.
+It starts and ends journaled dynamic children, and teaches, stops, restarts and erases a ledger, by a seeded plan. What
+it is about to do and has done it says on stdout; it is killed in the middle of it. First it says what it has found.
 """
 
 from __future__ import annotations

@@ -38,8 +38,9 @@ async def end(system: hf.ActorSystem, how: str, spec: hf.ChildSpec, gate: Path) 
         case "its supervisor is killed and restarted":
             top(system).kill()
         case _:
+            cell = at(system)._cell
             call = top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
-    await system.node.settled()
+            await until(lambda: bool(cell.extra().urgent))  # The order to stop stands ahead of what is queued.
     let_through(gate)
     if how.startswith("stops"):
         await until(lambda: "/app/top/doer" not in system.tree())
