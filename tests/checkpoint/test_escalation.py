@@ -179,7 +179,7 @@ async def test_an_escalation_through_two_supervisors_counts_for_the_one_it_began
             event = await back(stream, hf.RolledBack, path)
         assert event.to_turn > 0
         await until(lambda: path in system.tree())
-        assert await system.ref(path, hf.Actor).ask(Seen(), timeout=20.0) == ["a"]  # type: ignore[arg-type]
+        assert await system.ref(path, hf.Actor).ask(Seen(), timeout=20.0) == ["a"]
 
 
 async def test_what_is_restarted_by_hand_or_killed_is_no_escalation(store: str | None, isolation: str) -> None:

@@ -22,7 +22,10 @@ async def running(store: str | None) -> AsyncIterator[hf.ActorSystem]:
 
 def doing(isolation: str, name: str = "doer", **options: Any) -> hf.ChildSpec:
     """A recorded child for a `tree` of this isolation."""
-    method = {"interval": NEVER, **{key: options.pop(key) for key in ("keep", "on_escalate") if key in options}}
+    method: dict[str, Any] = {
+        "interval": NEVER,
+        **{key: options.pop(key) for key in ("keep", "on_escalate") if key in options},
+    }
     own: Any = "process" if isolation == "process" else "task"
     options = {"shutdown": 8.0, **options}
     return hf.child(name, hf.start(Doer), isolation=own, recovery=hf.hybrid(**method), **options)
@@ -30,7 +33,8 @@ def doing(isolation: str, name: str = "doer", **options: Any) -> hf.ChildSpec:
 
 def tree(isolation: str, *children: hf.ChildSpec, **options: Any) -> hf.ChildSpec:
     own: Any = "process" if isolation == "subtree" else "task"
-    return hf.supervisor("top", children=children, isolation=own, **{"intensity": 100, **options})
+    flags: dict[str, Any] = {"intensity": 100, **options}
+    return hf.supervisor("top", children=children, isolation=own, **flags)
 
 
 def at(system: hf.ActorSystem, name: str = "doer") -> hf.ActorRef[Doer]:

@@ -15,7 +15,7 @@ from tests.checkpoint.trees import running
 class Pupil(hf.Actor):
     """Has a name, and learns words."""
 
-    def __init__(self, name: str, town: str = "nowhere") -> None:
+    def __init__(self, name: str = "nobody", town: str = "nowhere") -> None:
         self.words = [f"{name} of {town}"]
 
     @hf.on(Note)
@@ -44,7 +44,8 @@ PUPIL = hf.child(None, hf.start(Pupil), recovery=hf.hybrid())
 
 
 def school(template: hf.ChildSpec | None = None, **options: Any) -> hf.ChildSpec:
-    return hf.dynamic("school", template=template, journal=True, **{"intensity": 5, **options})
+    flags: dict[str, Any] = {"intensity": 5, **options}
+    return hf.dynamic("school", template=template, journal=True, **flags)
 
 
 @pytest.fixture(params=["memory", "sqlite"])
@@ -79,7 +80,7 @@ async def ids(system: hf.ActorSystem) -> list[str]:
 
 async def words(system: hf.ActorSystem, name: str) -> list[str]:
     await until(lambda: f"/app/school/{name}" in system.tree())
-    return await system.ref(f"/app/school/{name}", hf.Actor).ask(Seen(), timeout=20.0)  # type: ignore[arg-type]
+    return await system.ref(f"/app/school/{name}", hf.Actor).ask(Seen(), timeout=20.0)
 
 
 async def test_children_come_back_in_order_with_their_arguments_and_what_they_have_learnt(
