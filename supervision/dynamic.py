@@ -166,7 +166,7 @@ class DynamicSupervisor(Supervisor):
         raise NotSupported("a dynamic supervisor forgets stopped children: start it anew with StartChild")
 
     @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> None:
+    def _delete_child(self, message: DeleteChild) -> Any:
         """A stopped child is forgotten here."""
         self._child(message.id)
         raise NotSupported("a dynamic supervisor forgets stopped children by itself: use TerminateChild")

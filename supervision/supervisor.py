@@ -244,16 +244,11 @@ class Supervisor(Actor):
         return f"{self.ctx.path}/{one.spec.id}"
 
     def _erase(self, one: Child) -> None:
-        """Forget what was recorded of a child that does not run, and of all below it.
-
-        Raises:
-            HoldfastError: the store refused.
-        """
+        """Forget what was recorded of a child that does not run. Raises HoldfastError if the store refuses."""
         if one.cell is not None:
             lives.retire(one.cell, "it begins afresh")
-        spec = one.spec
-        if spec.is_supervisor or spec.recovery is not None:
-            self.ctx.cell.node.keeper.erase(self._path_of(one), below=spec.is_supervisor)
+        if one.spec.is_supervisor or one.spec.recovery is not None:
+            self.ctx.cell.node.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
 
     async def _restart_group(self, failed: Child, reason: ExitReason) -> None:
         """one_for_all and rest_for_one: stop the others newest first, then start all of them in order."""

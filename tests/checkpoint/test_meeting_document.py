@@ -81,6 +81,8 @@ async def test_what_comes_back_after_an_escalation(time: str, method: str, expec
     options = {} if method == "left out" else {"on_escalate": method.strip('`"')}
     async with running(None) as system:
         await system.start(tree("task", doing("task", **options), intensity=0))
+        before: list[str] = []
+        after: list[str] = []
         for number in range(TIMES[time]):
             for letter in "ab":
                 await add(system, f"{letter}{number}")
@@ -90,4 +92,4 @@ async def test_what_comes_back_after_an_escalation(time: str, method: str, expec
             with contextlib.suppress(hf.HoldfastError):
                 await escalate(system, "task")
             after = await seen(system)
-        assert after == {"as it was": before, "older snapshot": before[:-2], "fresh": []}[expected]
+    assert after == {"as it was": before, "older snapshot": before[:-2], "fresh": []}[expected]

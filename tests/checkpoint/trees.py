@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import holdfast as hf
 from tests.checkpoint.players import Do, Doer, Seen, until
@@ -15,17 +15,15 @@ from tests.checkpoint.strikes import NEVER
 
 
 @asynccontextmanager
-async def running(store: str | None) -> AsyncIterator[hf.ActorSystem]:
+async def running(store: str | None) -> AsyncGenerator[hf.ActorSystem, None]:
     async with hf.ActorSystem("app", store=store, log=False, intensity=1000) as system:
         yield system
 
 
 def doing(isolation: str, name: str = "doer", **options: Any) -> hf.ChildSpec:
     """A recorded child for a `tree` of this isolation."""
-    method: dict[str, Any] = {
-        "interval": NEVER,
-        **{key: options.pop(key) for key in ("keep", "on_escalate") if key in options},
-    }
+    method: dict[str, Any] = {"interval": NEVER}
+    method.update({key: options.pop(key) for key in ("keep", "on_escalate") if key in options})
     own: Any = "process" if isolation == "process" else "task"
     options = {"shutdown": 8.0, **options}
     return hf.child(name, hf.start(Doer), isolation=own, recovery=hf.hybrid(**method), **options)
@@ -47,7 +45,8 @@ def top(system: hf.ActorSystem) -> hf.ActorRef[hf.Supervisor]:
 
 async def seen(system: hf.ActorSystem, name: str = "doer") -> list[str]:
     await until(lambda: f"/app/top/{name}" in system.tree())
-    return await at(system, name).ask(Seen(), timeout=20.0)
+    ref: hf.ActorRef[Any] = system.ref(f"/app/top/{name}", hf.Actor)
+    return cast("list[str]", await ref.ask(Seen(), timeout=20.0))
 
 
 async def add(system: hf.ActorSystem, *words: str, name: str = "doer") -> None:
