@@ -7,7 +7,7 @@ import signal
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import holdfast as hf
 from tests.checkpoint.players import Do, Doer, Seen, until
@@ -46,7 +46,7 @@ def top(system: hf.ActorSystem) -> hf.ActorRef[hf.Supervisor]:
 async def seen(system: hf.ActorSystem, name: str = "doer") -> list[str]:
     await until(lambda: f"/app/top/{name}" in system.tree())
     ref: hf.ActorRef[Any] = system.ref(f"/app/top/{name}", hf.Actor)
-    return cast("list[str]", await ref.ask(Seen(), timeout=20.0))
+    return await ref.ask(Seen(), timeout=20.0)
 
 
 async def add(system: hf.ActorSystem, *words: str, name: str = "doer") -> None:
