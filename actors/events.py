@@ -119,6 +119,17 @@ class RecoveryFailed(Event, frozen=True, eq=False):
     reason: str
 
 
+class RolledBack(Event, frozen=True, eq=False):
+    """An actor comes back with an older state: what its turns after `to_turn` did to it, up to `from_turn`, is undone.
+
+    `to_turn` is -1 if it begins afresh. What has left stays out; what was not handled stays queued.
+    """
+
+    from_turn: int
+    to_turn: int
+    reason: str
+
+
 class MessageQuarantined(Event, frozen=True, eq=False):
     """A message that ended the process `deliveries` times in a row was put aside."""
 
@@ -136,6 +147,12 @@ class SnapshotTaken(Event, frozen=True, eq=False):
 
 class SnapshotFailed(Event, frozen=True, eq=False):
     """A snapshot could not be made or kept; journal and older snapshot stay."""
+
+    reason: str
+
+
+class StoreRefused(Event, frozen=True, eq=False):
+    """What a supervisor in another process wanted kept or erased could not be."""
 
     reason: str
 

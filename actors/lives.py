@@ -209,6 +209,10 @@ class FirstTurn(Item):
         if not self.started.done():
             self.started.set_result(None)
 
+    def ignored(self, cell: Cell, why: str) -> bool:
+        start_fails(cell, self, StartIgnored(cell.path, why))
+        return True
+
     def undelivered(self, cell: Cell, reason: str) -> None:
         self.fail_start(StartFailed(cell.path, reason))
 
@@ -255,9 +259,8 @@ class Kill(Item):
 
 def crash(cell: Cell, item: Any, error: BaseException) -> None:
     """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
-    if isinstance(error, Ignore) and isinstance(item, FirstTurn):  # No crash: it does not want to live.
-        start_fails(cell, item, StartIgnored(cell.path, error.why))
-        finish(cell, NORMAL)
+    if isinstance(error, Ignore) and hasattr(item, "ignored") and item.ignored(cell, error.why):
+        finish(cell, NORMAL)  # No crash: it does not want to live.
         return
     reason = exits.crash(error)
     fail = getattr(item, "fail", None)
@@ -265,6 +268,9 @@ def crash(cell: Cell, item: Any, error: BaseException) -> None:
         fail(remote_crash(error))
     elif isinstance(item, FirstTurn):
         start_fails(cell, item, StartFailed(cell.path, str(reason)))
+        if isinstance(error, StartFailed) and getattr(type(cell.actor), "_supervises", False):
+            finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).
+            return
     node = cell.node
     if node.watched:
         node.emit(ActorCrashed(cell.path, cell.life, reason, item))
@@ -378,7 +384,7 @@ def ended(cell: Cell, reason: ExitReason) -> None:
         _undo(cell)
     if cell.spec is not None and cell.parent is not None:
         if more is not None:
-            links.announce(cell, reason, recovering=cell.host.recovers(reason))
+            links.announce(cell, reason, recovering=cell.host.recovers(reason) and cell.spec.restarts(reason))
             tell_enders(more, reason)
         cell.parent.push(ChildExit(cell, cell.life, reason))
     else:

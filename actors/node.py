@@ -18,6 +18,7 @@ from .deadlines import Deadlines
 from .errors import ActorStopped, NameTaken, NoSuchActor, SendError, SpecError, WrongActor, type_name
 from .events import DeadLetter, Event, EventHub
 from .exits import ExitReason
+from .keeper import Keeper, NothingKept
 from .lives import LOCAL
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
@@ -56,6 +57,7 @@ class Node(RunLoop):
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
         self.here: Host = LOCAL  # lives in this very process
         self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
+        self.keeper: Keeper = NothingKept()
         self.respec: Callable[[Cell, Start[Any]], None] = begin_with  # has an actor's next lives begin with this
         self._seeds = random.Random(seed)
         self._numbers = itertools.count(1)

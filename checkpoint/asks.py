@@ -135,6 +135,13 @@ class Calls:
         if batch is None:
             own.commit(self._home.journal)
 
+    def abandon(self) -> None:
+        """What is still out concerns nobody any more."""
+        for ask in self.asks.values():
+            ask.is_over, ask.future = True, OVER
+        self.asks.clear()
+        self.sends.clear()
+
     def accepted(self, turn: int, k: int) -> None:
         """A `send` of ours was accepted. (Not journaled: under replay it is accepted unless it still waits.)"""
         self.sends.discard((turn, k))

@@ -73,7 +73,7 @@ class HomeBound:
             case "drop_newest":
                 if ask is not None:
                     ask.fail(MailboxFull(self._home.path, self.capacity))
-                self._home.lost(name, body, self._why())
+                self._home.ends.lost(name, body, self._why())
                 return False
             case "drop_oldest":
                 self._drop(keep=self.capacity - 1)
@@ -94,8 +94,8 @@ class HomeBound:
                 break
             if source.id not in (self._fed, home.partial_id):
                 self._behind.pop(source.id, None)
-                home.lost(source.name, source.body, self._why())
-                home.end_without_turn(source, error, batch)
+                home.ends.lost(source.name, source.body, self._why())
+                home.ends.without_turn(source, error, batch)
         batch.commit(home.journal)
 
     def room(self) -> asyncio.Future[None] | None:

@@ -12,7 +12,7 @@ import msgspec
 
 from ..actors import links, lives
 from ..actors.cell import DOWN, GONE, RUNNING, Cell
-from ..actors.errors import StartFailed
+from ..actors.errors import StartFailed, StartIgnored
 from ..actors.exits import KILLED, ExitReason
 from ..actors.mail import Item
 from ..actors.process import frames
@@ -58,6 +58,9 @@ class TaskHost(HomeHost, lives.LocalHost):
     async def _follow(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
         try:
             await self.until_live(cell, live, recovering)
+        except StartIgnored:
+            await cell.ended()  # The next life begins when this one is over.
+            raise
         except StartFailed as error:
             if cell.state not in (DOWN, GONE):  # Its replay diverged: the next life begins when this one is over.
                 cell.kill()
@@ -129,12 +132,12 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         start = cell.extra().start
         assert start is not None
         cell.table = start.kind._table
-        return self.begin(cell, self._recover(cell))
+        # Now, not in the task: from here on what is sent is admitted by the home.
+        return self.begin(cell, self._recover(cell, *self.open(cell)))
 
-    async def _recover(self, cell: Cell) -> None:
+    async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
         start = cell.extra().start
         assert start is not None
-        switch, live, recovering = self.open(cell)
         clock = self.clock
         assert clock is not None
         worker, recipe = await self.take(cell)

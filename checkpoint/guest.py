@@ -10,8 +10,9 @@ import msgspec
 
 from ..actors import exits, links, lives
 from ..actors.cell import DOWN, RUNNING, Cell, Host
-from ..actors.errors import StartFailed
+from ..actors.errors import StartFailed, StartIgnored
 from ..actors.exits import ExitReason, pack_exit
+from ..actors.keeper import child_key
 from ..actors.mail import Envelope, Item
 from ..actors.mailbox import Bounded
 from ..actors.message import message_name
@@ -64,6 +65,55 @@ class RecordedGuest:
         if spec.recovery is not None and spec.recovery.records:
             return InnerLifeHost(self._guest, spec.recovery, self._port)
         return self._guest.node.here
+
+
+class GuestKeeper:
+    """The root's keeper, as the supervisors of this process speak to it: in order with everything else they say."""
+
+    def __init__(self, guest: Guest, notes: dict[str, bytes], known: list[str]) -> None:
+        self._guest, self._notes, self._known = guest, dict(notes), set(known)
+
+    def _say(self, what: str, path: str, **data: Any) -> None:
+        root = self._guest.node.root
+        assert root is not None
+        self._guest.command(root, "keep", {"what": what, "path": path, **data})
+
+    def knows(self, path: str) -> bool:
+        """Whether anything was ever recorded at this address, and not erased since."""
+        return path in self._known
+
+    def begins(self, path: str) -> None:
+        """Something is recorded there from now on."""
+        self._known.add(path)
+
+    def erase(self, path: str, *, below: bool) -> None:
+        """Have the root forget what was recorded there."""
+        self._known.discard(path)
+        if below:
+            prefix = f"{path}/"
+            self._known = {one for one in self._known if not one.startswith(prefix)}
+            for key in self.notes(child_key(path, "")):
+                del self._notes[key]
+        self._say("erase", path, below=below)
+
+    def blame(self, path: str) -> None:
+        """The supervisor above this address ends because of the actor there."""
+        self._say("blame", path)
+
+    def returned(self, path: str, period: float) -> None:
+        """A supervisor in this process is started again."""
+        self._say("returned", path, period=period)
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep the fact that a supervisor has a child; None forgets it."""
+        self._notes.pop(key, None)
+        if value is not None:
+            self._notes[key] = value
+        self._say("note", key.removeprefix("child "), value=value)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """The facts whose keys begin so, oldest first."""
+        return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
 
 
 class Port:
@@ -161,6 +211,8 @@ class InnerLifeHost(LifeHost):
         more = cell.extra()
         start = more.start
         assert start is not None
+        if isinstance(cell.node.keeper, GuestKeeper):
+            cell.node.keeper.begins(cell.path)
         cell.table = start.kind._table
         cell.admit = self._admit
         if more.bound is not None:  # The home counts.
@@ -207,13 +259,18 @@ class InnerLifeHost(LifeHost):
             self._up.exception()  # Nobody may be left to look.
 
     def _closed(self, cell: Cell) -> None:
-        self._life = None
+        life, self._life = self._life, None
         self._say_closed(cell)
-        self._fail(cell, StartFailed(cell.path, str(cell.extra().reason)))
+        if life is not None and life.ignored_why is not None:
+            self._fail(cell, StartIgnored(cell.path, life.ignored_why))
+        else:
+            self._fail(cell, StartFailed(cell.path, str(cell.extra().reason)))
 
     def _say_closed(self, cell: Cell) -> None:
         assert self._port is not None
-        self._port.to_home(Closed(self._number, pack_exit(cell.extra().reason)))
+        reason = cell.extra().reason
+        recovers = self.recovers(reason) and cell.spec is not None and cell.spec.restarts(reason)
+        self._port.to_home(Closed(self._number, pack_exit(reason), recovers))
 
     def kill(self, cell: Cell) -> None:
         if cell.state is DOWN and self._up is not None and not self._up.done():

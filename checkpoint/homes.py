@@ -8,18 +8,22 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from ..actors.cell import GONE, RUNNING, Cell
-from ..actors.errors import HoldfastError, StartFailed
+from ..actors.errors import HoldfastError, StartFailed, StartIgnored
 from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
+from ..actors.keeper import child_key
 from .bound import HomeBound
 from .journal import Journal
 from .method import Method
+from .rollback import roll_back
 from .switch import Switch
 
 if TYPE_CHECKING:
     from ..actors.node import Node
 
 ENDED = "it ended before it was live"
+ERASING = "erasing"
+"""The fact that names the address whose tree is being erased."""
 
 
 class Homes:
@@ -28,12 +32,19 @@ class Homes:
     def __init__(self, node: Node, journal: Journal) -> None:
         self.node, self.journal = node, journal
         self._switches: dict[str, Switch] = {}
+        self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
+        self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
+        unfinished = journal.notes(ERASING).get(ERASING)
+        self._stored = set(journal.addresses())
+        if unfinished is not None:  # This process's predecessor died in the middle of it.
+            self._erase_tree(unfinished.decode())
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for."""
         switch = self._switches.get(cell.path)
         if switch is None:
             switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self.journal)
+        self.absolve(cell.path)
         switch.method = method
         switch.cell = cell
         more = cell.extra()
@@ -48,10 +59,75 @@ class Homes:
         switch = self._switches.get(path)
         return None if switch is None or switch.cell is None or switch.cell.state is GONE else switch.cell
 
-    def erase(self, path: str) -> None:
-        """Forget all about an address."""
-        self._switches.pop(path, None)
-        self.journal.erase(path)
+    # -- what supervisors say (`Keeper`) ----------------------------------------------------------------------------
+
+    def knows(self, path: str) -> bool:
+        """Whether anything was ever recorded at this address, and not erased since."""
+        return path in self._switches or path in self._stored
+
+    def known(self, above: str) -> list[str]:
+        """The addresses below one, at which anything was recorded."""
+        prefix = f"{above}/"
+        return [path for path in {**dict.fromkeys(self._stored), **self._switches} if path.startswith(prefix)]
+
+    def erase(self, path: str, *, below: bool) -> None:
+        """Forget all about an address where nobody lives; with `below`, also about all addresses below it.
+
+        Raises:
+            HoldfastError: the store refused. What is left is erased when it is opened again.
+        """
+        if not below:
+            self._erase(path)
+            return
+        self.journal.note(ERASING, path.encode())
+        self._erase_tree(path)
+
+    def _erase_tree(self, top: str) -> None:
+        for path in (top, *self.known(top)):
+            self._erase(path)
+        for key in self.journal.notes(child_key(top, "")):
+            self.journal.note(key, None)
+        self.journal.note(ERASING, None)
+
+    def _erase(self, path: str) -> None:
+        self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
+        self._stored.discard(path)
+        self._blamed.discard(path)
+        self._returns.pop(path, None)
+        switch = self._switches.pop(path, None)
+        if switch is not None:
+            switch.ends.erased("what was recorded of it has been erased")
+
+    def blame(self, path: str) -> None:
+        """The supervisor above this address ends because of the actor there."""
+        self._blamed.add(path)
+
+    def absolve(self, path: str) -> None:
+        """A life begins there: what happens from now on has other causes."""
+        self._blamed.discard(path)
+
+    def returned(self, path: str, period: float) -> None:
+        """The supervisor at `path` is started again by its own: who was to blame comes back as its method says."""
+        prefix, now = f"{path}/", self.node.loop.time()
+        for blamed in [one for one in self._blamed if one.startswith(prefix)]:
+            switch = self._switches.get(blamed)
+            if switch is None:
+                continue
+            times = [*(when for when in self._returns.get(blamed, ()) if now - when <= period), now]
+            self._returns[blamed] = times
+            why = f"its supervisor has ended because of it, {len(times)} time(s) within {period:g} s"
+            try:
+                roll_back(switch, switch.method.after_escalation(len(times)), why)
+            except HoldfastError as error:
+                self.node.emit(RecoveryFailed(blamed, f"it comes back as it was: {error}"))
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep a small fact; None forgets it."""
+        self.journal.note(key, value)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """The facts whose keys begin so, oldest first."""
+        return self.journal.notes(prefix)
 
     def close(self) -> None:
         """Close the store."""
@@ -144,7 +220,7 @@ class HomeHost:
             return
         for topic in (*topics, *self.switch.topics):
             cell.node.topics.unsubscribe(topic, cell)
-        self.switch.drop_all("it has stopped", keep_tells=restarting)
+        self.switch.ends.drop_all("it has stopped", keep_tells=restarting)
 
     async def until_live(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
         """Wait until a life has caught up, and tell of it.
@@ -159,7 +235,8 @@ class HomeHost:
             restore_seconds = await live
             clock.mark("replay", switch.live_at)
         except HoldfastError as error:
-            node.emit(RecoveryFailed(cell.path, str(error)))
+            if not isinstance(error, StartIgnored):
+                node.emit(RecoveryFailed(cell.path, str(error)))
             raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
         except asyncio.CancelledError:
             raise StartFailed(cell.path, "it was stopped while it started") from None

@@ -112,12 +112,12 @@ class Journal(Protocol):
         """Append (address, entry) pairs as one: all or none. Returns their positions, rising ints."""
         ...
 
-    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int) -> None:
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep the snapshot, made after `turn`, then forget the positions it contains (T10: in this order).
 
-        The two newest snapshots are kept. `drop` is only marked now and physically removed by the next cut of the
-        address, so that the older snapshot stays usable for as long as it is kept. Positions in `drop` that the
-        address does not have are ignored.
+        With `keep=2` the one before it is kept too: then `drop` is only marked now and physically removed by the next
+        cut of the address, so that the older snapshot stays usable for as long as it is kept. With `keep=1` nothing
+        older remains. Positions in `drop` that the address does not have are ignored.
         """
         ...
 
@@ -148,6 +148,10 @@ class Journal(Protocol):
 
     def noted(self, key: str) -> bytes | None:
         """The fact of that name, or `None`."""
+        ...
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """All facts whose keys begin so, in the order in which they were last written."""
         ...
 
     def close(self) -> None:
@@ -181,7 +185,7 @@ class MemoryJournal:
         self._last += count
         return list(range(first, first + count))
 
-    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int) -> None:
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Do nothing: the switch keeps the snapshot."""
 
     def load(self, address: str, *, older: bool = False) -> Saved:
@@ -197,14 +201,17 @@ class MemoryJournal:
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep the fact until the process ends."""
-        if value is None:
-            self._notes.pop(key, None)
-        else:
+        self._notes.pop(key, None)
+        if value is not None:
             self._notes[key] = value
 
     def noted(self, key: str) -> bytes | None:
         """Return the fact of that name, or `None`."""
         return self._notes.get(key)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """Return the facts whose keys begin so."""
+        return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
 
     def close(self) -> None:
         """Do nothing."""

@@ -26,6 +26,7 @@ from .records import (
     Begin,
     Feed,
     Go,
+    Ignored,
     Live,
     Out,
     Outcome,
@@ -76,6 +77,7 @@ class Life:
         self.has_replayed = False
         self.begins_suspended = False
         self.in_hook = False
+        self.ignored_why: str | None = None
         self._snapshot_turn = -1
         self._state: list[bytes] = []
         self._has_state = False
@@ -202,6 +204,14 @@ class Life:
         self.outs = []
         if self.page is not None:
             self.page[0] = 0
+
+    def ignore(self, why: str) -> None:
+        """The actor does not want to be started: turn 0 stays open for the next start."""
+        self.feed, self.outs, self.ignored_why = None, [], why
+        self.in_hook = True  # What is left is `on_stop`.
+        if self.page is not None:
+            self.page[0] = 0
+        self.port.to_home(Ignored(why))
 
     def fail_turn(self, error: BaseException) -> None:
         """The turn raised: what it has not released is dropped, its asker gets the error."""

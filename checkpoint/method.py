@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+from typing import Literal, get_args
 
 from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
 
 Durability = Literal["memory", "os", "fsync"]
+OnEscalate = Literal["restore", "older_snapshot", "fresh"]
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -19,6 +20,18 @@ class Method:
     interval: float = 0.0
     max_deliveries: int = 5
     journal_limit: int = 256_000_000
+    keep: int = 2
+    on_escalate: OnEscalate | None = None
+
+    def after_escalation(self, times: int) -> OnEscalate:
+        """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
+
+        >>> [hybrid().after_escalation(times) for times in (1, 2, 3)]
+        ['restore', 'older_snapshot', 'restore']
+        """
+        if self.on_escalate is not None:
+            return self.on_escalate
+        return "older_snapshot" if times == 2 else "restore"
 
     @property
     def records(self) -> bool:
@@ -46,6 +59,8 @@ def hybrid(
     pacing: Literal["fast"] = "fast",
     max_deliveries: int = 5,
     journal_limit: int = 256_000_000,
+    keep: int = 2,
+    on_escalate: OnEscalate | None = None,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -54,6 +69,11 @@ def hybrid(
         pacing: "fast" replays as quickly as the handlers run.
         max_deliveries: process deaths in the turn of one and the same message after which it is quarantined.
         journal_limit: bytes of messages kept since the last snapshot; when it is reached, sends wait or are refused.
+        keep: snapshots that are kept: 2, or 1 to save the memory or disk of the older one.
+        on_escalate: what happens when its supervisor has ended because of it and was restarted: "restore" what there
+            is; go back to the "older_snapshot", without the turns since; begin "fresh". In all cases what has not been
+            handled stays queued. Left out: an older snapshot the second time within the window of whoever restarted
+            the supervisor, else restore.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -66,4 +86,9 @@ def hybrid(
         raise SpecError("hybrid", f"max_deliveries must be a whole number >= 1, not {max_deliveries!r}")
     if not isinstance(journal_limit, int) or isinstance(journal_limit, bool) or journal_limit < 1:
         raise SpecError("hybrid", f"journal_limit must be bytes > 0, not {journal_limit!r}")
-    return Method("hybrid", float(interval), max_deliveries, journal_limit)
+    if keep not in (1, 2) or isinstance(keep, bool):
+        raise SpecError("hybrid", f"keep must be 1 or 2, not {keep!r}")
+    if on_escalate is not None and on_escalate not in get_args(OnEscalate):
+        known = ", ".join(map(repr, get_args(OnEscalate)))
+        raise SpecError("hybrid", f"on_escalate must be one of {known} or left out, not {on_escalate!r}")
+    return Method("hybrid", float(interval), max_deliveries, journal_limit, int(keep), on_escalate)

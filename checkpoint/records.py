@@ -196,9 +196,16 @@ class Closed(msgspec.Struct, array_like=True, tag=18):
 
     number: int
     reason: dict[str, Any]
+    recovers: bool = False
 
 
-ToHome = Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed
+class Ignored(msgspec.Struct, array_like=True, tag=19):
+    """The actor does not want to be started."""
+
+    why: str
+
+
+ToHome = Ignored | Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed
 
 PIECE = 4 * 1024 * 1024
 """Bytes of state per record, so that a large state does not hold up everything else."""

@@ -16,7 +16,31 @@ if TYPE_CHECKING:
     from .switch import Switch
 
 FORMAT = 1
-_META = tuple[int, int, int, list[int], dict[str, Saved], list[str], int, bytes]
+
+
+class Meta(msgspec.Struct, array_like=True, frozen=True):
+    """A snapshot, with what the home knew when it came.
+
+    `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
+    were undone. An empty `state` stands for none: the actor begins afresh. `later` are the inputs whose reply was to
+    come later. (Stores of before have neither `base` nor `later`.)
+    """
+
+    format: int
+    turn: int
+    next_id: int
+    stash: list[int]
+    timers: dict[str, Saved]
+    topics: list[str]
+    epoch: int
+    state: bytes
+    base: int = -1
+    later: list[int] = []
+
+
+def decode_meta(data: bytes) -> Meta:
+    """A snapshot as the store has it."""
+    return msgspec.msgpack.decode(data, type=Meta)
 
 
 def cut(home: Switch, state: bytes, record: Snapshot) -> None:
@@ -25,26 +49,38 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     Raises:
         HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
     """
-    covered = [number for number in home.turns if number <= record.turn]
+    turn, older = record.turn, home.newest
+    meta = Meta(
+        FORMAT, turn, home.next_id, record.stash, home.timers.saved(), list(home.topics), home.journal.epoch, state,
+        turn, list(home.later),
+    )  # fmt: skip
+    put(home, meta, home.method.keep)
+    # In a store that lasts it is read back when it is wanted.
+    home.older = older if home.method.keep > 1 and not home.journal.durable else None
+
+
+def put(home: Switch, meta: Meta, keep: int) -> None:
+    """Have the next life begin with this, and forget the turns up to `meta.turn`; `keep` as in `Journal.cut`.
+
+    Raises:
+        HoldfastError: it could not be kept, and nothing has changed.
+    """
+    covered = [number for number in home.turns if number <= meta.turn]
     if home.journal.durable:
         drop = [*home.dropped, *(position for number in covered for position in home.positions.get(number, ()))]
         for number in covered:
             source = home.turns[number].input
             if source.id not in home.open:  # Else it is stashed, and not handled yet.
                 drop.extend(source.positions)
-        meta = (
-            FORMAT, record.turn, home.next_id, record.stash, home.timers.saved(), list(home.topics),
-            home.journal.epoch, state,
-        )  # fmt: skip
-        home.journal.cut(home.path, msgspec.msgpack.encode(meta), drop, turn=record.turn)
+        home.journal.cut(home.path, msgspec.msgpack.encode(meta), drop, turn=meta.turn, keep=keep)
     home.dropped.clear()
-    home.state, home.state_turn, home.stash = state, record.turn, record.stash
+    home.newest, home.stash = meta, meta.stash
     done = (home.turns.pop(number) for number in covered)
     home.bytes -= sum(len(turn.input.body) + OVERHEAD for turn in done if turn.status != STASHED)
     for known in (home.positions, home.pipes_done):
-        for number in [number for number in known if number <= record.turn]:
+        for number in [number for number in known if number <= meta.turn]:
             del known[number]
-    for key in [key for key in home.calls.outcomes if key[0] <= record.turn]:
+    for key in [key for key in home.calls.outcomes if key[0] <= meta.turn]:
         del home.calls.outcomes[key]
 
 
@@ -53,11 +89,9 @@ def load(home: Switch) -> None:
     saved = home.journal.load(home.path)
     timers: dict[str, Saved] = {}
     if saved.snapshot is not None:
-        _, home.turn, home.next_id, home.stash, timers, topics, _, home.state = msgspec.msgpack.decode(
-            saved.snapshot, type=_META
-        )
-        home.state_turn = home.turn
-        home.topics = dict.fromkeys(topics)
+        meta = home.newest = decode_meta(saved.snapshot)
+        home.turn, home.next_id, home.stash, timers = meta.turn, meta.next_id, meta.stash, dict(meta.timers)
+        home.topics = dict.fromkeys(meta.topics)
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     for source in home.open.values():

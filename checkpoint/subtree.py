@@ -15,6 +15,7 @@ from ..actors.cell import DOWN, GONE, RUNNING, Cell
 from ..actors.control.calls import Call, send_call
 from ..actors.errors import HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
+from ..actors.keeper import child_key
 from ..actors.mail import Item
 from ..actors.mailbox import Bound
 from ..actors.process import frames
@@ -40,6 +41,8 @@ class SubtreeHost(ProcessHost):
 
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
         worker, recipe = await super().take(cell)
+        kept = self._homes.notes(child_key(cell.path, ""))
+        self._options = {"kept": kept, "known": self._homes.known(cell.path)}
         slots = Slots(len(worker.page))
 
         def taker(path: str) -> frames.TakeRecord:
@@ -108,7 +111,7 @@ class SubtreeHome(HomeHost):
             self._begin(record)
         elif isinstance(record, Closed):
             if self._wanted is not None and record.number == self._wanted.number:
-                self._closed(unpack_exit(record.reason))
+                self._closed(unpack_exit(record.reason), recovers=record.recovers)
         elif self.switch is not None and self._wanted is not None:
             self.switch.from_life(record)
 
@@ -160,7 +163,13 @@ class SubtreeHome(HomeHost):
             RemoteLife(self.path, worker).to_life(Started(wanted.number, problem))
 
     def _closed(
-        self, reason: ExitReason, running: int = -1, *, ordered: bool = True, noticed: float | None = None
+        self,
+        reason: ExitReason,
+        running: int = -1,
+        *,
+        recovers: bool = True,
+        ordered: bool = True,
+        noticed: float | None = None,
     ) -> None:
         """The life is over: tell whom it concerns here; its supervisor decides what follows."""
         cell = self.cell
@@ -171,7 +180,7 @@ class SubtreeHome(HomeHost):
         cell.state = DOWN
         more = cell.extra()
         more.reason = reason
-        links.announce(cell, reason, recovering=self.recovers(reason))
+        links.announce(cell, reason, recovering=recovers and self.recovers(reason))
         lives.tell_enders(more, reason)
 
     def lost(self, worker: Worker, reason: ExitReason) -> None:

@@ -18,26 +18,25 @@ from ..actors import links
 from ..actors.cell import Cell
 from ..actors.codec import Parcel
 from ..actors.errors import (
-    ActorStopped,
     AskDeadlock,
     HoldfastError,
-    MailboxFull,
-    Quarantined,
     ReplayDiverged,
+    StartIgnored,
 )
-from ..actors.events import JournalFull, MessageQuarantined, RecoveryFailed, SnapshotFailed, SnapshotTaken
+from ..actors.events import RecoveryFailed, SnapshotFailed, SnapshotTaken
 from ..actors.exits import pack_exit
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
 from .asks import Calls, SwitchAsk, answer_ask
 from .bound import HomeBound
+from .ends import Ends
 from .inputs import OVERHEAD, Batch, Input, Turn
 from .journal import Journal
+from .limit import Limit
 from .method import Method
 from .outputs import Outputs
 from .records import (
     DOWN,
-    DROPPED,
     EXIT,
     FAILED,
     LATER,
@@ -51,6 +50,7 @@ from .records import (
     Answer,
     Closed,
     Go,
+    Ignored,
     Live,
     Out,
     PipeDone,
@@ -65,7 +65,7 @@ from .records import (
     Wanted,
     pieces,
 )
-from .saved import cut, load
+from .saved import Meta, cut, load
 from .timers import Timers
 
 if TYPE_CHECKING:
@@ -96,11 +96,13 @@ class Switch:
         self.later: dict[int, Ask] = {}
         self.timers = Timers(self)
         self.outputs = Outputs(self)
+        self.ends = Ends(self)
+        self.limit = Limit(self)
         self.bound: HomeBound | None = None
         self.pipes_done: dict[int, set[int]] = {}
         self.topics: dict[str, None] = {}
-        self.state: bytes | None = None
-        self.state_turn = -1
+        self.newest: Meta | None = None  # the snapshot to begin with
+        self.older: Meta | None = None  # the one before it, if the store does not have it
         self.stash: list[int] = []
         self.live: asyncio.Future[float] | None = None
         self.live_at = 0.0
@@ -111,11 +113,9 @@ class Switch:
         self.unsaved: list[str] = []  # why, for each of those
         self.next_id = 0
         self.bytes = 0
-        self._waiters: list[asyncio.Future[None]] = []
         self._incoming: list[bytes] = []
         self.positions: dict[int, list[int]] = {}  # in the journal, of what belongs to a turn besides its input
         self.dropped: list[int] = []  # the same of inputs that ended without a turn
-        self._full_told = False
         self._replay_k = 0
         self._replay_turn = -1
         load(self)
@@ -138,7 +138,8 @@ class Switch:
             if type(message) not in cell.table:
                 cell.require(message)
             name, body = message_name(type(message)), self.node.codec.encode(message, self.path)
-        if self.bytes >= self.method.journal_limit and not self._make_room(ask):
+        if self.bytes >= self.method.journal_limit:
+            self.limit.refuse(ask)
             return
         origin = None if sender is None else sender.path
         if self.bound is None or self.bound.makes_room(ask, name, body, origin):
@@ -156,28 +157,11 @@ class Switch:
         """Whether a turn of ours waits for this ask."""
         return any(path == self.path and number in self.open for path, number in ask.chain)
 
-    def _make_room(self, ask: Ask | None) -> bool:
-        """The journal is at its limit: have a snapshot taken, and refuse until it is cut."""
-        if not self._full_told:
-            self._full_told = True
-            self.node.emit(JournalFull(self.path, self.state_turn, self.bytes))
-        if self.port is not None:
-            self.port.to_life(SnapshotNow())
-        error = MailboxFull(self.path, len(self.open))
-        if ask is None:
-            raise error
-        ask.fail(error)
-        return False
-
     def room(self) -> asyncio.Future[None] | None:
         """For `send`: None while the journal has room."""
-        if self.bytes < self.method.journal_limit:
-            return None if self.bound is None else self.bound.room()
-        if self.port is not None:
-            self.port.to_life(SnapshotNow())
-        future: asyncio.Future[None] = self.node.loop.create_future()
-        self._waiters.append(future)
-        return future
+        if self.limit.is_reached:
+            return self.limit.wait()
+        return None if self.bound is None else self.bound.room()
 
     def backlog(self, running: int) -> int:
         """Messages and ticks that wait; `running` is the input in hand, -1 if none."""
@@ -231,9 +215,19 @@ class Switch:
     # -- recovery ---------------------------------------------------------------------------------------------------
 
     @property
+    def state(self) -> bytes | None:
+        """The state to begin with, if there is any."""
+        return self.newest.state or None if self.newest is not None else None
+
+    @property
+    def state_turn(self) -> int:
+        """The turn that the next life begins after, apart from what is replayed to it; -1: none."""
+        return self.newest.turn if self.newest is not None else -1
+
+    @property
     def is_new(self) -> bool:
-        """Whether nothing was ever handled here."""
-        return self.turn < 0 and self.state is None
+        """Whether nothing was ever handled here, or all of it was undone."""
+        return self.turn == self.state_turn and self.state is None
 
     def prepare(self) -> asyncio.Future[float]:
         """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
@@ -303,15 +297,9 @@ class Switch:
             return
         source.deliveries += 1
         if source.deliveries >= self.method.max_deliveries:
-            self.node.emit(MessageQuarantined(self.path, source.name, source.deliveries))
-            error = Quarantined(self.path, source.deliveries)
-            # It uses up the number of its turn: what that has sent, and asks it has out, are not another's.
-            batch = Batch()
-            self._end(source, self.turn + 1, DROPPED, batch)
-            self._give(source, Answer(*self.node.codec.encode_error(error)), batch)
-            batch.commit(self.journal)
+            self.ends.quarantine(source)
 
-    def _end(self, source: Input, number: int, status: str, batch: Batch) -> None:
+    def end_turn(self, source: Input, number: int, status: str, batch: Batch) -> None:
         """A turn is over: its end record."""
         turn = self.turns[number] = Turn(source, status, self.partial)
         self.partial, self.partial_id = [], -1
@@ -328,58 +316,6 @@ class Switch:
     def positions_of(self, turn: int) -> list[int]:
         """Where in the journal a turn's own entries stand."""
         return self.positions.setdefault(turn, [])
-
-    def end_without_turn(self, source: Input, answer: Answer, batch: Batch) -> None:
-        """An input that will not be handled: it gets an end record all the same."""
-        del self.open[source.id]
-        self.bytes -= len(source.body) + OVERHEAD
-        if self.bound is not None:
-            self.bound.ended(source)
-        self.dropped.extend(source.positions)
-        batch.add(self.path, ("drop", source.id), self.dropped)
-        self._give(source, answer, batch)
-
-    def drop_all(self, why: str, *, keep_tells: bool = False) -> None:
-        """Nobody lives here any more: whoever waits is told, the rest goes to dead letters.
-
-        `keep_tells`: it is the actor's supervisor that has ended. Both may be started again, so what nobody waits for
-        stays for the next life.
-        """
-        batch = Batch()
-        if self.live is not None and not self.live.done():
-            self.live.cancel()
-        self.timers.pause()
-        if self.bound is not None:
-            self.bound.release(ActorStopped(self.path, why))
-        for source in list(self.open.values()):
-            if source.kind == START or (keep_tells and source.ask is None):
-                continue
-            if source.ask is None and source.kind == MESSAGE:
-                self.lost(source.name, source.body, why)
-            self.end_without_turn(source, Answer(*self.node.codec.encode_error(ActorStopped(self.path, why))), batch)
-        batch.commit(self.journal)
-        for ask in self.later.values():
-            ask.fail(ActorStopped(self.path, why))
-        self.later.clear()
-        self._wake_waiters()
-
-    def _wake_waiters(self) -> None:
-        waiters, self._waiters = self._waiters, []
-        for waiter in waiters:
-            if not waiter.done():
-                waiter.set_result(None)
-
-    def lost(self, name: str, body: bytes, why: str) -> None:
-        """A message that will not be handled, and nobody waits for."""
-        cell = self.cell
-        if cell is None:
-            return
-        try:
-            message = self.node.codec.decode(cell.table.kind_named(name), body)
-        except (HoldfastError, msgspec.DecodeError):
-            self.node.dead_letter(cell, Parcel(name, body), why)
-        else:
-            cell.undelivered(message, why)
 
     # -- what the life says -----------------------------------------------------------------------------------------
 
@@ -401,13 +337,17 @@ class Switch:
                     self._pipe_done(record)
                 case Unsaved():
                     self.node.emit(SnapshotFailed(self.path, record.problem))
+                case Ignored():
+                    if self.live is not None and not self.live.done():
+                        self.live.set_exception(StartIgnored(self.path, record.why))
                 case Wanted() | Closed():
                     pass  # for whoever begins lives
         except ReplayDiverged as error:
             self.diverged = error
-            self.node.emit(RecoveryFailed(self.path, str(error)))
             if self.live is not None and not self.live.done():
-                self.live.set_exception(error)
+                self.live.set_exception(error)  # Whoever waits for it tells of it.
+            else:
+                self.node.emit(RecoveryFailed(self.path, str(error)))
             if self.cell is not None:
                 self.cell.kill()
 
@@ -470,12 +410,12 @@ class Switch:
             return
         batch = Batch()
         self._take(end.turn, end.id, end.outs, batch)
-        self._end(source, end.turn, end.status, batch)
+        self.end_turn(source, end.turn, end.status, batch)
         if end.answer.kind == LATER:
             if source.ask is not None:
                 self.later[end.id] = source.ask
         elif end.status != STASHED:
-            self._give(source, end.answer, batch)
+            self.give(source, end.answer, batch)
         batch.commit(self.journal)
 
     def _replayed(self, end: TurnEnd) -> None:
@@ -486,7 +426,7 @@ class Switch:
         if past is None or seen != len(past.digests) or end.status != past.status:
             raise ReplayDiverged(self.path, end.turn, seen + 1)
 
-    def _give(self, source: Input, answer: Answer, batch: Batch) -> None:
+    def give(self, source: Input, answer: Answer, batch: Batch) -> None:
         """Answer the ask of an input, behind the append."""
         ask, source.ask = source.ask, None
         if ask is None or answer.kind == NOTHING:
@@ -521,7 +461,6 @@ class Switch:
                 self.is_void, self.unsaved = True, [*self.unsaved, str(error)]
                 self.cell.kill()
             return
-        self._full_told = False
-        self._wake_waiters()
+        self.limit.cut()
         if self.node.watched:
             self.node.emit(SnapshotTaken(self.path, record.turn, len(state), record.pause))

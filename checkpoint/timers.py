@@ -54,7 +54,7 @@ class Timers:
         home = self._home
         for source in list(home.open.values()):
             if source.kind == TICK and source.origin == timer and source.id != running:
-                home.end_without_turn(source, Answer(), batch)
+                home.ends.without_turn(source, Answer(), batch)
 
     def pause(self) -> None:
         """The address is given up: what remains runs on with the next life."""
@@ -72,6 +72,15 @@ class Timers:
             if timer.handle is None:
                 timer.due += loop.time()
                 timer.handle = loop.call_at(timer.due, self._tick, key)
+
+    def replace(self, saved: dict[str, Saved]) -> None:
+        """Have these instead of those there are; they run on with the next life."""
+        for timer in self._states.values():
+            if timer.handle is not None:
+                timer.handle.cancel()
+        self._states = {
+            key: TimerState(name, body, max(0.0, left), interval) for key, (name, body, left, interval) in saved.items()
+        }
 
     def saved(self) -> dict[str, Saved]:
         """All of them, with the time that is left."""

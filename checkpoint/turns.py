@@ -121,6 +121,12 @@ class Fed(Item):
         else:
             life.close_turn(OK, answer if self.feed.is_ask else Answer())
 
+    def ignored(self, cell: Cell, why: str) -> bool:
+        """Called when the turn raised `Ignore`: only `on_start` may mean it."""
+        if self.feed.kind == START:
+            self.life.ignore(why)
+        return self.feed.kind == START
+
     def fail(self, error: BaseException) -> None:
         """Called when the turn crashed the actor."""
         self.life.fail_turn(error.__cause__ or error)
@@ -153,6 +159,12 @@ class Hook(Item):
         except Refusal as no:
             raise StartFailed(self.life.cell.path, str(no)) from no
         self.over()
+
+    def ignored(self, cell: Cell, why: str) -> bool:
+        """Called when the hook raised `Ignore`."""
+        if self.name == "on_start":
+            self.life.ignore(why)
+        return self.name == "on_start"
 
     def over(self) -> None:
         """The hook has returned."""

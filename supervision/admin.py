@@ -111,13 +111,14 @@ class StartChild(Message[Any]):
     """Start one more child; the reply is its ref, or None if it did not want to be started (`Ignore`).
 
     `spec` is a child spec; a dynamic supervisor takes a bare `start(...)` too. From a template a child is started by
-    `StartChild(args=(...), kwargs={...}, id=...)`.
+    `StartChild(args=(...), kwargs={...}, id=...)`. With `fresh` nothing comes back that was recorded at its address.
     """
 
     spec: Any = None
     args: tuple[Any, ...] = ()
     kwargs: dict[str, Any] = msgspec.field(default_factory=dict[str, Any])
     id: str | None = None
+    fresh: bool = False
 
     def __post_init__(self) -> None:
         msgspec.structs.force_setattr(self, "spec", boxed(self.spec))
@@ -134,15 +135,20 @@ class TerminateChild(Message[None]):
 
 
 class RestartChild(Message[Any]):
-    """Start a stopped child again; the reply is its ref, or None if it did not want to be started."""
+    """Start a stopped child again; the reply is its ref, or None if it did not want to be started.
+
+    With `fresh` what was recorded of it (of a supervisor: of all below it) is erased first.
+    """
 
     id: str
+    fresh: bool = False
 
 
 class DeleteChild(Message[None]):
-    """Forget a stopped child."""
+    """Forget a stopped child, and (unless `erase` is False) what was recorded of it and of all below it."""
 
     id: str
+    erase: bool = True
 
 
 class ChildInfo(Message[None]):

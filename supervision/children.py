@@ -8,8 +8,10 @@ from collections import deque
 from typing import Any
 
 from ..actors.cell import Cell
+from ..actors.errors import NoSuchActor, StartFailed
 from ..actors.exits import ExitReason
 from ..actors.mail import Item
+from .admin import ChildInfo
 from .spec import ChildSpec
 
 # What a child may be in, as `WhichChildren` tells it.
@@ -37,6 +39,33 @@ class Child:
     def is_running(self) -> bool:
         """Whether a life is lived there now, or is being brought back."""
         return self.state in (UP, RECOVERING)
+
+    def info(self, above: str) -> ChildInfo:
+        """As `WhichChildren` tells it."""
+        return ChildInfo(self.spec.id, self.state, f"{above}/{self.spec.id}", self.spec.is_supervisor)
+
+
+def new_cell(own: Cell, spec: ChildSpec) -> Cell:
+    """An address below a supervisor's, for the lives of a child.
+
+    Raises:
+        StartFailed: a binding points nowhere. NameTaken: somebody else lives there.
+    """
+    node = own.node
+    targets = {port: node.find(path) for port, path in spec.bindings.items()}
+    for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
+        if target is None:
+            missing = NoSuchActor(spec.bindings[port])
+            raise StartFailed(f"{own.path}/{spec.id}", f"binding {port!r}: {missing}") from missing
+    cell = node.cell_below(own, spec.id, node.host_for(spec))
+    cell.spec = spec
+    cell.extra().start = spec.start
+    if spec.mailbox is not None:
+        node.bound(cell, spec.mailbox)
+    for port, target in targets.items():
+        assert target is not None
+        node.bind(cell, port, target)
+    return cell
 
 
 @dataclasses.dataclass(slots=True, eq=False)

@@ -11,12 +11,15 @@ import asyncio
 import dataclasses
 from typing import Any, ClassVar
 
-from ..actors import lives
+from ..actors import exits, lives
 from ..actors.actor import Start, on
 from ..actors.cell import DOWN, GONE, Cell
-from ..actors.errors import SpecError, type_name
+from ..actors.errors import HoldfastError, SpecError, type_name
+from ..actors.events import ChildStartFailed, StoreRefused
 from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.keeper import child_key
 from ..actors.process.limits import Limits
+from ..actors.process.recipe import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .change import check_place, check_subtree
 from .children import Child
@@ -45,6 +48,52 @@ class DynamicSupervisor(Supervisor):
         super()._begin(Plan.of(plan.flags, ()))
         self._template = plan.children[0] if plan.children else None
 
+    async def on_start(self, restored: bool) -> None:
+        """Start empty, or with the children that were there before, if there is a journal of them."""
+        await super().on_start(restored)
+        node, where = self.ctx.cell.node, child_key(self.ctx.path, "")
+        for key, data in node.keeper.notes(where).items() if self._flags.journal else ():
+            name = key.removeprefix(where)
+            if "/" in name:
+                continue  # It is the child of a supervisor below us.
+            try:
+                one = self._children[name] = Child(self._noted(name, data))
+            except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
+                node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
+                continue
+            try:
+                await self._start(one)
+            except HoldfastError as error:  # One that fails must not keep the others from coming back.
+                self._again(one, exits.crash(error))
+
+    def _noted(self, name: str, data: bytes) -> ChildSpec:
+        """A child as the journal has it. Raises HoldfastError if it can not be made any more."""
+        what = unpack_data(data)
+        if isinstance(what, ChildSpec):
+            spec = what
+        elif self._template is None:
+            raise SpecError(self.ctx.path, f"{name!r} was started from a template, and there is none now")
+        else:
+            spec = _filled(self._template, *what)
+        return dataclasses.replace(spec, id=name)
+
+    def _enlist(self, one: Child) -> None:
+        if self._flags.journal:  # First: what is started must come back, also if we die in the middle of the start.
+            given = one.spec if self._template is None else _added(self._template.start, one.spec.start)
+            data = pack_data(given, f"child {one.spec.id!r}")
+            self.ctx.cell.node.keeper.note(child_key(self.ctx.path, one.spec.id), data)
+        super()._enlist(one)
+
+    def _forget(self, one: Child) -> None:
+        super()._forget(one)
+        if not self._flags.journal:
+            return
+        node = self.ctx.cell.node
+        try:
+            node.keeper.note(child_key(self.ctx.path, one.spec.id), None)
+        except HoldfastError as error:  # It is over all the same, but will come back with us.
+            node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
+
     def _take(self, plan: Plan) -> None:
         """New flags and template; those who live now stay as they are, even if there are more than there may be."""
         check_dynamic(self.ctx.path, plan)
@@ -61,7 +110,7 @@ class DynamicSupervisor(Supervisor):
         if self._template is not None:
             if given is not None:
                 raise SpecError("StartChild", f"{self.ctx.path} has a template: give args and kwargs only")
-            spec = _filled(self._template, message)
+            spec = _filled(self._template, message.args, message.kwargs)
         elif message.args or message.kwargs:
             raise SpecError("StartChild", f"{self.ctx.path} has no template for these arguments: give a child spec")
         elif isinstance(given, Start):
@@ -84,7 +133,9 @@ class DynamicSupervisor(Supervisor):
         while True:
             self._count += 1
             name = f"{prefix}-{self._count}"
-            if name not in self._children and name not in (self.ctx.cell.children or ()):
+            # Whoever had it once may be recorded, and is not to come back as somebody else.
+            is_known = self.ctx.cell.node.keeper.knows(f"{self.ctx.path}/{name}")
+            if not is_known and name not in self._children and name not in (self.ctx.cell.children or ()):
                 return name
 
     def _check_free(self, spec: ChildSpec) -> None:
@@ -115,7 +166,7 @@ class DynamicSupervisor(Supervisor):
         raise NotSupported("a dynamic supervisor forgets stopped children: start it anew with StartChild")
 
     @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> None:
+    def _delete_child(self, message: DeleteChild) -> Any:
         """A stopped child is forgotten here."""
         self._child(message.id)
         raise NotSupported("a dynamic supervisor forgets stopped children by itself: use TerminateChild")
@@ -152,19 +203,25 @@ def _kill_all(cells: list[Cell]) -> None:
             cell.kill()
 
 
-def _filled(template: ChildSpec, message: StartChild) -> ChildSpec:
+def _filled(template: ChildSpec, args: tuple[Any, ...], kwargs: dict[str, Any]) -> ChildSpec:
     """The template with the arguments of one start behind its own.
 
     Raises:
         SpecError: the arguments do not fit the class.
     """
     own = template.start
-    start = Start(own.kind, (*own.args, *message.args), {**own.kwargs, **message.kwargs})
+    start = Start(own.kind, (*own.args, *args), {**own.kwargs, **kwargs})
     try:
         start.check()
     except TypeError as error:
         raise SpecError("StartChild", f"start({type_name(own.kind)}, ...): {error}") from error
     return dataclasses.replace(template, start=start)
+
+
+def _added(template: Start[Any], start: Start[Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """The arguments that a start has added to those of its template."""
+    kwargs = {key: value for key, value in start.kwargs.items() if template.kwargs.get(key, start) is not value}
+    return start.args[len(template.args) :], kwargs
 
 
 def check_dynamic(where: str, plan: Plan) -> None:
@@ -191,6 +248,7 @@ def dynamic(
     *,
     template: ChildSpec | None = None,
     max_children: int | None = None,
+    journal: bool = False,
     intensity: int = 1,
     period: float = 5.0,
     restart: Restart = "permanent",
@@ -207,6 +265,9 @@ def dynamic(
         template: `child(None, start(Class, ...))`: every child is one of these, and `StartChild(args=...)` adds the
             rest of its arguments; without one `StartChild` takes any child spec, or a bare `start(...)`.
         max_children: how many there may be, those that are being restarted among them; None sets no limit.
+        journal: when it is started again, it brings its children back: those that were started by request and not ended
+            for good since; with a store that lasts also after the end of the program. Their arguments must be such as
+            can be saved, and their classes importable.
         intensity: restarts allowed within `period` seconds; one more and it gives up.
         period: seconds, > 0.
         restart, shutdown, isolation, limits, significant, rules: as a child of its own supervisor; see `supervisor`.
@@ -216,7 +277,7 @@ def dynamic(
     """
     where = f"dynamic {name!r}"
     try:
-        flags = Flags("one_for_one", intensity, period, "never", max_children)
+        flags = Flags("one_for_one", intensity, period, "never", max_children, journal)
     except SpecError as error:
         raise SpecError(where, error.problem) from None
     if template is not None:

@@ -127,7 +127,7 @@ class PartitionSupervisor(Supervisor):
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 
     @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> None:
+    def _delete_child(self, message: DeleteChild) -> Any:
         """Partitions are all alike."""
         self._child(message.id)
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")

@@ -66,7 +66,7 @@ class Router(Actor):
         free = [cell for cell in crew if cell.path not in waiting] if waiting else crew
         if crew and not free:
             item.fail(AskDeadlock(crew[0].path, tuple(path for path, _ in chain)))
-            self.ctx.item = Stashed.of(item)
+            self.ctx.cell.item = Stashed.of(item)
             return
         able = [cell for cell in free if has_room(cell)]
         if able:
@@ -153,7 +153,7 @@ class Router(Actor):
     def _hold(self, item: Any, full: list[Cell]) -> None:
         """Put the message back and handle no other before `look_again`; commands are still obeyed."""
         cell = self.ctx.cell
-        self.ctx.item = Stashed.of(item)
+        self.ctx.cell.item = Stashed.of(item)
         if isinstance(item, Ask):
             item.started = False
         if cell.more is not None and cell.more.bound is not None and mailbox.counts(item):

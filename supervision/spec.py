@@ -18,7 +18,7 @@ from ..actors.process.limits import Limits
 from ..actors.process.recipe import pack_recipe
 from ..actors.values import UnsavableValue
 from .backoff import Backoff
-from .decisions import is_as_told
+from .decisions import decide, is_as_told
 from .rules import Rule
 
 Restart = Literal["permanent", "transient", "temporary"]
@@ -37,7 +37,7 @@ PATIENCE = 5.0
 class Flags:
     """A supervisor's own settings: strategy, and at most `intensity` restarts within `period` seconds.
 
-    `auto_shutdown` says whether it ends with its significant children; `max_children` is for dynamic ones.
+    `auto_shutdown` says whether it ends with its significant children; dynamic ones have `max_children` and `journal`.
     """
 
     strategy: Strategy = "one_for_one"
@@ -45,8 +45,11 @@ class Flags:
     period: float = 5.0
     auto_shutdown: AutoShutdown = "never"
     max_children: int | None = None
+    journal: bool = False
 
     def __post_init__(self) -> None:
+        if not isinstance(self.journal, bool):
+            raise SpecError("supervisor", f"journal must be True or False, not {self.journal!r}")
         _choose("supervisor", "strategy", self.strategy, Strategy)
         _choose("supervisor", "auto_shutdown", self.auto_shutdown, AutoShutdown)
         most = self.max_children
@@ -122,6 +125,10 @@ class ChildSpec:
                 pack_recipe(self.start, where)
             except UnsavableValue as error:
                 raise SpecError(error.where, f"{error.problem} cannot be sent to another process") from error
+
+    def restarts(self, reason: ExitReason) -> bool:
+        """Whether an end by itself for this reason is followed by another life."""
+        return decide(self.restart, self.rules, reason) == "restart"
 
     async def stop(self, cell: Cell, reason: ExitReason = SHUTDOWN) -> ExitReason:
         """Stop the child as its spec says: ask, wait, kill. Returns the reason it ended with."""
@@ -228,8 +235,9 @@ class Plan:
         period: float = 5.0,
         auto_shutdown: AutoShutdown = "never",
         max_children: int | None = None,
+        journal: bool = False,
     ) -> None:
-        flags = Flags(strategy, intensity, period, auto_shutdown, max_children)
+        flags = Flags(strategy, intensity, period, auto_shutdown, max_children, journal)
         object.__setattr__(self, "flags", flags)
         object.__setattr__(self, "children", checked("supervisor", children, auto_shutdown, nameless=True))
 

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from ..actors import lives
 from ..actors.actor import Actor, on
 from ..actors.cell import DOWN, GONE, Cell
-from ..actors.errors import HoldfastError, NoSuchActor, SpecError, StartFailed, StartIgnored
+from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
 from ..actors.exits import SHUTDOWN, ExitReason, unpack_exit
 from ..actors.mail import Item, ReplyHandle
@@ -38,7 +38,7 @@ from .admin import (
     opened,
 )
 from .change import check_place, new_plan, succession
-from .children import RECOVERING, RESTARTING, STOPPED, UP, Child, Retry, Row, StartOver
+from .children import RECOVERING, RESTARTING, STOPPED, UP, Child, Retry, Row, StartOver, new_cell
 from .decisions import affected, decide, is_reported
 from .intensity import admit_restart
 from .spec import ChildSpec, Flags, Plan, check_spec
@@ -68,7 +68,11 @@ class Supervisor(Actor):
         self.ctx.trap_exits = True  # Only our own parent can end us: the end of a stranger that is linked is no order.
         self._begin(new_plan(self))
         for one in list(self._children.values()):
-            await self._start(one)
+            try:
+                await self._start(one)
+            except HoldfastError:
+                self._blame(one)
+                raise
 
     def _begin(self, plan: Plan) -> None:
         """Take up the plan of this start."""
@@ -102,7 +106,7 @@ class Supervisor(Actor):
             task = asyncio.current_task()
             if task is not None and task.cancelling():
                 raise  # It is our own turn that is killed.
-            raise StartFailed(f"{self.ctx.path}/{one.spec.id}", "it was killed while it started") from error
+            raise StartFailed(self._path_of(one), "it was killed while it started") from error
 
     def _launch(self, one: Child) -> asyncio.Future[None] | None:
         """Begin a life of the child; a future if it takes longer than this turn.
@@ -112,28 +116,9 @@ class Supervisor(Actor):
         """
         cell = one.cell
         if cell is None or cell.state is GONE:
-            cell = one.cell = self._new_cell(one.spec)
+            cell = one.cell = new_cell(self.ctx.cell, one.spec)
             one.ignored_life = 0  # A new address counts its lives anew.
         return cell.host.start(cell)
-
-    def _new_cell(self, spec: ChildSpec) -> Cell:
-        own = self.ctx.cell
-        node = own.node
-        targets = {port: node.find(path) for port, path in spec.bindings.items()}
-        for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
-            if target is None:
-                missing = NoSuchActor(spec.bindings[port])
-                raise StartFailed(f"{own.path}/{spec.id}", f"binding {port!r}: {missing}") from missing
-        cell = node.cell_below(own, spec.id, node.host_for(spec))
-        cell.spec = spec
-        more = cell.extra()
-        more.start = spec.start
-        if spec.mailbox is not None:
-            node.bound(cell, spec.mailbox)
-        for port, target in targets.items():
-            assert target is not None
-            node.bind(cell, port, target)
-        return cell
 
     def _is_up(self, one: Child) -> None:
         one.state = UP
@@ -147,7 +132,7 @@ class Supervisor(Actor):
         node = self.ctx.cell.node
         if node.watched:
             reason = error.reason if isinstance(error, StartFailed) else str(error)
-            node.emit(ChildStartFailed(f"{self.ctx.path}/{one.spec.id}", reason))
+            node.emit(ChildStartFailed(self._path_of(one), reason))
 
     def _ignored(self, one: Child) -> None:
         """It did not want to be started, which is no failure: the spec stays, that of a temporary child does not."""
@@ -235,8 +220,10 @@ class Supervisor(Actor):
             self._give_up(one, reason, SHUTDOWN)
             return None
         self._restarts = window
+        if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
+            node.keeper.returned(self._path_of(one), flags.period)
         if node.watched:
-            node.emit(ChildRestarted(f"{self.ctx.path}/{one.spec.id}", reason, len(window)))
+            node.emit(ChildRestarted(self._path_of(one), reason, len(window)))
         if flags.strategy == "one_for_one":
             self._start_row(Row(deque([one]), reason))
             return None
@@ -245,8 +232,23 @@ class Supervisor(Actor):
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
         one.state = STOPPED
+        self._blame(one)
         self.ctx.cell.node.emit(SupervisorGaveUp(self.ctx.path, one.spec.id, reason))
         self.ctx.stop(told)
+
+    def _blame(self, one: Child) -> None:
+        """We end because of this child."""
+        self.ctx.cell.node.keeper.blame(self._path_of(one))
+
+    def _path_of(self, one: Child) -> str:
+        return f"{self.ctx.path}/{one.spec.id}"
+
+    def _erase(self, one: Child) -> None:
+        """Forget what was recorded of a child that does not run. Raises HoldfastError if the store refuses."""
+        if one.cell is not None:
+            lives.retire(one.cell, "it begins afresh")
+        if one.spec.is_supervisor or one.spec.recovery is not None:
+            self.ctx.cell.node.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
 
     async def _restart_group(self, failed: Child, reason: ExitReason) -> None:
         """one_for_all and rest_for_one: stop the others newest first, then start all of them in order."""
@@ -295,12 +297,16 @@ class Supervisor(Actor):
             if other.row is row:
                 other.state, other.row = STOPPED, None
         self._start_failed(one, error)
+        self._again(one, row.reason)
+
+    def _again(self, one: Child, reason: ExitReason) -> None:
+        """A start has failed: try once more, which counts."""
         one.state = RESTARTING
         if one.spec.backoff is not None:
-            self._later(one, row.reason)
+            self._later(one, reason)
             return
         one.retry += 1
-        self.ctx.cell.push(Retry(one, one.retry, row.reason))  # Through our own mailbox: we answer in between.
+        self.ctx.cell.push(Retry(one, one.retry, reason))  # Through our own mailbox: we answer in between.
 
     def _start_over(self, one: Child, up: asyncio.Future[None]) -> Coroutine[Any, Any, None] | None:
         """A restart has come to its end, unless the child was stopped meanwhile."""
@@ -362,14 +368,21 @@ class Supervisor(Actor):
         except HoldfastError as error:
             return self._fail(error)
         self._check_free(spec)
-        one = self._children[spec.id] = Child(spec)
+        one = Child(spec)
         try:
+            if message.fresh:
+                self._erase(one)
+            self._enlist(one)
             return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:
             self._forget(one)
             if one.cell is not None:
                 lives.retire(one.cell, "it could not be started")
             return self._fail(error)
+
+    def _enlist(self, one: Child) -> None:
+        """A child is to be started for the first time. Raises HoldfastError if that cannot be."""
+        self._children[one.spec.id] = one
 
     def _check_free(self, spec: ChildSpec) -> None:
         """Refuse a child whose id is known."""
@@ -407,29 +420,33 @@ class Supervisor(Actor):
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
         try:
+            if message.fresh:
+                self._erase(one)
             return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:
             self._give_up_address(one, "it could not be started")
             return self._fail(error)
 
     @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> None:
-        """Forget a stopped child's spec."""
+    def _delete_child(self, message: DeleteChild) -> Any:
+        """Forget a stopped child's spec, and what was recorded of it."""
         one = self._child(message.id)
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
-        self._forget(one)
         if one.cell is not None:
             lives.retire(one.cell, "it was deleted")
+        if message.erase:
+            try:
+                self._erase(one)
+            except HoldfastError as error:  # It can be deleted again.
+                return self._fail(error)
+        self._forget(one)
+        return None
 
     @on(WhichChildren, readonly=True)
     def _which_children(self, message: WhichChildren) -> list[ChildInfo]:
         """What there is, in start order."""
-        own = self.ctx.path
-        return [
-            ChildInfo(one.spec.id, one.state, f"{own}/{one.spec.id}", one.spec.is_supervisor)
-            for one in self._children.values()
-        ]
+        return [one.info(self.ctx.path) for one in self._children.values()]
 
     @on(CountChildren, readonly=True)
     def _count_children(self, message: CountChildren) -> ChildCounts:

@@ -7,7 +7,7 @@ import socket
 
 from ..actors.cell import Cell
 from ..actors.process import frames, guest
-from ..checkpoint.guest import RecordedGuest
+from ..checkpoint.guest import GuestKeeper, RecordedGuest
 from ..supervision.respec import respec
 
 
@@ -25,7 +25,9 @@ def prepare(host: guest.Guest) -> None:
 
 def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:
     """Begin the life that the root asks for."""
-    recorded = frame.options.get("recorded")
+    options = frame.options
+    host.node.keeper = GuestKeeper(host, options.get("kept", {}), options.get("known", []))
+    recorded = options.get("recorded")
     if recorded is None:
         return cell.host.start(cell)
     host.recovery.start(cell, recorded)

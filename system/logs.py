@@ -21,8 +21,10 @@ from ..actors.events import (
     ProcessDied,
     Recovered,
     RecoveryFailed,
+    RolledBack,
     ShutdownError,
     SnapshotFailed,
+    StoreRefused,
     SupervisorGaveUp,
 )
 from ..actors.exits import Crash
@@ -78,9 +80,11 @@ LEVELS: dict[type, str] = {
     ProcessDied: "warning",
     Recovered: "info",
     RecoveryFailed: "error",
+    RolledBack: "error",
     MessageQuarantined: "error",
     SnapshotFailed: "error",
     JournalFull: "warning",
+    StoreRefused: "error",
     LogLine: "info",
     Moved: "info",
 }
@@ -97,9 +101,11 @@ NAMES: dict[type, str] = {
     ProcessDied: "process died",
     Recovered: "actor recovered",
     RecoveryFailed: "recovery failed",
+    RolledBack: "rolled back",
     MessageQuarantined: "message quarantined",
     SnapshotFailed: "snapshot failed",
     JournalFull: "journal full",
+    StoreRefused: "store refused",
     LogLine: "output",
     Moved: "actor moved",
 }

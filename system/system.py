@@ -112,6 +112,7 @@ class ActorSystem(Controls):
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
         node.outside = self._homes.find
+        node.keeper = self._homes
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
         self._body = asyncio.current_task()
@@ -197,8 +198,10 @@ class ActorSystem(Controls):
             raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
         return self._node
 
-    async def start(self, spec: ChildSpec) -> ActorRef[Any]:
+    async def start(self, spec: ChildSpec, *, fresh: bool = False) -> ActorRef[Any]:
         """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
+
+        With `fresh` nothing comes back that was recorded at its address, or below it, before.
 
         Raises:
             StartFailed: naming the actor and why. AlreadyStarted, AlreadyPresent: the id is in use.
@@ -206,7 +209,7 @@ class ActorSystem(Controls):
         if not isinstance(spec, ChildSpec):
             raise SpecError("start", f"takes child(...) or supervisor(...), not {spec!r}")
         root = self._root_ref()
-        return cast("ActorRef[Any]", await root.ask(StartChild(spec), ADMIN_TIMEOUT))
+        return cast("ActorRef[Any]", await root.ask(StartChild(spec, fresh=fresh), ADMIN_TIMEOUT))
 
     def spawn(self, start: Start[A], name: str | None = None, *, mailbox: Bounded | None = None) -> ActorRef[A]:
         """Start an actor that nobody restarts, in this process, at once (its `on_start` is its first turn).
@@ -220,6 +223,8 @@ class ActorSystem(Controls):
         self, ref: ActorRef[Any], reason: ExitReason = SHUTDOWN, *, drain: bool = False, deadline: float = 5.0
     ) -> None:
         """Stop an actor for good; returns when its children have ended, then its hook has run. Twice is no error.
+
+        What was recorded of it stays: started again under the same id, it is restored.
 
         Args:
             ref: the actor.
@@ -251,7 +256,7 @@ class ActorSystem(Controls):
             supervisor = ActorRef[Supervisor](parent)
             try:
                 await supervisor.ask(TerminateChild(cell.name, pack_exit(reason)), STOP_TIMEOUT)
-                await supervisor.ask(DeleteChild(cell.name), ADMIN_TIMEOUT)
+                await supervisor.ask(DeleteChild(cell.name, erase=False), ADMIN_TIMEOUT)
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:

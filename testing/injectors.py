@@ -392,9 +392,9 @@ class FaultyJournal:
         self._refuse("journal append", [entry[0] for _, entry in entries])
         return self._real.append(entries)
 
-    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int) -> None:
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         self._refuse("snapshot write", f"{len(snapshot)} bytes after turn {turn}")
-        self._real.cut(address, snapshot, drop, turn=turn)
+        self._real.cut(address, snapshot, drop, turn=turn, keep=keep)
 
     def load(self, address: str, *, older: bool = False) -> Saved:
         return self._real.load(address, older=older)

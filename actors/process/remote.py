@@ -15,8 +15,9 @@ from .. import links, lives, mailbox
 from ..cell import DOWN, GONE, RUNNING, Cell
 from ..codec import Parcel
 from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
-from ..events import ActorStarted
+from ..events import ActorStarted, StoreRefused
 from ..exits import KILLED, ExitReason, pack_exit, unpack_exit
+from ..keeper import child_key
 from ..mail import Ask, Envelope, Item
 from . import frames
 from .connection import BadFrame
@@ -441,5 +442,35 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(text(frame, "path"), reason, with_parent=with_parent)
+        case "keep":
+            keep(node, worker, frame)
         case _:
             obey(node, cell, frame)
+
+
+def keep(node: Node, worker: Worker, frame: frames.Command) -> None:
+    """What the supervisors in an actor process say to the keeper, of addresses below their process's own.
+
+    Raises:
+        BadFrame: it is of another address.
+    """
+    home, path, keeper = worker.cell, text(frame, "path"), node.keeper
+    if home is None or not f"{path}/".startswith(f"{home.path}/"):
+        raise BadFrame(f"an actor process cannot speak of {path}")
+    try:
+        match text(frame, "what"):
+            case "erase":
+                keeper.erase(path, below=bool(frame.data.get("below")))
+            case "blame":
+                keeper.blame(path)
+            case "returned":
+                keeper.returned(path, float(frame.data.get("period", 0.0)))
+            case "note":
+                above, _, name = path.rpartition("/")
+                keeper.note(child_key(above, name), frame.data.get("value"))
+            case what:
+                raise BadFrame(f"an actor process cannot have {what!r} done")
+    except HoldfastError as error:  # The process goes on: it was not its fault, and it has gone on already.
+        if isinstance(error, BadFrame):
+            raise
+        node.emit(StoreRefused(path, str(error)))

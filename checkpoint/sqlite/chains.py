@@ -115,7 +115,7 @@ class Scan:
 
     def _notes(self) -> dict[str, bytes]:
         notes: dict[str, bytes] = {}
-        for name, value, crc in self._db.execute("SELECT name, value, crc FROM notes"):
+        for name, value, crc in self._db.execute("SELECT name, value, crc FROM notes ORDER BY key"):
             if crc != crc_of(name, value):
                 raise DamagedStore(self._path, None, None, f"the checksum of note {name!r} is wrong")
             notes[name] = value

@@ -104,7 +104,7 @@ class SqliteJournal:
         self._store.live += len(rows)
         return rows
 
-    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int) -> None:
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep the snapshot, then forget what it contains; see `Journal`.
 
         A snapshot of more than 1 MiB becomes a file, synced before the row that names it is written. Takes as long as
@@ -127,17 +127,17 @@ class SqliteJournal:
                 os.unlink(os.path.join(self._store.files.folder, file))
             raise
         try:
-            self._clean(chain)
+            self._clean(chain, keep)
         except StoreFailed:
             if self._store.failure is not None:
                 raise
             # The snapshot is kept, which is what we promised; the next cut cleans up.
 
-    def _clean(self, chain: Chain) -> None:
-        """Remove what only snapshots before the two newest need. A crash in between is made good by the next cut."""
-        for number in chain.kept[:-1]:
+    def _clean(self, chain: Chain, keep: int) -> None:
+        """Remove what only outdated snapshots need. A crash in between is made good by the next cut."""
+        for number in chain.kept[: -1 if keep > 1 else None]:
             self._remove_dropped(chain, number)
-        outdated = chain.kept[:-2]
+        outdated = chain.kept[: -2 if keep > 1 else -1]
         if not outdated:
             return
         with self._store.transaction(note=True) as db:
@@ -243,3 +243,9 @@ class SqliteJournal:
         with self._store.lock:
             self._store.refresh()
             return self._store.notes.get(key)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """All facts whose keys begin so; see `Journal`."""
+        with self._store.lock:
+            self._store.refresh()
+            return {key: value for key, value in self._store.notes.items() if key.startswith(prefix)}

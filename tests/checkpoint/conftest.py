@@ -33,3 +33,9 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 def gate(tmp_path: Path) -> Path:
     """Where a `Doer` stops, until it is let through."""
     return tmp_path / "gate"
+
+
+@pytest.fixture(params=["memory", "sqlite"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
+    """Where journals go: nowhere beyond this process, or into a file."""
+    return None if request.param == "memory" else f"sqlite:{tmp_path / 'app.db'}"

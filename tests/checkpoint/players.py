@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -125,6 +126,20 @@ class Doer(hf.Actor):
             case "raise":
                 if arg != "when open" or "open" in self.seen:
                     raise RuntimeError(arg)
+            case "fail":
+                raise OSError("for good")
+            case "memory":
+                raise MemoryError
+            case "hang":
+                if not Path(arg).exists():
+                    Path(arg).touch()
+                    time.sleep(60.0)
+            case "replayed":
+                if Path(arg).exists():
+                    raise RuntimeError("it fails the second time")
+                Path(arg).touch()
+            case "leave":
+                self.ctx.stop(hf.SHUTDOWN)
             case "refuse":
                 raise No(arg)
             case "world":

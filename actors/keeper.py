@@ -1,0 +1,78 @@
+"""What is kept of addresses beyond the lives there: how supervisors speak of it, knowing no recovery method."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+
+class Keeper(Protocol):
+    """Keeps state and messages of addresses, and small facts; there is one for each node."""
+
+    def knows(self, path: str) -> bool:
+        """Whether anything was ever recorded at this address, and not erased since."""
+        ...
+
+    def erase(self, path: str, *, below: bool) -> None:
+        """Forget what was recorded at an address where nobody lives; with `below`, also at all addresses below it.
+
+        Raises:
+            HoldfastError: the store refused. What is left is erased when it is opened again.
+        """
+        ...
+
+    def blame(self, path: str) -> None:
+        """The supervisor above this address ends because of the actor there."""
+        ...
+
+    def returned(self, path: str, period: float) -> None:
+        """The supervisor at `path` is started again by its own, whose window is `period` seconds long.
+
+        Whoever below was to blame for its end is brought back as its method says (`on_escalate`).
+        """
+        ...
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep a small fact; None forgets it. Raises HoldfastError if the store refused."""
+        ...
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """The facts whose keys begin so, oldest first."""
+        ...
+
+
+class NothingKept:
+    """The keeper of a node without recovery: only facts are kept, until the node ends."""
+
+    def __init__(self) -> None:
+        self._notes: dict[str, bytes] = {}
+
+    def knows(self, path: str) -> bool:
+        """Never."""
+        return False
+
+    def erase(self, path: str, *, below: bool) -> None:
+        """There is nothing but facts."""
+        if below:
+            for key in self.notes(child_key(path, "")):
+                del self._notes[key]
+
+    def blame(self, path: str) -> None:
+        """Nobody is brought back."""
+
+    def returned(self, path: str, period: float) -> None:
+        """Nobody is brought back."""
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep a fact until the node ends."""
+        self._notes.pop(key, None)
+        if value is not None:
+            self._notes[key] = value
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """The facts whose keys begin so, oldest first."""
+        return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
+
+
+def child_key(supervisor: str, name: str) -> str:
+    """The key of the fact that a supervisor has a child of this name."""
+    return f"child {supervisor}/{name}"

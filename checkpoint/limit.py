@@ -1,0 +1,67 @@
+"""The journal's limit: at it nothing is admitted until a snapshot has cut it."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from ..actors.errors import MailboxFull
+from ..actors.events import JournalFull
+from ..actors.mail import Ask
+from .records import SnapshotNow
+
+if TYPE_CHECKING:
+    from .switch import Switch
+
+
+class Limit:
+    """Who waits, or is refused, while the journal of one home is full."""
+
+    def __init__(self, home: Switch) -> None:
+        self._home = home
+        self._waiters: list[asyncio.Future[None]] = []
+        self._is_told = False
+
+    @property
+    def is_reached(self) -> bool:
+        """Whether the journal has no room."""
+        return self._home.bytes >= self._home.method.journal_limit
+
+    def refuse(self, ask: Ask | None) -> None:
+        """Have a snapshot taken, and refuse a message until the journal is cut.
+
+        Raises:
+            MailboxFull: to a tell; an ask fails with it.
+        """
+        home = self._home
+        if not self._is_told:
+            self._is_told = True
+            home.node.emit(JournalFull(home.path, home.state_turn, home.bytes))
+        self._want_snapshot()
+        error = MailboxFull(home.path, len(home.open))
+        if ask is None:
+            raise error
+        ask.fail(error)
+
+    def wait(self) -> asyncio.Future[None]:
+        """A future that ends when it is worth trying again."""
+        self._want_snapshot()
+        future: asyncio.Future[None] = self._home.node.loop.create_future()
+        self._waiters.append(future)
+        return future
+
+    def _want_snapshot(self) -> None:
+        if self._home.port is not None:
+            self._home.port.to_life(SnapshotNow())
+
+    def cut(self) -> None:
+        """There is room again."""
+        self._is_told = False
+        self.wake()
+
+    def wake(self) -> None:
+        """Whoever waits shall look again."""
+        waiters, self._waiters = self._waiters, []
+        for waiter in waiters:
+            if not waiter.done():
+                waiter.set_result(None)

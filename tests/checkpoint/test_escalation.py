@@ -1,0 +1,223 @@
+"""Escalation that comes back: the supervisor has ended because of a recorded child, and its own has restarted it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint.players import Do, Note, Notes, Seen, until
+from tests.checkpoint.strikes import sink
+from tests.checkpoint.trees import add, at, back, doing, escalate, running, seen, snapshot, top, tree
+
+
+async def two_snapshots(system: hf.ActorSystem) -> None:
+    """ "a" is in the older snapshot, "b" in the newest too, and "c" in none."""
+    await add(system, "a")
+    await snapshot(system)
+    await add(system, "b")
+    await snapshot(system)
+    await add(system, "c")
+
+
+async def rolled_back(system: hf.ActorSystem, isolation: str) -> list[hf.RolledBack]:
+    with system.events() as stream:
+        await escalate(system, isolation)
+        await seen(system)
+        return [one for one in stream.take() if isinstance(one, hf.RolledBack)]
+
+
+async def test_the_second_time_an_older_snapshot_comes_back_and_only_to_whom_it_was_due(
+    store: str | None, isolation: str
+) -> None:
+    async with running(store) as system:
+        await system.start(tree(isolation, doing(isolation), doing(isolation, "other"), intensity=0))
+        await two_snapshots(system)
+        await add(system, "mine", name="other")
+        assert await rolled_back(system, isolation) == []
+        assert await seen(system) == ["a", "b", "c"]
+        await until(lambda: at(system)._cell.host.switch.state_turn >= 4)  # type: ignore[attr-defined]
+        (event,) = await rolled_back(system, isolation)
+        assert await seen(system) == ["a", "b"]
+        assert event.address == "/app/top/doer"
+        assert event.from_turn > event.to_turn > 0
+        assert await seen(system, "other") == ["mine"]
+        await add(system, "d")
+        assert await rolled_back(system, isolation) == [], "more than that is done by hand only"
+        assert await seen(system) == ["a", "b", "d"]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"on_escalate": "restore"}, ["a", "b", "c"]),
+        ({"on_escalate": "older_snapshot"}, ["a"]),
+        ({"on_escalate": "older_snapshot", "keep": 1}, []),
+        ({"on_escalate": "fresh"}, []),
+    ],
+)
+async def test_the_method_says_what_comes_back(
+    store: str | None, isolation: str, options: dict[str, Any], expected: list[str]
+) -> None:
+    async with running(store) as system:
+        await system.start(tree(isolation, doing(isolation, **options), intensity=0))
+        await two_snapshots(system)
+        events = await rolled_back(system, isolation)
+        assert await seen(system) == expected
+        assert len(events) == (options["on_escalate"] != "restore")
+        if not expected:
+            assert events[0].to_turn == -1
+        assert all(("no older snapshot" in one.reason) is ("keep" in options) for one in events)
+        await add(system, "new")
+        with system.events() as stream:
+            at(system).tell(Do(["raise again"]))
+            await back(stream, hf.ChildRestarted, "/app/top")
+        if options["on_escalate"] != "restore":  # What was undone does not come back, not as an "older" one either.
+            assert not {"b", "c"} & set(await seen(system))
+    if store is not None and options["on_escalate"] != "restore":
+        async with running(store) as system:
+            await system.start(tree(isolation, doing(isolation, **options), intensity=0))
+            assert not {"b", "c"} & set(await seen(system))
+
+
+async def test_without_any_snapshot_an_older_one_means_a_fresh_start(store: str | None, isolation: str) -> None:
+    async with running(store) as system:
+        await system.start(tree(isolation, doing(isolation, on_escalate="older_snapshot"), intensity=0))
+        await add(system, "a")
+        (event,) = await rolled_back(system, isolation)
+        assert (event.to_turn, "no older snapshot" in event.reason) == (-1, True)
+        assert await seen(system) == []
+
+
+@pytest.mark.parametrize("to", ["older_snapshot", "fresh"])
+async def test_what_has_left_stays_out_and_what_was_not_handled_stays_queued(
+    store: str | None, isolation: str, to: str, gate: Path
+) -> None:
+    async with running(store) as system:
+        notes = await sink(system)
+        await system.start(tree(isolation, doing(isolation, on_escalate=to, shutdown="brutal_kill"), intensity=0))
+        await two_snapshots(system)
+        await at(system).ask(Do(["tell undone", "add undone"], notes), timeout=20.0)
+        at(system).tell(Do([f"gate {gate}", "tell after", "raise it"], notes))
+        await until(gate.exists)
+        at(system).tell(Do(["add queued", "tell queued"], notes))
+        await at(system).send(Do(["add last"]))
+        with system.events() as stream:
+            Path(f"{gate}.open").touch()
+            await back(stream, hf.RolledBack)
+        expected = [*(["a"] if to == "older_snapshot" else []), "queued", "last"]
+        assert await seen(system) == expected
+        assert await notes.ask(Notes()) == ["undone", "queued"]
+
+
+@pytest.mark.parametrize("to", ["older_snapshot", "fresh"])
+async def test_a_turn_that_has_let_something_out_ends_with_the_state_it_began_with(
+    store: str | None, isolation: str, to: str, gate: Path
+) -> None:
+    async with running(store) as system:
+        notes = await sink(system)
+        await system.start(tree(isolation, doing(isolation, on_escalate=to, shutdown="brutal_kill"), intensity=0))
+        await two_snapshots(system)
+        at(system).tell(Do(["tell out", "flush", f"gate {gate}", "tell never"], notes))
+        await until(gate.exists)
+        dead = system.dead_letters
+        with system.events() as stream:
+            at(system).kill()
+            await back(stream, hf.RolledBack)
+        Path(f"{gate}.open").touch()
+        await seen(system)
+        await add(system, "new")
+        assert await seen(system) == (["a", "new"] if to == "older_snapshot" else ["new"])
+        assert await notes.ask(Notes()) == ["out"]
+        assert system.dead_letters == dead + 1
+
+
+async def test_timers_stash_and_subscriptions_are_those_of_the_older_snapshot(store: str | None) -> None:
+    async with running(store) as system:
+        await system.start(tree("task", doing("task", on_escalate="older_snapshot"), intensity=0))
+        await at(system).ask(Do(["subscribe /early", "after 3000"]))
+        await snapshot(system)
+        await at(system).ask(Do(["subscribe /late", "after 3000", "add b"]))
+        await snapshot(system)
+        await rolled_back(system, "task")
+        switch = at(system)._cell.host.switch  # type: ignore[attr-defined]
+        assert (list(switch.topics), len(switch.timers.saved())) == (["/early"], 1)
+        await system.publish("/late", Note("x"))
+        await system.publish("/early", Note("y"))
+        assert await seen(system) == ["y"]
+
+
+async def test_who_waits_for_a_later_reply_from_an_undone_turn_is_told(isolation: str) -> None:
+    async with running(None) as system:
+        await system.start(tree(isolation, doing(isolation, on_escalate="fresh"), intensity=0))
+        waiting = at(system).ask(Do(["later"]), timeout=20.0)
+        await add(system, "a")
+        await rolled_back(system, isolation)
+        with pytest.raises((hf.AskFailed, hf.ActorStopped)):
+            await waiting
+
+
+async def test_an_escalation_through_two_supervisors_counts_for_the_one_it_began_with(store: str | None) -> None:
+    """Both give up; whoever restarts the upper one has brought the child back, in its own window."""
+    async with running(store) as system:
+        inner = hf.supervisor("top", children=[doing("task", on_escalate="older_snapshot")], intensity=0)
+        await system.start(hf.supervisor("above", children=[inner], intensity=0))
+        path = "/app/above/top/doer"
+        ref: Any = system.ref(path, hf.Actor)
+        for word in "abc":
+            await ref.ask(Do([f"add {word}"]))
+            if word != "c":
+                await system.ref("/app/above/top", hf.Supervisor).ask(hf.TerminateChild("doer"))
+                await system.ref("/app/above/top", hf.Supervisor).ask(hf.RestartChild("doer"))
+                ref = system.ref(path, hf.Actor)
+        with system.events() as stream:
+            ref.kill()
+            event = await back(stream, hf.RolledBack, path)
+        assert event.to_turn > 0
+        await until(lambda: path in system.tree())
+        assert await system.ref(path, hf.Actor).ask(Seen(), timeout=20.0) == ["a"]
+
+
+async def test_what_is_restarted_by_hand_or_killed_is_no_escalation(store: str | None, isolation: str) -> None:
+    async with running(store) as system:
+        await system.start(tree(isolation, doing(isolation, on_escalate="fresh"), intensity=5))
+        await add(system, "a")
+        with system.events() as stream:
+            top(system).kill()
+            await back(stream, hf.ChildRestarted, "/app/top")
+            assert await seen(system) == ["a"]
+            assert not [one for one in stream.take() if isinstance(one, hf.RolledBack)]
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_the_window_is_that_of_whoever_restarts_the_supervisor() -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000, period=10.0) as system:
+        await system.start(tree("task", doing("task"), intensity=0))
+        await two_snapshots(system)
+        for _ in range(4):
+            assert await rolled_back(system, "task") == []
+            await asyncio.sleep(10.1)
+        assert await rolled_back(system, "task") == []
+        await asyncio.sleep(9.9)
+        assert len(await rolled_back(system, "task")) == 1
+
+
+async def test_a_child_whose_restore_fails_again_and_again_goes_back_the_second_time(
+    store: str | None, tmp_path: Path
+) -> None:
+    """Its supervisor cannot even start with it: that is an escalation too, and the older snapshot is the way out."""
+    marker = tmp_path / "marker"
+    async with running(store) as system:
+        await system.start(tree("task", doing("task"), intensity=0))
+        await two_snapshots(system)
+        await at(system).ask(Do([f"replayed {marker}"]))
+        with system.events() as stream:
+            with contextlib.suppress(hf.HoldfastError):
+                await at(system).ask(Do(["raise it"]))
+            event = await back(stream, hf.RolledBack)
+        assert "2 time(s)" in event.reason
+        assert await seen(system) == ["a"]

@@ -1,0 +1,218 @@
+"""`dynamic(journal=True)`: its children come back with it (DESIGN 5), whatever ended it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint.players import Doer, Note, Seen, until
+from tests.checkpoint.trees import running
+
+
+class Pupil(hf.Actor):
+    """Has a name, and learns words."""
+
+    def __init__(self, name: str = "nobody", town: str = "nowhere") -> None:
+        self.words = [f"{name} of {town}"]
+
+    @hf.on(Note)
+    def note(self, message: Note) -> int:
+        self.words.append(message.text)
+        return len(self.words)
+
+    @hf.on(Seen, readonly=True)
+    def read(self, message: Seen) -> list[str]:
+        return self.words
+
+
+class Shy(hf.Actor):
+    """Does not start while there is such a file."""
+
+    def __init__(self, path: str, how: str) -> None:
+        if Path(path).exists():
+            raise hf.Ignore if how == "ignore" else OSError("not now")
+
+    @hf.on(Seen, readonly=True)
+    def read(self, message: Seen) -> list[str]:
+        return ["here"]
+
+
+PUPIL = hf.child(None, hf.start(Pupil), recovery=hf.hybrid())
+
+
+def school(template: hf.ChildSpec | None = None, **options: Any) -> hf.ChildSpec:
+    flags: dict[str, Any] = {"intensity": 5, **options}
+    return hf.dynamic("school", template=template, journal=True, **flags)
+
+
+@pytest.fixture(params=["memory", "sqlite"])
+def store(request: pytest.FixtureRequest, tmp_path: Path) -> str | None:
+    return None if request.param == "memory" else f"sqlite:{tmp_path / 'app.db'}"
+
+
+@pytest.fixture(params=["task", "process"])
+def isolation(request: pytest.FixtureRequest) -> Any:
+    """Where the dynamic supervisor lives, with its children."""
+    return request.param
+
+
+async def restarted(system: hf.ActorSystem) -> None:
+    with system.events() as stream:
+        system.ref("/app/school", hf.Supervisor).kill()
+        async for one in stream:
+            if isinstance(one, hf.ChildRestarted):
+                break
+    await until(lambda: "/app/school" in system.tree() and up(system))
+
+
+def up(system: hf.ActorSystem) -> bool:
+    cell = system.ref("/app/school", hf.Supervisor)._cell
+    return cell.host.is_up(cell)
+
+
+async def ids(system: hf.ActorSystem) -> list[str]:
+    there = await system.ref("/app/school", hf.Supervisor).ask(hf.WhichChildren(), timeout=20.0)
+    return [one.id for one in there if one.state == "running"]
+
+
+async def words(system: hf.ActorSystem, name: str) -> list[str]:
+    await until(lambda: f"/app/school/{name}" in system.tree())
+    return await system.ref(f"/app/school/{name}", hf.Actor).ask(Seen(), timeout=20.0)
+
+
+async def test_children_come_back_in_order_with_their_arguments_and_what_they_have_learnt(
+    store: str | None, isolation: Any
+) -> None:
+    async with running(store) as system:
+        top = await system.start(school(PUPIL, isolation=isolation))
+        bob = await top.ask(hf.StartChild(args=("Bob",), kwargs={"town": "Rome"}))
+        await top.ask(hf.StartChild(args=("Ann",), id="ann"))
+        await bob.ask(Note("salve"))
+        await restarted(system)
+        assert await ids(system) == ["pupil-1", "ann"]
+        assert await words(system, "pupil-1") == ["Bob of Rome", "salve"]
+        assert await words(system, "ann") == ["Ann of nowhere"]
+
+
+async def test_without_a_journal_it_starts_empty(isolation: Any) -> None:
+    async with running(None) as system:
+        top = await system.start(hf.dynamic("school", template=PUPIL, isolation=isolation, intensity=5))
+        await top.ask(hf.StartChild(args=("Bob",)))
+        await restarted(system)
+        assert await ids(system) == []
+
+
+async def test_they_come_back_when_the_same_tree_is_started_from_the_same_store(tmp_path: Path, isolation: Any) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    async with running(store) as system:
+        top = await system.start(school(isolation=isolation))
+        await top.ask(hf.StartChild(hf.child("doer", hf.start(Doer), recovery=hf.hybrid())))
+        await top.ask(hf.StartChild(hf.start(Pupil, "Bob")))
+        await system.ref("/app/school/doer", Doer).ask(Note("kept"))
+    async with running(store) as system:
+        await system.start(school(isolation=isolation))
+        assert await ids(system) == ["doer", "pupil-1"]
+        assert await words(system, "doer") == ["kept"]
+        assert await words(system, "pupil-1") == ["Bob of nowhere"]
+
+
+async def test_who_has_ended_for_good_does_not_come_back(store: str | None, isolation: Any) -> None:
+    async with running(store) as system:
+        top = await system.start(school(PUPIL, isolation=isolation))
+        for name in ("ann", "bob", "cleo"):
+            await top.ask(hf.StartChild(args=(name,), id=name))
+        await top.ask(hf.TerminateChild("ann"))
+        await system.stop(system.ref("/app/school/bob", Pupil))
+        await restarted(system)
+        assert await ids(system) == ["cleo"]
+
+
+async def test_a_made_up_id_is_not_given_twice_for_whoever_had_it_is_recorded(
+    store: str | None, isolation: Any
+) -> None:
+    async with running(store) as system:
+        top = await system.start(school(PUPIL, isolation=isolation))
+        bob = await top.ask(hf.StartChild(args=("Bob",)))
+        await bob.ask(Note("secret"))
+        await top.ask(hf.TerminateChild("pupil-1"))
+        await restarted(system)
+        ann = await top.ask(hf.StartChild(args=("Ann",)))
+        assert await ann.ask(Seen()) == ["Ann of nowhere"]
+        assert ann.path == "/app/school/pupil-2"
+        again = await top.ask(hf.StartChild(args=("Bob",), id="pupil-1"))
+        assert await again.ask(Seen()) == ["Bob of nowhere", "secret"], "asked for by name, it is restored"
+        await top.ask(hf.TerminateChild("pupil-1"))
+        anew = await top.ask(hf.StartChild(args=("Bob",), id="pupil-1", fresh=True))
+        assert await anew.ask(Seen()) == ["Bob of nowhere"]
+
+
+async def test_a_start_that_fails_or_is_refused_leaves_nothing_in_the_journal(
+    store: str | None, isolation: Any, tmp_path: Path
+) -> None:
+    blocked = tmp_path / "blocked"
+    blocked.touch()
+    async with running(store) as system:
+        top = await system.start(school(isolation=isolation, max_children=1))
+        with pytest.raises(hf.StartFailed):
+            await top.ask(hf.StartChild(hf.child("bad", hf.start(Shy, str(blocked), "fail"))))
+        assert await top.ask(hf.StartChild(hf.child("shy", hf.start(Shy, str(blocked), "ignore")))) is None
+        await top.ask(hf.StartChild(hf.child("good", hf.start(Pupil, "Ann"))))
+        with pytest.raises(hf.MaxChildren):
+            await top.ask(hf.StartChild(hf.child("more", hf.start(Pupil, "Bob"))))
+        blocked.unlink()
+        await restarted(system)
+        assert await ids(system) == ["good"]
+        assert list(system.node.keeper.notes("child ")) == ["child /app/school/good"]
+
+
+async def test_one_that_fails_to_come_back_is_tried_again_and_does_not_keep_the_others_away(
+    store: str | None, tmp_path: Path
+) -> None:
+    blocked = tmp_path / "blocked"
+    async with running(store) as system:
+        backoff = hf.Backoff(initial=0.05, maximum=0.05)
+        top = await system.start(school(intensity=1000))
+        await top.ask(hf.StartChild(hf.child("bad", hf.start(Shy, str(blocked), "fail"), backoff=backoff)))
+        await top.ask(hf.StartChild(hf.child("good", hf.start(Pupil, "Ann"))))
+        blocked.touch()
+        await restarted(system)
+        assert await ids(system) == ["good"]
+        blocked.unlink()
+        assert await words(system, "bad") == ["here"]
+
+
+async def test_what_cannot_be_kept_is_refused_and_not_started(store: str | None) -> None:
+    class Local(hf.Actor): ...
+
+    async with running(store) as system:
+        top = await system.start(school())
+        with pytest.raises(hf.SpecError, match="defined in a function"):
+            await top.ask(hf.StartChild(hf.start(Local)))
+        with pytest.raises(hf.HoldfastError, match="cannot be"):
+            await top.ask(hf.StartChild(hf.start(Pupil, "x", object())))  # type: ignore[arg-type]
+        assert await ids(system) == []
+
+
+async def test_a_fresh_or_deleted_supervisor_has_no_children(store: str | None, isolation: Any) -> None:
+    async with running(store) as system:
+        root = system.ref("/app", hf.Supervisor)
+        top = await system.start(school(PUPIL, isolation=isolation))
+        bob = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
+        await bob.ask(Note("gone"))
+        await root.ask(hf.TerminateChild("school"), timeout=20.0)
+        await root.ask(hf.RestartChild("school"), timeout=20.0)
+        assert await words(system, "bob") == ["Bob of nowhere", "gone"]
+        await root.ask(hf.TerminateChild("school"), timeout=20.0)
+        await root.ask(hf.RestartChild("school", fresh=True), timeout=20.0)
+        assert await ids(system) == []
+        bob = await system.ref("/app/school", hf.Supervisor).ask(hf.StartChild(args=("Bob",), id="bob"))
+        assert await bob.ask(Seen()) == ["Bob of nowhere"]
+
+
+@pytest.mark.parametrize("journal", [1, "yes", None])
+def test_journal_is_yes_or_no(journal: Any) -> None:
+    with pytest.raises(hf.SpecError, match="journal must be True or False"):
+        hf.dynamic("x", journal=journal)
