@@ -122,7 +122,17 @@ from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, ch
 from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tree import supervisor
 from holdfast.system.run import run
+from holdfast.system.script import UntrustedFile
 from holdfast.system.system import ActorSystem
+from holdfast.system.transaction.change import Change
+from holdfast.system.transaction.errors import TransactionFailed, TransactionRefused
+from holdfast.system.transaction.events import (
+    ScriptLoaded,
+    TransactionBegan,
+    TransactionCommitted,
+    TransactionRolledBack,
+)
+from holdfast.system.transaction.operation import Operation, Step
 
 __all__ = [
     "Actor",
@@ -142,6 +152,7 @@ __all__ = [
     "Backoff",
     "BadMessage",
     "Binding",
+    "Change",
     "ChangeSupervisor",
     "ChildBusy",
     "ChildCounts",
@@ -190,6 +201,7 @@ __all__ = [
     "NotSupported",
     "NotSuspended",
     "Opaque",
+    "Operation",
     "OutOfMemory",
     "PartitionSupervisor",
     "Plan",
@@ -208,6 +220,7 @@ __all__ = [
     "Route",
     "Rule",
     "SHUTDOWN",
+    "ScriptLoaded",
     "SendError",
     "Shutdown",
     "ShutdownError",
@@ -221,16 +234,23 @@ __all__ = [
     "StartIgnored",
     "Statistics",
     "Status",
+    "Step",
     "Supervisor",
     "SupervisorGaveUp",
     "TerminateChild",
     "Timer",
+    "TransactionBegan",
+    "TransactionCommitted",
+    "TransactionFailed",
+    "TransactionRefused",
+    "TransactionRolledBack",
     "TreeFailed",
     "TurnBegan",
     "TurnEnded",
     "TurnSlow",
     "Unbound",
     "UnknownMessage",
+    "UntrustedFile",
     "WhichChildren",
     "WrongActor",
     "bounded",

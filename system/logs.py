@@ -26,6 +26,7 @@ from ..actors.events import (
 )
 from ..actors.exits import Crash
 from ..actors.node import message_of
+from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
 
 BURST = 10
 """Records of one kind within a second; what is more is counted and told with the next one."""
@@ -81,6 +82,9 @@ LEVELS: dict[type, str] = {
     SnapshotFailed: "error",
     JournalFull: "warning",
     LogLine: "info",
+    ScriptLoaded: "info",
+    TransactionCommitted: "info",
+    TransactionRolledBack: "warning",
 }
 NAMES: dict[type, str] = {
     ActorCrashed: "actor crashed",
@@ -99,6 +103,9 @@ NAMES: dict[type, str] = {
     SnapshotFailed: "snapshot failed",
     JournalFull: "journal full",
     LogLine: "output",
+    ScriptLoaded: "code loaded",
+    TransactionCommitted: "transaction committed",
+    TransactionRolledBack: "transaction rolled back",
 }
 
 
