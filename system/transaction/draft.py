@@ -31,7 +31,19 @@ Target = ActorRef[Any] | str
 class Place:
     """One address in the draft. `cell` is None while nobody has lived there: it is to be added."""
 
-    __slots__ = ("bindings", "cell", "children", "flags", "is_leaving", "kind", "name", "names", "parent", "spec")
+    __slots__ = (
+        "bindings",
+        "cell",
+        "children",
+        "flags",
+        "is_leaving",
+        "is_planned",
+        "kind",
+        "name",
+        "names",
+        "parent",
+        "spec",
+    )
 
     def __init__(self, name: str, parent: Place | None, cell: Cell | None, spec: ChildSpec | None) -> None:
         self.name, self.parent, self.cell, self.spec = name, parent, cell, spec
@@ -39,6 +51,7 @@ class Place:
         self.flags: Flags | None = None
         self.kind: type[Actor] | None = spec.start.kind if spec is not None else None
         self.is_leaving = False  # removed by an earlier step; it goes when all is done
+        self.is_planned = False  # added by an earlier step
         self.bindings: dict[str, Place] = {}
         self.names: list[str] = []
 
@@ -82,6 +95,11 @@ class Place:
         if cell is None or cell.is_dead:
             raise NoSuchActor(self.path)
         return cell
+
+    def check_lived_in(self, node: Node) -> None:
+        """Whether somebody lives here, or will at this point. Raises NoSuchActor."""
+        if not self.is_planned:
+            self.living(node)
 
     def line(self) -> str:
         """The place in one line of text."""
@@ -173,8 +191,10 @@ class Draft:
         if not place.is_supervisor:
             raise wrong(place.path, "this is no supervisor")
         cell = place.cell
+        if place.is_planned:
+            return place  # It will have what its spec says.
         if cell is None:
-            return place  # A step before adds it: it will have what its spec says.
+            raise NoSuchActor(place.path)
         if place.actor is None:
             if not is_elsewhere(cell):
                 raise ActorRestarting(place.path)

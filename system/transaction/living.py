@@ -31,8 +31,7 @@ class OnLiving(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._place = draft.find(self._at)
         self.target, self.between_turns_of = place.path, (place,)
-        if place.cell is not None:
-            place.living(system.node)
+        place.check_lived_in(system.node)
 
     def cell(self, system: ActorSystem) -> Cell:
         """Who lives there now. Raises NoSuchActor."""

@@ -121,6 +121,7 @@ def check_child(above: Place, spec: ChildSpec) -> None:
 def _planned(draft: Draft, above: Place, spec: ChildSpec) -> Place:
     """The place of a child to be, and of those that come with it."""
     place = above.children[spec.id] = Place(spec.id, above, None, spec)
+    place.is_planned = True
     for port, path in spec.bindings.items():
         place.bindings[port] = draft.find(path)
     flags, children = (*spec.start.args, None, None)[:2] if spec.is_supervisor else (None, None)
@@ -166,7 +167,7 @@ class Remove(Operation):
             raise wrong(place.path, "the root is not removed: leave the system")
         if above.is_partitioned:
             raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
-        if place.cell is None and place.spec is not None and place.spec.id in _added_names(above):
+        if place.is_planned:
             raise wrong(place.path, "it is added by this very transaction")
         self.target = place.path
         place.is_leaving = True
@@ -190,13 +191,6 @@ class Remove(Operation):
             await system.stop(cell.ref)
         elif above is not None and above.is_supervisor:
             await forget(above.living(system.node), place.name)
-
-
-def _added_names(above: Place) -> set[str]:
-    """Ids of children that are in the draft only."""
-    actor = above.actor
-    known = set(actor._children) if actor is not None else set(above.cell.children or ()) if above.cell else set()
-    return set(above.children) - known
 
 
 class Reorder(Operation):

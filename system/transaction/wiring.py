@@ -36,6 +36,8 @@ class Bind(Operation):
         owner = self._owner = draft.find(self._at)
         self._bound = draft.find(self._to)
         self.target = owner.path
+        for place in (owner, self._bound):
+            place.check_lived_in(system.node)
         kind = owner.kind
         if kind is not None and self._port not in kind._bindings:
             known = ", ".join(sorted(kind._bindings)) or "none"
@@ -94,6 +96,7 @@ class Register(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._place = draft.find(self._at)
         self.target = place.path
+        place.check_lived_in(system.node)
         holder = holder_of(self._name, draft)
         if holder is not None and holder is not place:
             raise NameTaken(self._name)
