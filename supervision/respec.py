@@ -43,6 +43,8 @@ def rebuilt(start: Start[Any], names: list[str], new: Start[Any]) -> Start[Any]:
     if not issubclass(start.kind, Supervisor) or len(start.args) != 2:
         return start
     flags, specs = start.args
+    if not isinstance(specs, tuple):
+        return start  # Of a dynamic supervisor: its children are in no recipe.
     changed = tuple(_changed(spec, names, new) for spec in specs)
     return Start(start.kind, (flags, changed), start.kwargs)
 

@@ -38,6 +38,7 @@ class Place:
         "flags",
         "is_leaving",
         "is_planned",
+        "is_suspended",
         "kind",
         "name",
         "names",
@@ -52,6 +53,7 @@ class Place:
         self.kind: type[Actor] | None = spec.start.kind if spec is not None else None
         self.is_leaving = False  # removed by an earlier step; it goes when all is done
         self.is_planned = False  # added by an earlier step
+        self.is_suspended = cell is not None and cell.more is not None and cell.more.suspended
         self.bindings: dict[str, Place] = {}
         self.names: list[str] = []
 
@@ -205,8 +207,14 @@ class Draft:
         return place
 
     def check(self) -> None:
-        """What must hold when all is done. Raises SpecError: a binding would point at nobody."""
+        """What must hold when all is done.
+
+        Raises:
+            SpecError: a binding would point at nobody, or a suspended supervisor would have to stop a child.
+        """
         for place in self.staying():
+            if place.is_suspended and any(child.is_leaving for child in place.children.values()):
+                check_awake(place)
             for port, target in place.bindings.items():
                 if any(above.is_leaving for above in _upwards(target)):
                     raise wrong(place.path, f"its binding {port!r} would point at {target.path}, which is removed")
@@ -223,6 +231,12 @@ class Draft:
     def lines(self) -> list[str]:
         """The tree when all is done, a line for each address."""
         return [place.line() for place in self.staying()]
+
+
+def check_awake(place: Place) -> None:
+    """Whether a supervisor takes requests. Raises SpecError: it is suspended."""
+    if place.is_suspended:
+        raise wrong(place.path, "it is suspended, and starts and stops nobody: resume it first")
 
 
 def is_elsewhere(cell: Cell) -> bool:

@@ -45,6 +45,11 @@ class Suspend(OnLiving):
     verb: ClassVar[str] = "suspend"
     _done = False
 
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        await super().check(system, draft)
+        assert self._place is not None
+        self._place.is_suspended = True
+
     async def do(self, system: ActorSystem) -> None:
         cell = self.cell(system)
         status = await system.get_status(cell.ref)
@@ -62,6 +67,11 @@ class Resume(OnLiving):
 
     verb: ClassVar[str] = "resume"
     _done = False
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        await super().check(system, draft)
+        assert self._place is not None
+        self._place.is_suspended = False
 
     async def do(self, system: ActorSystem) -> None:
         cell = self.cell(system)
@@ -84,6 +94,12 @@ class Held(OnLiving):
     _held = False  # it is we who have suspended it
     _before: Any = None
     _is_known = False  # whether `_before` is the state to go back to
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        await super().check(system, draft)
+        assert self._place is not None
+        if self._place.is_supervisor:
+            raise wrong(self.target, "a supervisor is changed by its own operations: add, remove, strategy ...")
 
     async def _hold(self, system: ActorSystem) -> Cell:
         cell = self.cell(system)

@@ -24,7 +24,7 @@ from ...supervision.change import check_subtree
 from ...supervision.dynamic import check_dynamic
 from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec
 from ...supervision.supervisor import Supervisor
-from .draft import Draft, Place, Target, is_elsewhere
+from .draft import Draft, Place, Target, check_awake, is_elsewhere
 from .lasting import Specs, in_order, keep, recipe_specs, with_child, without
 from .operation import Operation, wrong
 from .turns import arrange, between_turns
@@ -56,6 +56,7 @@ class Add(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         above, spec = await draft.supervisor(self._at), self.spec
         check_child(above, spec)
+        check_awake(above)
         if above.cell is not None and is_elsewhere(above.cell):
             check_subtree(above.path, (spec,))
             Boxed(spec).packed()

@@ -14,6 +14,7 @@ NAMES = st.sampled_from("abcdefgh")
 ABOVE = st.sampled_from(["/app/left", "/app/right", "/app/pool", "/app/left/sub"])
 PLACES = st.one_of(st.builds("{}/{}".format, ABOVE, NAMES), ABOVE, st.just("/app/right/client"))
 
+TIME_LIMIT = 15.0
 Step = tuple[str, tuple[Any, ...]]
 
 
@@ -70,7 +71,8 @@ def run(scenario: Callable[[hf.ActorSystem], Any]) -> None:
     async def main() -> None:
         async with hf.ActorSystem("app", log=False, intensity=1000) as system:
             await plant(system)
-            await scenario(system)
+            async with asyncio.timeout(TIME_LIMIT):
+                await scenario(system)
 
     asyncio.run(main())
 
