@@ -79,7 +79,7 @@ def read_source(path: str | os.PathLike[str], uid: int | None = None) -> Source:
             if not stat.S_ISREG(info.st_mode):
                 raise SpecError(str(full), "this is no file")
             check_owner(str(full), info, {owner})
-            check_folders(full.parent, owner)
+            check_folders(full.parent, {owner})
             data = file.read(LARGEST + 1)
     except OSError as error:
         raise SpecError(str(path), error.strerror or str(error)) from error
@@ -100,21 +100,22 @@ def check_owner(path: str, info: os.stat_result, owners: set[int]) -> None:
         raise UntrustedFile(path, f"others may write it (mode {stat.S_IMODE(info.st_mode):04o}); chmod go-w")
 
 
-def check_folders(folder: Path, owner: int, *, may_share: bool = False) -> None:
+def check_folders(folder: Path, owners: set[int], *, may_share: bool = False) -> None:
     """Whether nobody else could put another file in the place of one in this folder.
 
-    The folder itself must be the user's; those above may be root's, and open to all if they keep everybody's files
-    apart (the sticky bit, as /tmp has it). `may_share`: the folder itself too.
+    The folder itself must belong to one of the owners; those above may be root's, and open to all if they keep
+    everybody's files apart (the sticky bit, as /tmp has it). `may_share`: the folder itself too.
 
     Raises:
         UntrustedFile: somebody could.
     """
     for number, one in enumerate((folder, *folder.parents)):
+        above = bool(number) or may_share
         info = os.stat(one)
-        shared = bool(info.st_mode & stat.S_ISVTX) and info.st_uid in (0, owner)
-        if shared and (number or may_share):
+        allowed = owners | {0} if above else owners
+        if above and info.st_mode & stat.S_ISVTX and info.st_uid in allowed:
             continue
-        check_owner(str(one), info, {owner} if not number and not may_share else {owner, 0})
+        check_owner(str(one), info, allowed)
 
 
 def load_source(source: Source) -> types.ModuleType:
