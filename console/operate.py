@@ -34,11 +34,15 @@ def apply(
     try:
         loaded = load_script(script)
         source = loaded.source
-        with RemoteSystem(
+        system = RemoteSystem(
             socket, dry_run=dry_run, timeout=timeout, script=(source.path, source.sha256), told=_show
-        ) as system:
-            _run(loaded.reconfigure, system)
+        )
     except (UntrustedFile, NotReached, WrongUser, SpecError) as error:
+        raise _failed("apply", error, UNUSABLE) from error
+    try:
+        with system:
+            _run(loaded.reconfigure, system)
+    except NotReached as error:
         raise _failed("apply", error, UNUSABLE) from error
     except HoldfastError as error:
         raise _failed("apply", error, FAILED) from error
