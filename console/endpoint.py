@@ -44,6 +44,8 @@ IDLE = 600.0
 """Seconds a client may say nothing."""
 PATIENCE = 10.0
 """Seconds that a frame may take once it has begun, either way."""
+LINGER = 1.0
+"""Seconds that a client gets to take the reason why its connection ends."""
 LONGEST = 3600.0
 """Seconds that one request may take."""
 OPERATIONS = frozenset(
@@ -155,7 +157,7 @@ class Endpoint:
         except (HoldfastError, msgspec.DecodeError) as error:
             no = error if isinstance(error, HoldfastError) else BadRequest(str(error))
             with contextlib.suppress(OSError, TimeoutError):
-                await write(writer, failure(no))
+                await part(reader, writer, no)
         except (OSError, TimeoutError):
             pass  # It has gone, or says nothing: its connection ends, and that is all.
         except asyncio.CancelledError:
@@ -243,6 +245,15 @@ async def read(reader: asyncio.StreamReader) -> bytes | None:
             return await reader.readexactly(size)
     except asyncio.IncompleteReadError as error:
         raise BadRequest("it is cut short") from error
+
+
+async def part(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, error: HoldfastError) -> None:
+    """Tell a client why its connection ends. What it has sent is read: else the kernel would cut off our answer."""
+    await write(writer, failure(error))
+    writer.write_eof()
+    async with asyncio.timeout(LINGER):
+        while await reader.read(64 * 1024):
+            pass
 
 
 async def write(writer: asyncio.StreamWriter, response: Response) -> None:
