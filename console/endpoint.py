@@ -1,4 +1,4 @@
-"""The control endpoint of a running system: a Unix socket for its own user, through which it is looked at and changed."""
+"""The control endpoint of a running system: a Unix socket for its user, to look at the system and to change it."""
 
 from __future__ import annotations
 
@@ -49,8 +49,22 @@ LINGER = 1.0
 LONGEST = 3600.0
 """Seconds that one request may take."""
 OPERATIONS = frozenset(
-    "add remove move reorder strategy intensity isolation bind register unregister suspend resume "
-    "replace_state replace_code".split()
+    [
+        "add",
+        "remove",
+        "move",
+        "reorder",
+        "strategy",
+        "intensity",
+        "isolation",
+        "bind",
+        "register",
+        "unregister",
+        "suspend",
+        "resume",
+        "replace_state",
+        "replace_code",
+    ]
 )
 
 
@@ -75,7 +89,7 @@ async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) ->
     Raises:
         EndpointInUse: a live process has it, or there is something else. UntrustedFile: others may write the folder.
     """
-    where = Path(os.path.abspath(path))
+    where = Path(path).absolute()
     sock, inode = listen(where)
     endpoint = Endpoint(system, os.geteuid())
     server = await asyncio.start_unix_server(endpoint.serve, sock=sock, limit=64 * 1024)
@@ -265,5 +279,3 @@ async def write(writer: asyncio.StreamWriter, response: Response) -> None:
     writer.write(data)
     async with asyncio.timeout(PATIENCE):
         await writer.drain()
-
-

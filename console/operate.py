@@ -34,9 +34,7 @@ def apply(
     try:
         loaded = load_script(script)
         source = loaded.source
-        system = RemoteSystem(
-            socket, dry_run=dry_run, timeout=timeout, script=(source.path, source.sha256), told=_show
-        )
+        system = RemoteSystem(socket, dry_run=dry_run, timeout=timeout, script=(source.path, source.sha256), told=_show)
     except (UntrustedFile, NotReached, WrongUser, SpecError) as error:
         raise _failed("apply", error, UNUSABLE) from error
     try:

@@ -165,7 +165,7 @@ class RemoteSystem:
     def __exit__(self, *exc: object) -> None:
         self._client.close()
 
-    # -- looking at it --------------------------------------------------------------------------------------------------
+    # -- looking at it ------------------------------------------------------------------------------------------------
 
     def tree(self) -> list[str]:
         """The addresses that live now, parents before children."""
@@ -189,15 +189,13 @@ class RemoteSystem:
         """A copy of an actor's state."""
         return await self._control("get_state", ref, timeout)
 
-    async def statistics(
-        self, ref: RemoteTarget, on: bool | None = None, *, timeout: float = 5.0
-    ) -> Statistics | None:
+    async def statistics(self, ref: RemoteTarget, on: bool | None = None, *, timeout: float = 5.0) -> Statistics | None:
         """What an actor has done since its statistics were switched on; None while they are off."""
         args = [] if on is None else [int(on)]
         counts: Statistics | None = await self._control("statistics", ref, timeout, *args, changes=on is not None)
         return counts
 
-    # -- orders to one actor --------------------------------------------------------------------------------------------
+    # -- orders to one actor ------------------------------------------------------------------------------------------
 
     async def suspend(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
         """Have an actor handle no message until `resume`."""
@@ -233,7 +231,7 @@ class RemoteSystem:
         packed = [pack_arg(arg, verb) for arg in args]
         return await self.call(Control(verb, text_of(ref), packed, timeout, self._script), timeout)
 
-    # -- transactions ---------------------------------------------------------------------------------------------------
+    # -- transactions -------------------------------------------------------------------------------------------------
 
     def transaction(self, *, dry_run: bool = False, timeout: float | None = None) -> RemoteTransaction:
         """As `ActorSystem.transaction`: what the body collects is sent when it ends, and carried out there as one."""
@@ -348,9 +346,7 @@ class RemoteChange:
         """Put `change(state)` in the place of an actor's state."""
         self._put("replace_state", target, change)
 
-    def replace_code(
-        self, target: RemoteTarget, new: type[Actor] | Start[Any], migrate: Migrate | None = None
-    ) -> None:
+    def replace_code(self, target: RemoteTarget, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
         """Go on as another class."""
         self._put("replace_code", target, new, migrate)
 

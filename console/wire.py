@@ -1,7 +1,7 @@
 """What an operator's command and a running system say to each other over the control endpoint.
 
-A frame is a 4-byte length and MessagePack. Requests are typed and bounded; what has to be rebuilt with its classes (child
-specs, functions, states) travels as packed bytes inside and is opened only when the request is carried out.
+A frame is a 4-byte length and MessagePack. Requests are typed and bounded; what has to be rebuilt with its classes
+(child specs, functions, states) travels as packed bytes inside and is opened only when the request is carried out.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def check_user(uid: int, expected: int) -> None:
         raise WrongUser(uid, expected)
 
 
-# -- arguments of operations --------------------------------------------------------------------------------------------
+# -- arguments of operations ------------------------------------------------------------------------------------------
 
 
 class Arg(msgspec.Struct, array_like=True, frozen=True, tag_field="kind"):
@@ -108,7 +108,7 @@ def open_arg(arg: AnyArg) -> Any:
     return unpack_function(decode_value(arg.data))
 
 
-# -- requests -----------------------------------------------------------------------------------------------------------
+# -- requests ---------------------------------------------------------------------------------------------------------
 
 
 class Request(msgspec.Struct, tag_field="ask", forbid_unknown_fields=True, frozen=True):

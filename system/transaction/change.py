@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Change:
-    """Collects operations. A target is a ref, or an address as it is at that point: one that a step before adds, too."""
+    """Collects operations. A target is a ref, or an address as it is at that point: a step before may have added it."""
 
     def __init__(self, system: ActorSystem) -> None:
         self._system = system
@@ -114,7 +114,7 @@ class Change:
 
     @property
     def difference(self) -> tuple[str, ...]:
-        """How the tree changes: lines that begin with `-` go, lines that begin with `+` come. Known after the checks."""
+        """How the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
         return tuple(self._difference or ())
 
     def describe(self) -> str:

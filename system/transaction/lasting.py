@@ -22,8 +22,7 @@ Edit = Callable[[Flags, Specs], tuple[Flags, Specs]]
 
 def recipe_flags(cell: Cell) -> Flags | None:
     """The flags in a supervisor's recipe, if it has one with flags."""
-    flags = _parts(_recipe(cell)[1])[0]
-    return flags
+    return _parts(_recipe(cell)[1])[0]
 
 
 def recipe_specs(cell: Cell) -> Specs | None:

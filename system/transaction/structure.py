@@ -296,7 +296,9 @@ class SetFlags(Operation):
         place = self._place = await draft.supervisor(self._at)
         self.target, self.between_turns_of = place.path, (place,)
         if place.flags is None:
-            raise NotSupported("it lives in another process and its class has an init of its own: only it knows its flags")
+            raise NotSupported(
+                "it lives in another process and its class has an init of its own: only it knows its flags"
+            )
         if place.cell is not None and is_elsewhere(place.cell):
             self._flags = place.flags
         place.flags = dataclasses.replace(place.flags, **self._wanted)

@@ -75,7 +75,7 @@ class Transaction:
         else:
             await self._finish()
 
-    # -- before ---------------------------------------------------------------------------------------------------------
+    # -- before -------------------------------------------------------------------------------------------------------
 
     async def _in_time(
         self, step: str, deadline: float, work: Callable[[], Coroutine[Any, Any, Any]], waits_for: str = ""
@@ -104,7 +104,7 @@ class Transaction:
             raise TransactionRefused("the tree as it would be", said(error)) from error
         change._difference = difference(before, draft.lines())
 
-    # -- the steps ------------------------------------------------------------------------------------------------------
+    # -- the steps ----------------------------------------------------------------------------------------------------
 
     async def _do(self, deadline: float) -> None:
         system, change = self._system, self._change
@@ -161,7 +161,7 @@ class Transaction:
             raise cancelled
         return tuple(undone), tuple(kept)
 
-    # -- behind ---------------------------------------------------------------------------------------------------------
+    # -- behind -------------------------------------------------------------------------------------------------------
 
     async def _finish(self) -> None:
         """There is no way back: what is left goes on even if nobody waits for it any more."""
@@ -215,7 +215,9 @@ def refuse_self(operation: Operation) -> None:
     """
     caller = current.get(None)
     if caller is not None and any(place.cell is caller.cell for place in operation.between_turns_of):
-        raise TransactionRefused(operation.text, f"{caller.path} cannot change itself within its own turn: spawn a task")
+        raise TransactionRefused(
+            operation.text, f"{caller.path} cannot change itself within its own turn: spawn a task"
+        )
 
 
 def said(error: BaseException) -> str:

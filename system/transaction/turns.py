@@ -1,4 +1,4 @@
-"""Work that is done between two turns of a supervisor, ahead of its messages: what it decides sees all of it or none."""
+"""Work between two turns of a supervisor, ahead of its messages: what it decides sees all of it or none."""
 
 from __future__ import annotations
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-# The actors of some tests are imported by the system that a command reaches: by name, so the root has to be on the path.
+# What a command sends is rebuilt by name in the system that it reaches, so the root has to be on the path.
 ROOT = str(Path(__file__).parents[2])
 if ROOT not in sys.path:
     sys.path.append(ROOT)

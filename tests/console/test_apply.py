@@ -1,4 +1,4 @@
-"""`holdfast apply`: a script of its user, and of nobody else, changes a running system; as in process, so over the socket."""
+"""`holdfast apply`: a script of its user, and of nobody else, changes a running system, as it would in process."""
 
 import asyncio
 import hashlib
@@ -16,7 +16,7 @@ from holdfast.system.script import UntrustedFile, read_source
 from tests.system.trees import Add, picture, plant, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
-GROW = '''
+GROW = """
 import holdfast as hf
 
 
@@ -41,7 +41,7 @@ async def reconfigure(system):
         change.move("/app/left/b", "/app/right")
         change.replace_state("/app/left/a", hundred)
         change.remove("/app/left/c")
-'''
+"""
 
 
 @pytest.fixture
@@ -124,8 +124,8 @@ async def test_the_same_script_runs_in_process(system: hf.ActorSystem, grow: Pat
             "transaction refused at: remove /app/x (there is no actor at /app/x); nothing was done",
         ),
         (
-            "async def reconfigure(system):\n async with system.transaction() as change:\n  change.remove('/app/left/b')\n"
-            "  raise RuntimeError('changed my mind')",
+            "async def reconfigure(system):\n async with system.transaction() as change:\n"
+            + "  change.remove('/app/left/b')\n  raise RuntimeError('changed my mind')",
             FAILED,
             "changed my mind",
         ),

@@ -59,12 +59,10 @@ async def raw(path: Path, data: bytes) -> tuple[Any, bytes]:
         await writer.wait_closed()
 
 
-# -- the socket ---------------------------------------------------------------------------------------------------------
+# -- the socket -------------------------------------------------------------------------------------------------------
 
 
-async def test_only_its_user_may_open_it_and_it_goes_with_the_endpoint(
-    system: hf.ActorSystem, tmp_path: Path
-) -> None:
+async def test_only_its_user_may_open_it_and_it_goes_with_the_endpoint(system: hf.ActorSystem, tmp_path: Path) -> None:
     where = tmp_path / "app.sock"
     umask = os.umask(0)
     try:
@@ -116,7 +114,9 @@ async def test_a_live_endpoint_is_not_replaced(system: hf.ActorSystem, path: Pat
 
 async def test_the_socket_of_a_dead_process_is_replaced(system: hf.ActorSystem, tmp_path: Path) -> None:
     where = tmp_path / "app.sock"
-    program = "import socket, sys; s = socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); import os; os._exit(9)"
+    program = (
+        "import socket, sys; s = socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); import os; os._exit(9)"
+    )
     assert subprocess.run([sys.executable, "-c", program, where], check=False, timeout=60).returncode == 9
     assert where.is_socket()
     async with control_endpoint(system, where):
@@ -147,7 +147,7 @@ async def test_another_user_is_not_served(system: hf.ActorSystem, tmp_path: Path
         await server.wait_closed()
 
 
-# -- what is sent -------------------------------------------------------------------------------------------------------
+# -- what is sent -----------------------------------------------------------------------------------------------------
 
 HEAD = struct.Struct(">I")
 BAD = {
@@ -202,7 +202,7 @@ def test_every_request_is_typed() -> None:
     assert all(kind.__struct_config__.forbid_unknown_fields for kind in Request.__subclasses__())
 
 
-# -- what a script can do -----------------------------------------------------------------------------------------------
+# -- what a script can do ---------------------------------------------------------------------------------------------
 
 
 async def test_the_tree_is_looked_at_and_actors_are_controlled(system: hf.ActorSystem, path: Path) -> None:

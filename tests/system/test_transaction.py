@@ -11,7 +11,6 @@ from tests.system.trees import (
     Add,
     Boom,
     Broken,
-    Client,
     Counter,
     Double,
     Life,
@@ -22,6 +21,9 @@ from tests.system.trees import (
     picture,
     ref,
 )
+
+# A refused or failed transaction ends with its block, which collects several steps.
+# ruff: noqa: PT012
 
 Steps = Callable[[hf.Change], object]
 
@@ -112,7 +114,7 @@ async def test_nothing_is_done_when_the_body_raises(system: hf.ActorSystem) -> N
     assert stone.calls == []
 
 
-# -- each operation, what is particular to it ---------------------------------------------------------------------------
+# -- each operation, what is particular to it -------------------------------------------------------------------------
 
 
 async def test_later_steps_see_what_earlier_ones_add(system: hf.ActorSystem) -> None:
@@ -289,7 +291,7 @@ async def test_the_tree_keeps_its_new_shape_when_a_supervisor_is_restarted(syste
     assert await ref(system, "/app/left/g").ask(Add()) == 6
 
 
-# -- while others are at work -------------------------------------------------------------------------------------------
+# -- while others are at work -----------------------------------------------------------------------------------------
 
 
 async def test_a_child_that_crashes_in_the_middle_is_restarted_by_whoever_has_it(system: hf.ActorSystem) -> None:
@@ -484,5 +486,3 @@ async def test_what_cannot_be_undone_is_told(system: hf.ActorSystem) -> None:
             change.step(Stumble())
     assert failed.value.undone == ("stumble over a stone", "unregister first")
     assert "first" in system.node.names
-
-
