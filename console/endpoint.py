@@ -8,7 +8,7 @@ import errno
 import os
 import socket
 import stat
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any
 
@@ -48,23 +48,8 @@ LINGER = 1.0
 """Seconds that a client gets to take the reason why its connection ends."""
 LONGEST = 3600.0
 """Seconds that one request may take."""
-OPERATIONS = frozenset(
-    [
-        "add",
-        "remove",
-        "move",
-        "reorder",
-        "strategy",
-        "intensity",
-        "isolation",
-        "bind",
-        "register",
-        "unregister",
-        "suspend",
-        "resume",
-        "replace_state",
-        "replace_code",
-    ]
+OPERATIONS = frozenset({"add", "remove", "move", "reorder", "strategy", "intensity", "isolation"}) | frozenset(
+    {"bind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
 )
 
 
@@ -80,7 +65,7 @@ class EndpointInUse(HoldfastError):
 
 
 @contextlib.asynccontextmanager
-async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) -> AsyncIterator[Path]:
+async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) -> AsyncGenerator[Path, None]:
     """Serve the control endpoint of a running system at `path`, for this user only, until the block ends.
 
     The folder must be one that nobody else can write to (or keep everybody's files apart, as /tmp does). A socket that
@@ -89,7 +74,7 @@ async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) ->
     Raises:
         EndpointInUse: a live process has it, or there is something else. UntrustedFile: others may write the folder.
     """
-    where = Path(path).absolute()
+    where = absolute(path)
     sock, inode = listen(where)
     endpoint = Endpoint(system, os.geteuid())
     server = await asyncio.start_unix_server(endpoint.serve, sock=sock, limit=64 * 1024)
@@ -99,9 +84,21 @@ async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) ->
         server.close()
         await endpoint.close()
         await server.wait_closed()
-        with contextlib.suppress(FileNotFoundError):
-            if os.lstat(where).st_ino == inode:  # Else it is another's by now.
-                os.unlink(where)
+        remove(where, inode)
+
+
+def absolute(path: str | os.PathLike[str]) -> Path:
+    """The path from the root on: the folder in which we are may change."""
+    return Path(path).absolute()
+
+
+def remove(path: Path, inode: int) -> None:
+    """Remove our socket, unless another's is there by now."""
+    try:
+        if os.lstat(path).st_ino == inode:
+            os.unlink(path)
+    except FileNotFoundError:
+        pass
 
 
 def listen(path: Path) -> tuple[socket.socket, int]:

@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
@@ -32,7 +32,7 @@ class Needed:
 
 
 @contextlib.contextmanager
-def trusted_imports(node: Node, needed: Needed) -> Iterator[None]:
+def trusted_imports(node: Node, needed: Needed) -> Generator[None, None, None]:
     """While the block runs, modules are imported only from files of this user, or root's, that nobody else may write.
 
     The script's own module is loaded first, if something in the request is defined there.

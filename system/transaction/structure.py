@@ -22,7 +22,7 @@ from ...supervision.admin import (
 )
 from ...supervision.change import check_subtree
 from ...supervision.dynamic import check_dynamic
-from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec
+from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, child
 from ...supervision.supervisor import Supervisor
 from .draft import Draft, Place, Target, check_awake, is_elsewhere
 from .lasting import Specs, in_order, keep, recipe_specs, with_child, without
@@ -85,9 +85,9 @@ class Add(Operation):
         if not self._asked or above is None:
             return
         supervisor = above.living(system.node)
-        child = (supervisor.children or {}).get(self.spec.id)
-        if child is not None and not child.host.is_up(child):
-            child.kill()  # Its start would hold up its supervisor, and us, for as long as it likes.
+        cell = (supervisor.children or {}).get(self.spec.id)
+        if cell is not None and not cell.host.is_up(cell):
+            cell.kill()  # Its start would hold up its supervisor, and us, for as long as it likes.
         await forget(supervisor, self.spec.id)
 
     def verify(self, system: ActorSystem) -> None:
@@ -136,9 +136,9 @@ def _planned(draft: Draft, above: Place, spec: ChildSpec) -> Place:
 def _fill(place: Place, cell: Cell) -> None:
     """The place is lived in now: later steps find who does."""
     place.cell = cell
-    for name, child in (cell.children or {}).items():
+    for name, below in (cell.children or {}).items():
         if name in place.children:
-            _fill(place.children[name], child)
+            _fill(place.children[name], below)
 
 
 async def forget(supervisor: Cell, name: str) -> None:
@@ -328,10 +328,10 @@ class SetFlags(Operation):
 
     def seal(self, system: ActorSystem) -> None:
         assert self._place is not None
-        keep(
-            self._place.living(system.node),
-            lambda flags, specs: (dataclasses.replace(flags, **self._wanted), specs),
-        )
+        keep(self._place.living(system.node), self._edit)
+
+    def _edit(self, flags: Flags, specs: Specs) -> tuple[Flags, Specs]:
+        return dataclasses.replace(flags, **self._wanted), specs
 
 
 def named_spec(supervisor: Target, spec: ChildSpec | Start[Any], taken: set[str], system: ActorSystem) -> ChildSpec:
@@ -340,8 +340,6 @@ def named_spec(supervisor: Target, spec: ChildSpec | Start[Any], taken: set[str]
     Raises:
         SpecError: it is no spec.
     """
-    from ...supervision.spec import child
-
     made = child(None, spec) if isinstance(spec, Start) else spec
     if not isinstance(made, ChildSpec):
         raise wrong("add", f"takes child(...), start(...) or supervisor(...), not {spec!r}")

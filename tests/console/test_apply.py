@@ -43,6 +43,13 @@ async def reconfigure(system):
         change.remove("/app/left/c")
 """
 
+CHANGED_MIND = """
+async def reconfigure(system):
+    async with system.transaction() as change:
+        change.remove("/app/left/b")
+        raise RuntimeError("changed my mind")
+"""
+
 
 @pytest.fixture
 async def system() -> AsyncIterator[hf.ActorSystem]:
@@ -124,8 +131,7 @@ async def test_the_same_script_runs_in_process(system: hf.ActorSystem, grow: Pat
             "transaction refused at: remove /app/x (there is no actor at /app/x); nothing was done",
         ),
         (
-            "async def reconfigure(system):\n async with system.transaction() as change:\n"
-            + "  change.remove('/app/left/b')\n  raise RuntimeError('changed my mind')",
+            CHANGED_MIND,
             FAILED,
             "changed my mind",
         ),

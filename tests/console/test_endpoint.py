@@ -1,6 +1,7 @@
 """The control endpoint: whom it serves, what it refuses, and that nobody is hurt by what another sends (DESIGN 9)."""
 
 import asyncio
+import inspect
 import os
 import socket
 import stat
@@ -40,7 +41,7 @@ async def far(path: Path, work: Any) -> Any:
 
     def run() -> Any:
         with RemoteSystem(path) as remote:
-            return asyncio.run(work(remote)) if asyncio.iscoroutinefunction(work) else work(remote)
+            return asyncio.run(work(remote)) if inspect.iscoroutinefunction(work) else work(remote)
 
     return await asyncio.to_thread(run)
 
@@ -283,13 +284,18 @@ async def test_a_transaction_whose_client_goes_is_rolled_back(system: hf.ActorSy
                     change.add("/app/pool", hf.child("slow", hf.start(Endless)))
 
             client = asyncio.create_task(far(path, lambda remote: go_in_the_middle(remote, work)))
-            async for event in stream:
-                if isinstance(event, hf.TransactionRolledBack):
-                    break
+            reason = await rolled_back(stream)
         await client
     await system.resume(ref(system, "/app/right"))
-    assert event.reason == "cancelled"
+    assert reason == "cancelled"
     assert picture(system) == before
+
+
+async def rolled_back(stream: hf.EventStream) -> str:
+    async for event in stream:
+        if isinstance(event, hf.TransactionRolledBack):
+            return event.reason
+    raise AssertionError("the stream has ended")
 
 
 class Endless(Counter):

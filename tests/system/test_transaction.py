@@ -82,11 +82,13 @@ async def test_it_is_undone_by_a_failure_behind_it(system: hf.ActorSystem, name:
     if name in ("register", "strategy"):
         steps = [EACH[name]]
     before = picture(system)
+    transaction = system.transaction()
+    change = await transaction.__aenter__()
+    for step in steps:
+        step(change)
+    change.step(Stumble())
     with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
-        async with system.transaction() as change:
-            for step in steps:
-                step(change)
-            change.step(Stumble())
+        await transaction.__aexit__(None, None, None)
     assert picture(system) == before
     assert failed.value.kept == ()
     assert failed.value.undone == tuple(step.text for step in reversed(change.steps))
