@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.actor import Start
@@ -318,7 +319,7 @@ class SetFlags(Operation):
         if before is not None and self._place is not None:
             await self._set(self._place.living(system.node), lambda flags: dataclasses.replace(flags, **before))
 
-    async def _set(self, cell: Cell, edit: Any) -> None:
+    async def _set(self, cell: Cell, edit: Callable[[Flags], Flags]) -> None:
         if self._flags is None:
             await between_turns(cell, lambda supervisor: setattr(supervisor, "_flags", edit(supervisor._flags)))
             return

@@ -85,7 +85,7 @@ async def test_it_has_no_wider_rights_at_the_moment_of_its_birth(
             super().bind(address)
             seen.append(stat.S_IMODE(os.lstat(address).st_mode))
 
-    monkeypatch.setattr(endpoint_module.socket, "socket", Looking)
+    monkeypatch.setattr(socket, "socket", Looking)
     before = os.umask(0o022)
     try:
         sock, _ = endpoint_module.listen(tmp_path / "app.sock")

@@ -167,3 +167,22 @@ async def test_code_of_a_child_of_a_dynamic_supervisor_is_replaced(system: hf.Ac
         change.replace_code(one, Double)
     one.tell(Boom())
     assert await one.ask(Add(3)) == 6
+
+
+async def test_a_move_waits_for_recorded_actors_that_may_have_to_repeat_what_they_sent(
+    system: hf.ActorSystem,
+) -> None:
+    plain, sender = ref(system, "/app/near/plain"), ref(system, "/app/near/sender")
+    await system.suspend(plain)
+    poked = sender.ask(Poke(plain))  # Its turn is not over: a replay would ask again, at the address of before.
+    while not (await system.get_status(sender)).turn:
+        await asyncio.sleep(0)
+    with pytest.raises(hf.TransactionFailed, match="their snapshots are waited for"):
+        async with system.transaction(timeout=0.2) as change:
+            change.move(plain, "/app/other")
+    assert plain.path == "/app/near/plain"
+    await system.resume(plain)
+    assert await poked == 1
+    async with system.transaction() as change:
+        change.move(plain, "/app/other")
+    assert plain.path == "/app/other/plain"
