@@ -28,7 +28,7 @@ class TransactionRolledBack(Event, frozen=True, eq=False):
 
 
 class ScriptLoaded(Event, frozen=True, eq=False):
-    """Code was loaded at run time, from a file; its sha256 in hex digits says what it was."""
+    """A script was run or sent here, or a module was loaded for one; its sha256 in hex digits says what it was."""
 
     path: str
     sha256: str
