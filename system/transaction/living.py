@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import functools
 from typing import TYPE_CHECKING, Any, ClassVar, cast
@@ -210,6 +211,7 @@ class Isolate(OnLiving):
         super().__init__(target)
         self._to = isolation
         self._before: Isolation | None = None
+        self._moving: asyncio.Task[None] | None = None
 
     @property
     def text(self) -> str:
@@ -232,11 +234,17 @@ class Isolate(OnLiving):
         before: Isolation = cell.spec.isolation
         if before != self._to:
             self._before = before
-            await cast("Any", system).set_isolation(cell.ref, self._to)
+            moving = cast("Any", system).set_isolation(cell.ref, self._to)
+            self._moving = system.node.loop.create_task(moving, name=f"isolation of {cell.path}")
+            await asyncio.shield(self._moving)
 
     async def undo(self, system: ActorSystem) -> None:
         if self._before is None:
             return
+        if self._moving is not None:
+            await asyncio.wait((self._moving,))  # Whoever is cancelled gives up waiting; the move comes to its end.
+            if not self._moving.cancelled():
+                self._moving.exception()
         cell = self.cell(system)
-        if cell.spec.isolation != self._before:  # Else it was in the middle of it, and has given up itself.
+        if cell.spec.isolation != self._before:  # Else it stayed where it was.
             await cast("Any", system).set_isolation(cell.ref, self._before)
