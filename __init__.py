@@ -135,7 +135,17 @@ from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tasks import Tasks, tasks
 from holdfast.supervision.tree import supervisor
 from holdfast.system.run import run
+from holdfast.system.script import UntrustedFile
 from holdfast.system.system import ActorSystem
+from holdfast.system.transaction.change import Change
+from holdfast.system.transaction.errors import TransactionFailed, TransactionRefused
+from holdfast.system.transaction.events import (
+    ScriptLoaded,
+    TransactionBegan,
+    TransactionCommitted,
+    TransactionRolledBack,
+)
+from holdfast.system.transaction.operation import Operation, Step
 
 __all__ = [
     "Actor",
@@ -157,6 +167,7 @@ __all__ = [
     "BadMessage",
     "Binding",
     "CannotMove",
+    "Change",
     "ChangeSupervisor",
     "ChildBusy",
     "ChildCounts",
@@ -215,6 +226,7 @@ __all__ = [
     "NotUnique",
     "Ok",
     "Opaque",
+    "Operation",
     "OutOfMemory",
     "PartitionSupervisor",
     "Plan",
@@ -246,6 +258,7 @@ __all__ = [
     "Route",
     "Rule",
     "SHUTDOWN",
+    "ScriptLoaded",
     "SendError",
     "Shutdown",
     "ShutdownError",
@@ -259,6 +272,7 @@ __all__ = [
     "StartIgnored",
     "Statistics",
     "Status",
+    "Step",
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
@@ -266,12 +280,18 @@ __all__ = [
     "Tasks",
     "TerminateChild",
     "Timer",
+    "TransactionBegan",
+    "TransactionCommitted",
+    "TransactionFailed",
+    "TransactionRefused",
+    "TransactionRolledBack",
     "TreeFailed",
     "TurnBegan",
     "TurnEnded",
     "TurnSlow",
     "Unbound",
     "UnknownMessage",
+    "UntrustedFile",
     "WhichChildren",
     "WrongActor",
     "bounded",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from ..actors.cell import GONE, RUNNING, Cell
@@ -58,6 +58,9 @@ class Homes:
         """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
         switch = self._switches.get(path)
         return None if switch is None or switch.cell is None or switch.cell.state is GONE else switch.cell
+
+    def __iter__(self) -> Iterator[Switch]:
+        return iter(self._switches.values())
 
     # -- what supervisors say (`Keeper`) ----------------------------------------------------------------------------
 

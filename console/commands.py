@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 
 from .. import HoldfastError
+from . import operate
 from .cli import missing_extra
 
 commands = typer.Typer(
@@ -88,6 +89,11 @@ def demo(
         raise _failed(error, DIFFERS) from error
     if not report.is_good:
         raise typer.Exit(DIFFERS)
+
+
+commands.command()(operate.apply)
+commands.command()(operate.tree)
+commands.command()(operate.status)
 
 
 def _failed(error: Exception, status: int) -> typer.Exit:

@@ -170,7 +170,7 @@ class PoolSupervisor(Supervisor):
         raise NotSupported("the children of a pool are its workers: use ResizePool")
 
     @on(DeleteChild)
-    def _delete_child(self, message: DeleteChild) -> None:
+    def _delete_child(self, message: DeleteChild) -> Any:
         """Workers are all alike."""
         self._child(message.id)
         raise NotSupported("the children of a pool are its workers: use ResizePool")

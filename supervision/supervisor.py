@@ -146,6 +146,9 @@ class Supervisor(Actor):
     def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Coroutine[Any, Any, None] | None:
         """Decide what follows from the end of a child's life (called by the loop, in a turn of ours)."""
         one = self._children.get(cell.name)
+        if cell.parent is not self.ctx.cell and cell.parent is not None:
+            cell.parent.push(lives.ChildExit(cell, life, reason))  # It was moved since: another one decides.
+            return None
         if one is None or one.cell is not cell:
             lives.retire(cell, reason)
             return None

@@ -29,6 +29,7 @@ from ..actors.events import (
 )
 from ..actors.exits import Crash
 from ..actors.node import message_of
+from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
 
 BURST = 10
 """Records of one kind within a second; what is more is counted and told with the next one."""
@@ -87,6 +88,9 @@ LEVELS: dict[type, str] = {
     StoreRefused: "error",
     LogLine: "info",
     Moved: "info",
+    ScriptLoaded: "info",
+    TransactionCommitted: "info",
+    TransactionRolledBack: "warning",
 }
 NAMES: dict[type, str] = {
     ActorCrashed: "actor crashed",
@@ -108,6 +112,9 @@ NAMES: dict[type, str] = {
     StoreRefused: "store refused",
     LogLine: "output",
     Moved: "actor moved",
+    ScriptLoaded: "code loaded",
+    TransactionCommitted: "transaction committed",
+    TransactionRolledBack: "transaction rolled back",
 }
 
 

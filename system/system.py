@@ -35,6 +35,9 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .script import load_script
+from .transaction.addresses import Moved
+from .transaction.transaction import Transaction, Transactions
 
 A = TypeVar("A", bound=Actor)
 
@@ -97,6 +100,7 @@ class ActorSystem(Controls):
         self._closing: asyncio.Task[None] | None = None
         self._failure: TreeFailed | None = None
         self._stopping: set[asyncio.Task[None]] = set()
+        self._transactions = Transactions()
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -111,7 +115,8 @@ class ActorSystem(Controls):
         node.respec = respec
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
-        node.outside = self._homes.find
+        self.moved_addresses = Moved(node, self._homes.find)
+        node.outside = self.moved_addresses.find
         node.keeper = self._homes
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
@@ -275,6 +280,36 @@ class ActorSystem(Controls):
         if root is None:
             raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
         return ActorRef(root)
+
+    # -- several changes as one -------------------------------------------------------------------------------------
+
+    @property
+    def homes(self) -> Homes:
+        """All recorded addresses, for those who change the tree."""
+        return self._homes
+
+    def transaction(self, *, dry_run: bool = False, timeout: float = 10.0) -> Transaction:
+        """Several changes of the running tree as one: `async with system.transaction() as change: change.add(...)`.
+
+        The body collects; when it ends, all is checked, then done. If the body raises, nothing is done.
+
+        Args:
+            dry_run: check only; `change.describe()` then tells what would be done.
+            timeout: seconds from the end of the body until all is done; stopping what was removed is not counted.
+
+        Raises (at the end of the body):
+            TransactionRefused: a check has failed; nothing was done. TransactionFailed: a step has; all was undone.
+        """
+        self._root_ref()
+        return Transaction(self, self._transactions, dry_run=dry_run, timeout=timeout)
+
+    async def apply(self, path: str) -> Any:
+        """Run the reconfiguration script at `path`: its `async def reconfigure(system)`, with this system.
+
+        Raises:
+            UntrustedFile: somebody else could have written it. SpecError: it is no such script.
+        """
+        return await load_script(path, self.node).reconfigure(self)
 
     # -- names, topics, bindings ------------------------------------------------------------------------------------
 

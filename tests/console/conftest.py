@@ -1,8 +1,14 @@
 """A small log of the demo's format, drawn here: a robot drives down a corridor."""
 
+import sys
 from pathlib import Path
 
 import pytest
+
+# What a command sends is rebuilt by name in the system that it reaches, so the root has to be on the path.
+ROOT = str(Path(__file__).parents[2])
+if ROOT not in sys.path:
+    sys.path.append(ROOT)
 
 SCANS = 60
 BEAMS = 19

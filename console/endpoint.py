@@ -1,0 +1,278 @@
+"""The control endpoint of a running system: a Unix socket for its user, to look at the system and to change it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import socket
+import stat
+from collections.abc import AsyncGenerator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from ..actors.actor import Actor
+from ..actors.errors import HoldfastError
+from ..actors.values import encode_value
+from ..system.script import check_folders
+from ..system.system import ActorSystem
+from .trust import Needed, trusted_imports
+from .wire import (
+    HEAD,
+    LARGEST,
+    REQUEST,
+    AnyRequest,
+    BadRequest,
+    Control,
+    Response,
+    Transact,
+    Tree,
+    Whereis,
+    check_user,
+    failure,
+    frame,
+    open_arg,
+    peer_uid,
+)
+
+MOST_CLIENTS = 32
+"""Connections at a time; further ones are closed at once."""
+IDLE = 600.0
+"""Seconds a client may say nothing."""
+PATIENCE = 10.0
+"""Seconds that a frame may take once it has begun, either way."""
+LINGER = 1.0
+"""Seconds that a client gets to take the reason why its connection ends."""
+LONGEST = 3600.0
+"""Seconds that one request may take."""
+OPERATIONS = frozenset({"add", "remove", "move", "reorder", "strategy", "intensity", "isolation"}) | frozenset(
+    {"bind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
+)
+
+
+class EndpointInUse(HoldfastError):
+    """A live process listens at this socket, or it is no socket."""
+
+    def __init__(self, path: str, why: str) -> None:
+        super().__init__(path, why)
+        self.path, self.why = path, why
+
+    def __str__(self) -> str:
+        return f"control endpoint {self.path}: {self.why}"
+
+
+@contextlib.asynccontextmanager
+async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) -> AsyncGenerator[Path, None]:
+    """Serve the control endpoint of a running system at `path`, for this user only, until the block ends.
+
+    The folder must be one that nobody else can write to (or keep everybody's files apart, as /tmp does). A socket that
+    a dead process has left is replaced.
+
+    Raises:
+        EndpointInUse: a live process has it, or there is something else. UntrustedFile: others may write the folder.
+    """
+    where = absolute(path)
+    sock, inode = listen(where)
+    endpoint = Endpoint(system, os.geteuid())
+    server = await asyncio.start_unix_server(endpoint.serve, sock=sock, limit=64 * 1024)
+    try:
+        yield where
+    finally:
+        server.close()
+        await endpoint.close()
+        await server.wait_closed()
+        remove(where, inode)
+
+
+def absolute(path: str | os.PathLike[str]) -> Path:
+    """The path from the root on: the folder in which we are may change."""
+    return Path(path).absolute()
+
+
+def remove(path: Path, inode: int) -> None:
+    """Remove our socket, unless another's is there by now."""
+    try:
+        if os.lstat(path).st_ino == inode:
+            os.unlink(path)
+    except FileNotFoundError:
+        pass
+
+
+def listen(path: Path) -> tuple[socket.socket, int]:
+    """A listening socket at `path` that never had wider rights than 0600, and its inode."""
+    try:
+        check_folders(path.parent, {os.geteuid()}, may_share=True)
+    except OSError as error:
+        raise EndpointInUse(str(path), error.strerror or str(error)) from error
+    clear(path)
+    sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
+    try:
+        os.fchmod(sock.fileno(), 0o600)  # The file gets these rights, less the umask: there is no moment with more.
+        before = os.umask(0o177)
+        try:
+            sock.bind(str(path))
+        finally:
+            os.umask(before)
+        sock.listen(MOST_CLIENTS)
+        return sock, os.lstat(path).st_ino
+    except OSError as error:
+        sock.close()
+        raise EndpointInUse(str(path), error.strerror or str(error)) from error
+
+
+def clear(path: Path) -> None:
+    """Remove the socket that a dead process has left. Raises EndpointInUse if it is not that."""
+    try:
+        found = os.lstat(path)
+    except FileNotFoundError:
+        return
+    if not stat.S_ISSOCK(found.st_mode) or found.st_uid != os.geteuid():
+        raise EndpointInUse(str(path), "there is something else at this path")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
+        probe.settimeout(PATIENCE)
+        code = probe.connect_ex(str(path))
+    if code != errno.ECONNREFUSED:
+        raise EndpointInUse(str(path), "a live process listens there")
+    if os.lstat(path).st_ino == found.st_ino:
+        os.unlink(path)
+
+
+class Endpoint:
+    """Serves many clients side by side; what one of them does wrong ends its own connection only."""
+
+    def __init__(self, system: ActorSystem, uid: int) -> None:
+        self._system, self._uid = system, uid
+        self._clients: set[asyncio.Task[Any]] = set()
+
+    async def close(self) -> None:
+        """End all connections; what they have asked for and is not done is undone."""
+        for task in list(self._clients):
+            task.cancel()
+        if self._clients:
+            await asyncio.wait(self._clients)
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        """One connection, from its first request to its end."""
+        task = asyncio.current_task()
+        assert task is not None
+        self._clients.add(task)
+        try:
+            if len(self._clients) > MOST_CLIENTS:
+                raise BadRequest(f"there are {MOST_CLIENTS} connections already")
+            check_user(peer_uid(writer.get_extra_info("socket")), self._uid)
+            while (body := await read(reader)) is not None and await self._answer(body, reader, writer):
+                pass
+        except (HoldfastError, msgspec.DecodeError) as error:
+            no = error if isinstance(error, HoldfastError) else BadRequest(str(error))
+            with contextlib.suppress(OSError, TimeoutError):
+                await part(reader, writer, no)
+        except (OSError, TimeoutError):
+            pass  # It has gone, or says nothing: its connection ends, and that is all.
+        except asyncio.CancelledError:
+            pass  # The endpoint closes: this task is its own, and nobody waits for its outcome.
+        finally:
+            self._clients.discard(task)
+            writer.close()
+
+    async def _answer(self, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
+        """Carry out one request. If the client goes meanwhile it is cancelled, and with it undone: False."""
+        request = REQUEST.decode(body)
+        work = asyncio.create_task(self._respond(request))
+        more = asyncio.create_task(reader.read(1))
+        try:
+            await asyncio.wait((work, more), return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            is_early = more.done() and more.result()
+            is_over = work.done()
+            for task in (work, more):  # Before the answer: the next request comes behind that.
+                task.cancel()
+            await asyncio.wait((work, more))
+        if is_early:
+            raise BadRequest("it came before the one before it was answered")
+        if is_over:
+            await write(writer, work.result())
+        return is_over
+
+    async def _respond(self, request: AnyRequest) -> Response:
+        try:
+            async with asyncio.timeout(LONGEST):
+                value = await self._do(request)
+            return Response(encode_value(value))
+        except Exception as error:  # It is the client's to know; a bug in a user's code must not end the endpoint.
+            return failure(error)
+
+    async def _do(self, request: AnyRequest) -> Any:
+        system = self._system
+        match request:
+            case Tree():
+                return system.tree()
+            case Whereis():
+                return system.whereis(request.name).path
+            case Control():
+                return await self._control(request)
+            case Transact():
+                return await self._transact(request)
+
+    async def _control(self, request: Control) -> Any:
+        system, timeout = self._system, min(request.timeout, LONGEST)
+        ref = system.ref(request.path, Actor)
+        with trusted_imports(system.node, Needed(request.script, request.args)):
+            args = [open_arg(arg) for arg in request.args]
+        value = await getattr(system, request.verb)(ref, *args, timeout=timeout)
+        return str(value) if request.verb == "terminate" else value
+
+    async def _transact(self, request: Transact) -> Any:
+        timeout = min(request.timeout, LONGEST)
+        everything = [arg for _, args in request.operations for arg in args]
+        with trusted_imports(self._system.node, Needed(request.script, everything)):
+            operations = [(verb, [open_arg(arg) for arg in args]) for verb, args in request.operations]
+        async with self._system.transaction(dry_run=request.dry_run, timeout=timeout) as change:
+            for verb, args in operations:
+                if verb not in OPERATIONS:
+                    raise BadRequest(f"there is no operation {verb!r}")
+                getattr(change, verb)(*args)
+        steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
+        return {"steps": steps, "difference": list(change.difference)}
+
+
+async def read(reader: asyncio.StreamReader) -> bytes | None:
+    """The next frame; None at the end.
+
+    Raises:
+        BadRequest: it is cut short, or too large. TimeoutError: the client says nothing, or not all of it.
+    """
+    async with asyncio.timeout(IDLE):
+        first = await reader.read(1)
+    if not first:
+        return None
+    try:
+        async with asyncio.timeout(PATIENCE):
+            (size,) = HEAD.unpack(first + await reader.readexactly(HEAD.size - 1))
+            if size > LARGEST:
+                raise BadRequest(f"it has {size} bytes, and {LARGEST} are allowed")
+            return await reader.readexactly(size)
+    except asyncio.IncompleteReadError as error:
+        raise BadRequest("it is cut short") from error
+
+
+async def part(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, error: HoldfastError) -> None:
+    """Tell a client why its connection ends. What it has sent is read: else the kernel would cut off our answer."""
+    await write(writer, failure(error))
+    writer.write_eof()
+    async with asyncio.timeout(LINGER):
+        while await reader.read(64 * 1024):
+            pass
+
+
+async def write(writer: asyncio.StreamWriter, response: Response) -> None:
+    """Answer. Raises TimeoutError: the client does not take it."""
+    try:
+        data = frame(response)
+    except BadRequest as error:
+        data = frame(failure(error))
+    writer.write(data)
+    async with asyncio.timeout(PATIENCE):
+        await writer.drain()

@@ -1,0 +1,382 @@
+"""A running system as a script sees it from another process: the same calls, sent over the control endpoint."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import math
+import os
+import socket
+import threading
+import uuid
+from collections.abc import Callable, Iterable
+from types import TracebackType
+from typing import Any
+
+from ..actors.actor import Actor, Start
+from ..actors.control.orders import Change as StateChange
+from ..actors.control.orders import Migrate, Status
+from ..actors.control.tap import Statistics
+from ..actors.errors import HoldfastError, SpecError
+from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
+from ..system.transaction.operation import Step
+from .wire import (
+    HEAD,
+    LARGEST,
+    RESPONSE,
+    AnyRequest,
+    BadRequest,
+    Control,
+    Transact,
+    Tree,
+    Whereis,
+    check_user,
+    frame,
+    outcome,
+    pack_arg,
+    peer_uid,
+)
+
+GRACE = 35.0
+"""Seconds beyond its own time limit that a request is waited for: it may have to be undone."""
+
+
+class NotReached(HoldfastError):
+    """No running system answers at this socket."""
+
+    def __init__(self, path: str, why: str) -> None:
+        super().__init__(path, why)
+        self.path, self.why = path, why
+
+    def __str__(self) -> str:
+        return f"no system answers at {self.path}: {self.why}; is it running, with a control endpoint there?"
+
+
+class RemoteRef:
+    """An address of the running system."""
+
+    __slots__ = ("path",)
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, RemoteRef) and other.path == self.path
+
+    def __hash__(self) -> int:
+        return hash(self.path)
+
+    def __repr__(self) -> str:
+        return f"<RemoteRef {self.path}>"
+
+
+RemoteTarget = RemoteRef | str
+
+
+class Client:
+    """One connection; a request, then its answer. It blocks: `RemoteSystem` waits for it in a thread.
+
+    Raises:
+        NotReached: nobody listens there. WrongUser: somebody else does.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = os.fspath(path)
+        self._lock = threading.Lock()
+        self._sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
+        try:
+            self._sock.settimeout(10.0)
+            self._sock.connect(self.path)
+            check_user(peer_uid(self._sock), os.geteuid())
+        except OSError as error:
+            self._sock.close()
+            raise NotReached(self.path, error.strerror or str(error)) from error
+        except BaseException:
+            self._sock.close()
+            raise
+
+    def call(self, request: AnyRequest, timeout: float) -> Any:
+        """Ask, and wait at most `timeout` seconds (and some for an undo) for the answer.
+
+        Raises:
+            HoldfastError: what the system answers. NotReached: it does not.
+        """
+        with self._lock:
+            try:
+                self._sock.settimeout(timeout + GRACE)
+                self._sock.sendall(frame(request))
+                (size,) = HEAD.unpack(self._read(HEAD.size))
+                if size > LARGEST:
+                    raise BadRequest(f"the answer has {size} bytes, and {LARGEST} are allowed")
+                body = self._read(size)
+            except OSError as error:
+                raise NotReached(self.path, error.strerror or str(error)) from error
+        return outcome(RESPONSE.decode(body))
+
+    def _read(self, size: int) -> bytes:
+        data = bytearray()
+        while len(data) < size:
+            part = self._sock.recv(size - len(data))
+            if not part:
+                raise OSError(0, "it has closed the connection")
+            data += part
+        return bytes(data)
+
+    def close(self) -> None:
+        """End the connection; what is asked for and not done yet is undone."""
+        try:
+            self._sock.shutdown(socket.SHUT_RDWR)  # Wakes the thread that waits.
+        except OSError:
+            pass  # It was closed by the other side.
+        self._sock.close()
+
+
+class RemoteSystem:
+    """The running system at a control endpoint.
+
+    Args:
+        path: the socket.
+        dry_run: every transaction is one; orders to actors are refused.
+        timeout: seconds that a transaction may take if it does not say itself.
+        script: the file whose code may be needed there (path and sha256).
+        told: called with each transaction when it is over.
+
+    Raises:
+        NotReached, WrongUser: as `Client`.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        dry_run: bool = False,
+        timeout: float = 10.0,
+        script: tuple[str, str] | None = None,
+        told: Callable[[RemoteChange], None] | None = None,
+    ) -> None:
+        self._client = Client(path)
+        self._dry_run, self._timeout, self._script = dry_run, timeout, script
+        self._told = told
+        self._is_in_body = False
+
+    def __enter__(self) -> RemoteSystem:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._client.close()
+
+    # -- looking at it ------------------------------------------------------------------------------------------------
+
+    def tree(self) -> list[str]:
+        """The addresses that live now, parents before children."""
+        found: list[str] = self._client.call(Tree(), 10.0)
+        return found
+
+    def whereis(self, name: str) -> RemoteRef:
+        """The actor with this name. Raises NoSuchActor."""
+        return RemoteRef(self._client.call(Whereis(name), 10.0))
+
+    def ref(self, path: str, kind: type[Actor] | None = None) -> RemoteRef:
+        """The address; whether somebody lives there is seen when it is used. (`kind` is for the call in process.)"""
+        return RemoteRef(path)
+
+    async def get_status(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Status:
+        """How an actor is."""
+        status: Status = await self._control("get_status", ref, timeout)
+        return status
+
+    async def get_state(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Any:
+        """A copy of an actor's state."""
+        return await self._control("get_state", ref, timeout)
+
+    async def statistics(self, ref: RemoteTarget, on: bool | None = None, *, timeout: float = 5.0) -> Statistics | None:
+        """What an actor has done since its statistics were switched on; None while they are off."""
+        args = [] if on is None else [int(on)]
+        counts: Statistics | None = await self._control("statistics", ref, timeout, *args, changes=on is not None)
+        return counts
+
+    # -- orders to one actor ------------------------------------------------------------------------------------------
+
+    async def suspend(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
+        """Have an actor handle no message until `resume`."""
+        await self._control("suspend", ref, timeout, changes=True)
+
+    async def resume(self, ref: RemoteTarget, *, timeout: float = 5.0) -> None:
+        """Have it handle messages again."""
+        await self._control("resume", ref, timeout, changes=True)
+
+    async def replace_state(self, ref: RemoteTarget, change: StateChange, *, timeout: float = 5.0) -> Any:
+        """Put `change(state)` in the place of an actor's state; a function of the script, or of another module."""
+        return await self._control("replace_state", ref, timeout, change, changes=True)
+
+    async def replace_code(
+        self,
+        ref: RemoteTarget,
+        new: type[Actor] | Start[Any],
+        migrate: Migrate | None = None,
+        *,
+        timeout: float = 5.0,
+    ) -> None:
+        """Have a suspended actor go on as another class."""
+        await self._control("replace_code", ref, timeout, new, migrate, changes=True)
+
+    async def terminate(self, ref: RemoteTarget, *, timeout: float = 5.0) -> str:
+        """End a life in good order; its supervisor then does as its spec says. Returns its exit reason in words."""
+        reason: str = await self._control("terminate", ref, timeout, changes=True)
+        return reason
+
+    async def _control(self, verb: Any, ref: RemoteTarget, timeout: float, *args: Any, changes: bool = False) -> Any:
+        if changes and self._dry_run:
+            raise SpecError(verb, "in a dry run no order is given to an actor: put it into a transaction")
+        packed = [pack_arg(arg, verb) for arg in args]
+        return await self.call(Control(verb, text_of(ref), packed, timeout, self._script), timeout)
+
+    # -- transactions -------------------------------------------------------------------------------------------------
+
+    def transaction(self, *, dry_run: bool = False, timeout: float | None = None) -> RemoteTransaction:
+        """As `ActorSystem.transaction`: what the body collects is sent when it ends, and carried out there as one."""
+        return RemoteTransaction(self, dry_run or self._dry_run, self._timeout if timeout is None else timeout)
+
+    async def transact(self, change: RemoteChange, *, dry_run: bool, timeout: float) -> None:
+        """Have the collected operations carried out."""
+        if not 0 < timeout < math.inf:
+            raise SpecError("transaction", f"timeout must be seconds > 0, not {timeout!r}")
+        request = Transact(change._operations, dry_run, timeout, self._script)
+        answer = await self.call(request, timeout)
+        change._take(answer)
+        if self._told is not None:
+            self._told(change)
+
+    async def call(self, request: AnyRequest, timeout: float) -> Any:
+        """Ask in a thread; if the wait is cancelled the connection ends, and what was asked for is undone."""
+        work = asyncio.get_running_loop().run_in_executor(None, self._client.call, request, timeout)
+        try:
+            return await asyncio.shield(work)
+        except asyncio.CancelledError:
+            self._client.close()
+            await asyncio.wait((work,))
+            work.exception()
+            raise
+
+
+class RemoteTransaction:
+    """`async with system.transaction() as change:` from another process."""
+
+    def __init__(self, system: RemoteSystem, dry_run: bool, timeout: float) -> None:
+        self._system, self._dry_run, self._timeout = system, dry_run, timeout
+        self._change = RemoteChange()
+
+    async def __aenter__(self) -> RemoteChange:
+        if self._system._is_in_body:
+            raise SpecError("transaction", "there is one already: collect all steps in it")
+        self._system._is_in_body = True
+        return self._change
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._system._is_in_body = False
+        if error is None:
+            await self._system.transact(self._change, dry_run=self._dry_run, timeout=self._timeout)
+
+
+class RemoteChange:
+    """Collects operations, as `Change` does; see there."""
+
+    def __init__(self) -> None:
+        self._operations: list[tuple[str, list[Any]]] = []
+        self._steps: tuple[Step, ...] | None = None
+        self._difference: tuple[str, ...] = ()
+
+    def add(self, supervisor: RemoteTarget, spec: ChildSpec | Start[Any]) -> str:
+        """Start one more child; returns its address."""
+        made = child(None, spec) if isinstance(spec, Start) else spec
+        if not isinstance(made, ChildSpec):
+            raise SpecError("add", f"takes child(...), start(...) or supervisor(...), not {spec!r}")
+        if made.id == NAMELESS:
+            made = dataclasses.replace(made, id=f"{made.start.kind.__name__.lower()}-{uuid.uuid4().hex[:8]}")
+        self._put("add", supervisor, made)
+        return f"{text_of(supervisor)}/{made.id}"
+
+    def remove(self, target: RemoteTarget) -> None:
+        """Stop an actor for good."""
+        self._put("remove", target)
+
+    def move(self, target: RemoteTarget, to_supervisor: RemoteTarget) -> None:
+        """Put a child under another supervisor."""
+        self._put("move", target, text_of(to_supervisor))
+
+    def reorder(self, supervisor: RemoteTarget, ids: Iterable[str]) -> None:
+        """Give children another start order."""
+        self._put("reorder", supervisor, list(ids))
+
+    def strategy(self, supervisor: RemoteTarget, strategy: Strategy) -> None:
+        """Restart by another strategy."""
+        self._put("strategy", supervisor, strategy)
+
+    def intensity(self, supervisor: RemoteTarget, intensity: int, period: float) -> None:
+        """Allow this many restarts within `period` seconds."""
+        self._put("intensity", supervisor, intensity, period)
+
+    def isolation(self, target: RemoteTarget, isolation: Isolation) -> None:
+        """Have an actor live in a process of its own, or as a task."""
+        self._put("isolation", target, isolation)
+
+    def bind(self, owner: RemoteTarget, port: str, target: RemoteTarget) -> None:
+        """Point a binding elsewhere."""
+        self._put("bind", owner, port, text_of(target))
+
+    def register(self, name: str, target: RemoteTarget) -> None:
+        """Give an actor a name."""
+        self._put("register", name, text_of(target))
+
+    def unregister(self, name: str) -> None:
+        """Free a name."""
+        self._put("unregister", name)
+
+    def suspend(self, target: RemoteTarget) -> None:
+        """Have an actor handle no message until it is resumed."""
+        self._put("suspend", target)
+
+    def resume(self, target: RemoteTarget) -> None:
+        """Have it handle messages again."""
+        self._put("resume", target)
+
+    def replace_state(self, target: RemoteTarget, change: StateChange) -> None:
+        """Put `change(state)` in the place of an actor's state."""
+        self._put("replace_state", target, change)
+
+    def replace_code(self, target: RemoteTarget, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
+        """Go on as another class."""
+        self._put("replace_code", target, new, migrate)
+
+    def _put(self, verb: str, target: RemoteTarget, *args: Any) -> None:
+        packed = [pack_arg(arg, f"{verb} {text_of(target)}") for arg in (text_of(target), *args)]
+        self._operations.append((verb, packed))
+
+    def _take(self, answer: dict[str, Any]) -> None:
+        self._steps = tuple(Step(*step) for step in answer["steps"])
+        self._difference = tuple(answer["difference"])
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps, in order; in full when the system has answered."""
+        if self._steps is not None:
+            return self._steps
+        named = [(verb, str(getattr(args[0], "value", ""))) for verb, args in self._operations]
+        return tuple(Step(n, verb, target, f"{verb} {target}") for n, (verb, target) in enumerate(named, 1))
+
+    @property
+    def difference(self) -> tuple[str, ...]:
+        """How the tree changes."""
+        return self._difference
+
+    def describe(self) -> str:
+        """The steps, and how the tree changes, in words."""
+        lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
+        return "\n".join([*lines, *self._difference])
+
+
+def text_of(target: RemoteTarget) -> str:
+    """A target's address."""
+    return target.path if isinstance(target, RemoteRef) else target

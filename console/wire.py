@@ -1,0 +1,199 @@
+"""What an operator's command and a running system say to each other over the control endpoint.
+
+A frame is a 4-byte length and MessagePack. Requests are typed and bounded; what has to be rebuilt with its classes
+(child specs, functions, states) travels as packed bytes inside and is opened only when the request is carried out.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from typing import Any, Literal
+
+import msgspec
+
+from ..actors.actor import Actor, Start
+from ..actors.control.orders import pack_function, unpack_function
+from ..actors.errors import HoldfastError, RemoteCrash, error_text, rebuild_error, type_name
+from ..actors.process.recipe import pack_data, pack_recipe, unpack_data, unpack_recipe
+from ..actors.values import decode_value, encode_value
+from ..supervision.spec import ChildSpec
+
+HEAD = struct.Struct(">I")
+LARGEST = 16 * 1024 * 1024
+"""Bytes of one frame."""
+CREDENTIALS = struct.Struct("3i")
+
+
+class BadRequest(HoldfastError):
+    """What came over the control endpoint is no request: the connection is closed."""
+
+    def __init__(self, problem: str) -> None:
+        super().__init__(problem)
+        self.problem = problem
+
+    def __str__(self) -> str:
+        return f"this is no request: {self.problem}"
+
+
+class WrongUser(HoldfastError):
+    """The other end of the control endpoint belongs to another user."""
+
+    def __init__(self, uid: int, expected: int) -> None:
+        super().__init__(uid, expected)
+        self.uid, self.expected = uid, expected
+
+    def __str__(self) -> str:
+        return f"the other end runs as the user with uid {self.uid}, and only uid {self.expected} is served"
+
+
+def peer_uid(sock: socket.socket) -> int:
+    """The user at the other end of a Unix socket, as the kernel says."""
+    _, uid, _ = CREDENTIALS.unpack(sock.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, CREDENTIALS.size))
+    return int(uid)
+
+
+def check_user(uid: int, expected: int) -> None:
+    """Raises WrongUser unless both are the same."""
+    if uid != expected:
+        raise WrongUser(uid, expected)
+
+
+# -- arguments of operations ------------------------------------------------------------------------------------------
+
+
+class Arg(msgspec.Struct, array_like=True, frozen=True, tag_field="kind"):
+    """An argument."""
+
+
+class Plain(Arg, tag="plain", array_like=True, frozen=True):
+    """Text, a number, None, or a list of these."""
+
+    value: str | int | float | list[str] | None
+
+
+class Packed(Arg, tag="packed", array_like=True, frozen=True):
+    """What has to be rebuilt: a child spec or recipe, a function, or the recipe of a class."""
+
+    of: Literal["spec", "function", "code"]
+    data: bytes
+
+
+AnyArg = Plain | Packed
+
+
+def pack_arg(value: Any, where: str) -> AnyArg:
+    """An argument for the wire.
+
+    Raises:
+        SpecError, UnsavableValue: it cannot be sent.
+    """
+    if isinstance(value, (ChildSpec, Start)):
+        return Packed("spec", pack_data(value, where))
+    if isinstance(value, type) and issubclass(value, Actor):
+        return Packed("code", pack_recipe(Start(value), where))
+    if callable(value):
+        return Packed("function", encode_value(pack_function(value, where, where)))
+    return Plain(list(value) if isinstance(value, (list, tuple)) else value)
+
+
+def open_arg(arg: AnyArg) -> Any:
+    """The argument again. Imports the modules it needs."""
+    if isinstance(arg, Plain):
+        return arg.value
+    if arg.of == "spec":
+        return unpack_data(arg.data)
+    if arg.of == "code":
+        return unpack_recipe(arg.data).kind
+    return unpack_function(decode_value(arg.data))
+
+
+# -- requests ---------------------------------------------------------------------------------------------------------
+
+
+class Request(msgspec.Struct, tag_field="ask", forbid_unknown_fields=True, frozen=True):
+    """Base of all requests."""
+
+
+class Tree(Request, tag="tree", frozen=True):
+    """All addresses that live now."""
+
+
+class Whereis(Request, tag="whereis", frozen=True):
+    """The address of the actor with this name."""
+
+    name: str
+
+
+class Control(Request, tag="control", frozen=True):
+    """An operator's order to one actor."""
+
+    verb: Literal[
+        "suspend", "resume", "get_state", "get_status", "statistics", "terminate", "replace_state", "replace_code"
+    ]
+    path: str
+    args: list[AnyArg]
+    timeout: float
+    script: tuple[str, str] | None = None
+
+
+class Transact(Request, tag="transaction", frozen=True):
+    """A whole transaction; `script` is the file that its classes may be defined in, and its sha256."""
+
+    operations: list[tuple[str, list[AnyArg]]]
+    dry_run: bool
+    timeout: float
+    script: tuple[str, str] | None = None
+
+
+AnyRequest = Tree | Whereis | Control | Transact
+REQUEST: msgspec.msgpack.Decoder[AnyRequest] = msgspec.msgpack.Decoder(AnyRequest)
+
+
+class Response(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """The outcome of one request: a value, or an error."""
+
+    value: bytes = b""
+    error: str = ""  # the error's class
+    args: bytes = b""  # its arguments, if they can be sent
+    text: str = ""
+
+
+RESPONSE: msgspec.msgpack.Decoder[Response] = msgspec.msgpack.Decoder(Response)
+
+
+def frame(value: Request | Response) -> bytes:
+    """Head and body. Raises BadRequest: too large."""
+    body = msgspec.msgpack.encode(value)
+    if len(body) > LARGEST:
+        raise BadRequest(f"it has {len(body)} bytes, and {LARGEST} are allowed")
+    return HEAD.pack(len(body)) + body
+
+
+def failure(error: BaseException) -> Response:
+    """An error as a response; if its arguments cannot be sent it arrives as a RemoteCrash."""
+    args = b""
+    if isinstance(error, HoldfastError):
+        try:
+            args = encode_value(tuple(error.args))
+        except HoldfastError:
+            pass  # A refusal with a ref in it, say: its text has to do.
+    return Response(error=type_name(type(error)), args=args, text=error_text(error))
+
+
+def outcome(response: Response) -> Any:
+    """The value in a response.
+
+    Raises:
+        HoldfastError: the error in it, as its class if that is known here.
+    """
+    if not response.error:
+        return decode_value(response.value)
+    error: HoldfastError | None = None
+    if response.args:
+        try:
+            args: Any = decode_value(response.args)
+            error = rebuild_error(response.error, args)
+        except Exception:
+            error = None  # Whatever is wrong with the arguments, its text says what happened.
+    raise error or RemoteCrash(response.error, response.text)

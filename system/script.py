@@ -1,0 +1,163 @@
+"""Code that is loaded at run time: taken only from a file that nobody else could have written."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import inspect
+import os
+import stat
+import sys
+import types
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+from ..actors.errors import HoldfastError, SpecError, error_text, type_name
+from ..actors.node import Node
+from .transaction.events import ScriptLoaded
+
+PREFIX = "holdfast_script_"
+"""How the modules of scripts are called; the rest is the beginning of their sha256."""
+LARGEST = 4 * 1024 * 1024
+"""Bytes a script may have."""
+
+
+class UntrustedFile(HoldfastError):
+    """A file, or a folder above it, could have been written by somebody else: it is not loaded."""
+
+    def __init__(self, path: str, problem: str) -> None:
+        super().__init__(path, problem)
+        self.path, self.problem = path, problem
+
+    def __str__(self) -> str:
+        return f"{self.path} is not loaded: {self.problem}"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Source:
+    """A script as it was read: what is checked, hashed and run are the same bytes."""
+
+    path: str
+    data: bytes
+
+    @property
+    def sha256(self) -> str:
+        """Of the bytes, in hex digits."""
+        return hashlib.sha256(self.data).hexdigest()
+
+    @property
+    def module(self) -> str:
+        """The name of its module: the same in every process that has loaded these bytes."""
+        return PREFIX + self.sha256[:16]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Script:
+    """A script that is loaded."""
+
+    source: Source
+    reconfigure: Callable[[Any], Awaitable[Any]]
+
+
+def read_source(path: str | os.PathLike[str], uid: int | None = None) -> Source:
+    """Read a file, if only this user could have written it.
+
+    Args:
+        path: of the file.
+        uid: the user; the one this process runs as if left out.
+
+    Raises:
+        UntrustedFile: it belongs to somebody else, or others may write it, or a folder above it.
+        SpecError: it cannot be read, or is no file, or too large.
+    """
+    owner = os.geteuid() if uid is None else uid
+    full = Path(os.path.realpath(path))
+    try:
+        with open(full, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK)) as file:
+            info = os.fstat(file.fileno())
+            if not stat.S_ISREG(info.st_mode):
+                raise SpecError(str(full), "this is no file")
+            check_owner(str(full), info, {owner})
+            check_folders(full.parent, {owner})
+            data = file.read(LARGEST + 1)
+    except OSError as error:
+        raise SpecError(str(path), error.strerror or str(error)) from error
+    if len(data) > LARGEST:
+        raise SpecError(str(full), f"a script has at most {LARGEST} bytes")
+    return Source(str(full), data)
+
+
+def check_owner(path: str, info: os.stat_result, owners: set[int]) -> None:
+    """Whether a file or folder belongs to one of these users, and nobody else may write it.
+
+    Raises:
+        UntrustedFile: it does not, or somebody may.
+    """
+    if info.st_uid not in owners:
+        raise UntrustedFile(path, f"it belongs to the user with uid {info.st_uid}, not to you")
+    if info.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise UntrustedFile(path, f"others may write it (mode {stat.S_IMODE(info.st_mode):04o}); chmod go-w")
+
+
+def check_folders(folder: Path, owners: set[int], *, may_share: bool = False) -> None:
+    """Whether nobody else could put another file in the place of one in this folder.
+
+    The folder itself must belong to one of the owners; those above may be root's, and open to all if they keep
+    everybody's files apart (the sticky bit, as /tmp has it). `may_share`: the folder itself too.
+
+    Raises:
+        UntrustedFile: somebody could.
+    """
+    for number, one in enumerate((folder, *folder.parents)):
+        above = bool(number) or may_share
+        info = os.stat(one)
+        allowed = owners | {0} if above else owners
+        if above and info.st_mode & stat.S_ISVTX and info.st_uid in allowed:
+            continue
+        check_owner(str(one), info, allowed)
+
+
+def load_source(source: Source) -> types.ModuleType:
+    """Run the source as a module, once in a process.
+
+    Raises:
+        SpecError: it raised.
+    """
+    known = sys.modules.get(source.module)
+    if known is not None:
+        return known
+    module = types.ModuleType(source.module)
+    module.__file__ = source.path
+    sys.modules[source.module] = module  # Before it runs: its classes are looked up by this name.
+    try:
+        exec(compile(source.data, source.path, "exec"), module.__dict__)
+    except BaseException as error:
+        del sys.modules[source.module]
+        if not isinstance(error, Exception):
+            raise
+        raise SpecError(source.path, f"{type_name(type(error))}: {error_text(error)}") from error
+    return module
+
+
+def load_script(path: str | os.PathLike[str], node: Node | None = None) -> Script:
+    """Load a reconfiguration script; `node` tells of it as an event.
+
+    Raises:
+        UntrustedFile: somebody else could have written it.
+        SpecError: it cannot be read, raises, or has no `async def reconfigure(system)`.
+    """
+    source = read_source(path)
+    if node is not None:
+        tell_loaded(node, source.path, source.sha256)
+    reconfigure = getattr(load_source(source), "reconfigure", None)
+    if not inspect.iscoroutinefunction(reconfigure):
+        raise SpecError(source.path, "it has no `async def reconfigure(system)`")
+    return Script(source, reconfigure)
+
+
+def tell_loaded(node: Node, path: str, sha256: str) -> None:
+    """Say that this code is loaded."""
+    root = node.root
+    if node.watched and root is not None:
+        node.emit(ScriptLoaded(root.path, path, sha256))

@@ -1,0 +1,123 @@
+"""What is written in the body of a transaction: operations are collected, and carried out when it ends."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ...actors.actor import Actor, Start
+from ...actors.control.orders import Change as StateChange
+from ...actors.control.orders import Migrate
+from ...supervision.spec import ChildSpec, Isolation, Strategy
+from . import living
+from .draft import Target
+from .moving import Move
+from .operation import Operation, Step
+from .structure import Add, Remove, Reorder, SetFlags, named_spec, text_of
+from .wiring import Bind, Register, Unregister
+
+if TYPE_CHECKING:
+    from ..system import ActorSystem
+
+
+class Change:
+    """Collects operations. A target is a ref, or an address as it is at that point: a step before may have added it."""
+
+    def __init__(self, system: ActorSystem) -> None:
+        self._system = system
+        self._operations: list[Operation] = []
+        self._added: set[str] = set()
+        self._before: list[str] | None = None
+        self._difference: list[str] | None = None
+
+    # -- the shape of the tree ----------------------------------------------------------------------------------------
+
+    def add(self, supervisor: Target, spec: ChildSpec | Start[Any]) -> str:
+        """Start one more child; returns its address. Under a dynamic supervisor it may come without an id."""
+        spec = named_spec(supervisor, spec, self._added, self._system)
+        path = f"{text_of(supervisor)}/{spec.id}"
+        self._added.add(path)
+        self.step(Add(supervisor, spec))
+        return path
+
+    def remove(self, target: Target) -> None:
+        """Stop an actor for good. Its address is free when the transaction is over."""
+        self.step(Remove(target))
+
+    def move(self, target: Target, to_supervisor: Target) -> None:
+        """Put a child under another supervisor: it lives on, its refs stay good, its address changes."""
+        self.step(Move(target, to_supervisor))
+
+    def reorder(self, supervisor: Target, ids: Iterable[str]) -> None:
+        """Give children another start order; those that are not named come behind."""
+        self.step(Reorder(supervisor, list(ids)))
+
+    def strategy(self, supervisor: Target, strategy: Strategy) -> None:
+        """Restart by another strategy from now on."""
+        self.step(SetFlags(supervisor, strategy=strategy))
+
+    def intensity(self, supervisor: Target, intensity: int, period: float) -> None:
+        """Allow this many restarts within `period` seconds from now on."""
+        self.step(SetFlags(supervisor, intensity=intensity, period=period))
+
+    def isolation(self, target: Target, isolation: Isolation) -> None:
+        """Have an actor live in a process of its own, or as a task."""
+        self.step(living.Isolate(target, isolation))
+
+    # -- what connects actors -----------------------------------------------------------------------------------------
+
+    def bind(self, owner: Target, port: str, target: Target) -> None:
+        """Point a binding elsewhere, from the owner's next turn on."""
+        self.step(Bind(owner, port, target))
+
+    def register(self, name: str, target: Target) -> None:
+        """Give an actor a name beside its address."""
+        self.step(Register(name, target))
+
+    def unregister(self, name: str) -> None:
+        """Free a name."""
+        self.step(Unregister(name))
+
+    # -- live actors --------------------------------------------------------------------------------------------------
+
+    def suspend(self, target: Target) -> None:
+        """Have an actor handle no message until it is resumed."""
+        self.step(living.Suspend(target))
+
+    def resume(self, target: Target) -> None:
+        """Have it handle messages again."""
+        self.step(living.Resume(target))
+
+    def replace_state(self, target: Target, change: StateChange) -> None:
+        """Put `change(state)` in the place of an actor's state; its messages wait until the transaction is over."""
+        self.step(living.ReplaceState(target, change))
+
+    def replace_code(self, target: Target, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
+        """Go on as another class; its messages wait until the transaction is over."""
+        self.step(living.ReplaceCode(target, new, migrate))
+
+    # -- all of it ----------------------------------------------------------------------------------------------------
+
+    def step(self, operation: Operation) -> None:
+        """One more operation, of whatever kind."""
+        self._operations.append(operation)
+
+    @property
+    def operations(self) -> tuple[Operation, ...]:
+        """What was collected so far."""
+        return tuple(self._operations)
+
+    @property
+    def steps(self) -> tuple[Step, ...]:
+        """The steps, in order."""
+        return tuple(Step(n, one.verb, one.target, one.text) for n, one in enumerate(self._operations, 1))
+
+    @property
+    def difference(self) -> tuple[str, ...]:
+        """How the tree changes: lines with `-` go, lines with `+` come. Known after the checks."""
+        return tuple(self._difference or ())
+
+    def describe(self) -> str:
+        """The steps, and how the tree changes (known after the checks), in words."""
+        lines = [f"{step.number}. {step.text}" for step in self.steps] or ["nothing to do"]
+        return "\n".join([*lines, *(self._difference or ())])

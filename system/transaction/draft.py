@@ -1,0 +1,260 @@
+"""The tree as it will be: checks look at this, and each operation changes it as it will change the real one."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from ...actors.cell import GONE, Cell
+from ...actors.errors import ActorRestarting, NoSuchActor
+from ...actors.node import Node, cell_kind
+from ...actors.process.relay import OutsideHost
+from ...actors.process.remote import ProcessHost
+from ...actors.ref import ActorRef
+from ...supervision.admin import WhichChildren
+from ...supervision.children import Child
+from ...supervision.dynamic import DynamicSupervisor
+from ...supervision.partition import PartitionSupervisor
+from ...supervision.spec import ChildSpec, Flags
+from ...supervision.supervisor import Supervisor
+from .lasting import recipe_flags
+from .operation import wrong
+
+if TYPE_CHECKING:
+    from ...actors.actor import Actor
+
+Target = ActorRef[Any] | str
+"""What an operation is about: a ref, or the address at that point of the transaction."""
+
+
+class Place:
+    """One address in the draft. `cell` is None while nobody has lived there: it is to be added."""
+
+    __slots__ = (
+        "bindings",
+        "cell",
+        "children",
+        "flags",
+        "is_leaving",
+        "is_planned",
+        "is_suspended",
+        "kind",
+        "name",
+        "names",
+        "parent",
+        "spec",
+    )
+
+    def __init__(self, name: str, parent: Place | None, cell: Cell | None, spec: ChildSpec | None) -> None:
+        self.name, self.parent, self.cell, self.spec = name, parent, cell, spec
+        self.children: dict[str, Place] = {}
+        self.flags: Flags | None = None
+        self.kind: type[Actor] | None = spec.start.kind if spec is not None else None
+        self.is_leaving = False  # removed by an earlier step; it goes when all is done
+        self.is_planned = False  # added by an earlier step
+        self.is_suspended = cell is not None and cell.more is not None and cell.more.suspended
+        self.bindings: dict[str, Place] = {}
+        self.names: list[str] = []
+
+    @property
+    def path(self) -> str:
+        """The address at this point."""
+        return self.name if self.parent is None else f"{self.parent.path}/{self.name}"
+
+    @property
+    def is_supervisor(self) -> bool:
+        """Whether it looks after its children."""
+        return self.kind is not None and issubclass(self.kind, Supervisor)
+
+    @property
+    def is_dynamic(self) -> bool:
+        """Whether its children have no order."""
+        return self.kind is not None and issubclass(self.kind, DynamicSupervisor)
+
+    @property
+    def is_partitioned(self) -> bool:
+        """Whether its children are all alike, and not ours to give."""
+        return self.kind is not None and issubclass(self.kind, PartitionSupervisor)
+
+    @property
+    def actor(self) -> Supervisor | None:
+        """The supervisor itself, if it lives in this process now."""
+        actor = self.cell.actor if self.cell is not None else None
+        return actor if isinstance(actor, Supervisor) and "_children" in actor.__dict__ else None
+
+    def walk(self) -> Iterator[Place]:
+        """This place, and all below it."""
+        yield self
+        for child in self.children.values():
+            yield from child.walk()
+
+    def living(self, node: Node) -> Cell:
+        """The cell that lives here now. Raises NoSuchActor."""
+        cell = self.cell
+        if cell is not None and cell.state is GONE:
+            cell = node.successor(cell)
+        if cell is None or cell.is_dead:
+            raise NoSuchActor(self.path)
+        return cell
+
+    def check_lived_in(self, node: Node) -> None:
+        """Whether somebody lives here, or will at this point. Raises NoSuchActor."""
+        if not self.is_planned:
+            self.living(node)
+
+    def line(self) -> str:
+        """The place in one line of text."""
+        said = [self.kind.__name__ if self.kind is not None else "actor"]
+        if self.spec is not None:
+            said += [self.spec.restart, self.spec.isolation]
+            if self.spec.recovery is not None:
+                said.append(type(self.spec.recovery).__name__.lower())
+        if self.flags is not None:
+            said.append(f"{self.flags.strategy} {self.flags.intensity} in {self.flags.period:g} s")
+        said += [f"{port} -> {target.path}" for port, target in sorted(self.bindings.items())]
+        said += [f"named {name!r}" for name in sorted(self.names)]
+        return f"{self.path}: {', '.join(said)}"
+
+
+class Draft:
+    """All places, as they are at this point of the transaction."""
+
+    def __init__(self, node: Node) -> None:
+        root = node.root
+        assert root is not None
+        self.node = node
+        self.by_cell: dict[Cell, Place] = {}
+        self.root = self._survey(root, root.path, None, None)
+        for cell, place in list(self.by_cell.items()):
+            for port, target in (cell.more.bindings if cell.more is not None else {}).items():
+                bound = self.by_cell.get(target)
+                if bound is not None:
+                    place.bindings[port] = bound
+        for name, cell in node.names.items():
+            if cell in self.by_cell:
+                self.by_cell[cell].names.append(name)
+
+    def _survey(self, cell: Cell | None, name: str, parent: Place | None, spec: ChildSpec | None) -> Place:
+        place = Place(name, parent, cell, spec)
+        if cell is None:
+            return place
+        self.by_cell[cell] = place
+        place.kind = cell_kind(cell) or place.kind
+        actor = place.actor
+        place.flags = actor._flags if actor is not None else recipe_flags(cell)
+        below = dict(cell.children or {})
+        known: list[Child] = list(actor._children.values()) if actor is not None else []
+        for one in known:
+            child = below.pop(one.spec.id, None)
+            place.children[one.spec.id] = self._survey(child, one.spec.id, place, one.spec)
+        for child in below.values():
+            own = child.spec if isinstance(child.spec, ChildSpec) else None
+            place.children[child.name] = self._survey(child, child.name, place, own)
+        return place
+
+    def find(self, target: Target) -> Place:
+        """The place a step is about.
+
+        Raises:
+            NoSuchActor: there will be nobody at that point. SpecError: a step before removes it.
+        """
+        place = self.by_cell.get(target._cell) if isinstance(target, ActorRef) else None
+        if place is None:
+            place = self._at(target if isinstance(target, str) else target.path)
+        at: Place | None = place
+        while at is not None:
+            if at.is_leaving:
+                raise wrong(place.path, f"{at.path} is removed by this very transaction")
+            at = at.parent
+        return place
+
+    def _at(self, path: str) -> Place:
+        top = self.root.path
+        if path != top and not path.startswith(f"{top}/"):
+            raise NoSuchActor(path)
+        place = self.root
+        for name in path[len(top) :].split("/")[1:]:
+            if name not in place.children:
+                moved = self.node.find(path)  # It may have had this address before.
+                if moved is not None and moved in self.by_cell:
+                    return self.by_cell[moved]
+                raise NoSuchActor(path)
+            place = place.children[name]
+        return place
+
+    async def supervisor(self, target: Target) -> Place:
+        """The supervisor a step is about, its children known.
+
+        Raises:
+            NoSuchActor: nobody is there. SpecError: it is no supervisor. ActorRestarting: it is not up.
+        """
+        place = self.find(target)
+        if not place.is_supervisor:
+            raise wrong(place.path, "this is no supervisor")
+        cell = place.cell
+        if place.is_planned:
+            return place  # It will have what its spec says.
+        if cell is None:
+            raise NoSuchActor(place.path)
+        if place.actor is None:
+            if not is_elsewhere(cell):
+                raise ActorRestarting(place.path)
+            ref: ActorRef[Supervisor] = ActorRef(cell)
+            for info in await ref.ask(WhichChildren()):  # It is in another process: it knows best.
+                if info.id not in place.children:
+                    place.children[info.id] = Place(info.id, place, None, None)
+        return place
+
+    def check(self) -> None:
+        """What must hold when all is done.
+
+        Raises:
+            SpecError: a binding would point at nobody, or a suspended supervisor would have to stop a child.
+        """
+        for place in self.staying():
+            if place.is_suspended and any(child.is_leaving for child in place.children.values()):
+                check_awake(place)
+            for port, target in place.bindings.items():
+                if any(above.is_leaving for above in _upwards(target)):
+                    raise wrong(place.path, f"its binding {port!r} would point at {target.path}, which is removed")
+
+    def staying(self) -> Iterator[Place]:
+        """All that is there when all is done, parents first."""
+        waiting = [self.root]
+        while waiting:
+            place = waiting.pop()
+            if not place.is_leaving:
+                yield place
+                waiting.extend(reversed(list(place.children.values())))
+
+    def lines(self) -> list[str]:
+        """The tree when all is done, a line for each address."""
+        return [place.line() for place in self.staying()]
+
+
+def check_awake(place: Place) -> None:
+    """Whether a supervisor takes requests. Raises SpecError: it is suspended."""
+    if place.is_suspended:
+        raise wrong(place.path, "it is suspended, and starts and stops nobody: resume it first")
+
+
+def is_elsewhere(cell: Cell) -> bool:
+    """Whether an actor lives in another process than the root's."""
+    return isinstance(cell.host, (ProcessHost, OutsideHost))
+
+
+def _upwards(place: Place) -> Iterator[Place]:
+    at: Place | None = place
+    while at is not None:
+        yield at
+        at = at.parent
+
+
+def difference(before: list[str], after: list[str]) -> list[str]:
+    """What changes from one description to another: lines with `-` go, lines with `+` come.
+
+    >>> difference(["a", "b"], ["a", "c"])
+    ['- b', '+ c']
+    """
+    return [line.rstrip() for line in difflib.ndiff(before, after) if line[:2] in ("- ", "+ ")]

@@ -1,0 +1,109 @@
+"""Recipes of supervisors: a change of the tree is written into them, so that a restart of a supervisor keeps it.
+
+A supervisor whose class has an `init` of its own is asked anew at each start, and its recipe left alone.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, TypeAlias
+
+from ...actors.actor import Start
+from ...actors.cell import Cell
+from ...supervision.dynamic import DynamicSupervisor
+from ...supervision.respec import rebuilt, respec
+from ...supervision.spec import ChildSpec, Flags
+from ...supervision.supervisor import Supervisor
+
+Specs: TypeAlias = "tuple[ChildSpec, ...]"
+Edit = Callable[[Flags, Specs], tuple[Flags, Specs]]
+"""What changes in a recipe: flags and children before, and after."""
+
+
+def recipe_flags(cell: Cell) -> Flags | None:
+    """The flags in a supervisor's recipe, if it has one with flags."""
+    return _parts(_recipe(cell)[1])[0]
+
+
+def recipe_specs(cell: Cell) -> Specs | None:
+    """The children in a supervisor's recipe, if it has one."""
+    return _parts(_recipe(cell)[1])[1]
+
+
+def keep(cell: Cell, edit: Edit) -> None:
+    """Have the next lives of a supervisor begin with a changed recipe."""
+    holder, start = _recipe(cell)
+    flags, specs = _parts(start)
+    if start is None or flags is None or specs is None:
+        return
+    flags_after, specs_after = edit(flags, specs)
+    if (flags_after, specs_after) == (flags, specs):
+        return
+    children: Any = start.args[1] if issubclass(start.kind, DynamicSupervisor) else specs_after
+    _put(holder, cell, Start(start.kind, (flags_after, children), start.kwargs))
+
+
+def without(name: str) -> Edit:
+    """The child of this id is no more."""
+    return lambda flags, specs: (flags, tuple(spec for spec in specs if spec.id != name))
+
+
+def with_child(spec: ChildSpec) -> Edit:
+    """One more child, behind the others."""
+    return lambda flags, specs: (flags, (*(other for other in specs if other.id != spec.id), spec))
+
+
+def in_order(ids: list[str]) -> Edit:
+    """The children in another order; those that are not mentioned behind the others."""
+    rank = {name: number for number, name in enumerate(ids)}
+    return lambda flags, specs: (flags, tuple(sorted(specs, key=lambda spec: rank.get(spec.id, len(rank)))))
+
+
+def _recipe(cell: Cell) -> tuple[Cell, Start[Any] | None]:
+    """The recipe of a supervisor, and the cell in whose recipe it stands: its own, or one above it."""
+    names: list[str] = []
+    at: Cell | None = cell
+    while at is not None:
+        start = at.more.start if at.more is not None else None
+        if start is not None and len(start.args) == 2 and isinstance(start.args[0], Flags):
+            return at, _inner(start, names)
+        names, at = [at.name, *names], at.parent
+    return cell, None
+
+
+def _inner(start: Start[Any], names: list[str]) -> Start[Any] | None:
+    for name in names:
+        specs = _parts(start)[1]
+        spec = next((spec for spec in specs or () if spec.id == name), None)
+        if spec is None:
+            return None
+        start = spec.start
+    return start
+
+
+def _parts(start: Start[Any] | None) -> tuple[Flags | None, Specs | None]:
+    if start is None or not issubclass(start.kind, Supervisor) or len(start.args) != 2:
+        return None, None
+    if start.kind.init is not Supervisor.init:
+        return None, None
+    flags, children = start.args
+    if not isinstance(flags, Flags):
+        return None, None
+    return flags, children if isinstance(children, tuple) else ()
+
+
+def _put(holder: Cell, cell: Cell, start: Start[Any]) -> None:
+    names: list[str] = []
+    at = cell
+    while at is not holder:
+        names.insert(0, at.name)
+        assert at.parent is not None
+        at = at.parent
+    respec(holder, start if not names else _nested(holder, names, start))
+
+
+def _nested(holder: Cell, names: list[str], new: Start[Any]) -> Start[Any]:
+    start = holder.extra().start
+    assert start is not None
+    return rebuilt(start, names, lambda spec: dataclasses.replace(spec, start=new))

@@ -1,0 +1,228 @@
+"""Transactions: checked, carried out and, if a step fails, undone. One at a time in a system."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Coroutine
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import HoldfastError, SpecError, error_text, type_name
+from ...actors.ref import current
+from .change import Change
+from .draft import Draft, difference
+from .errors import TransactionFailed, TransactionRefused
+from .events import TransactionBegan, TransactionCommitted, TransactionRolledBack
+from .operation import Operation
+
+if TYPE_CHECKING:
+    from ..system import ActorSystem
+
+UNDO_TIMEOUT = 30.0
+"""Seconds that undoing one step may take before it is given up, and told as such."""
+
+
+class Transactions:
+    """What the transactions of one system share: the lock, who is in a body, and what still goes on behind them."""
+
+    def __init__(self) -> None:
+        self.lock = asyncio.Lock()
+        self.bodies: set[asyncio.Task[Any] | None] = set()
+        self.behind: set[asyncio.Task[Any]] = set()
+
+
+class Transaction:
+    """`async with system.transaction() as change:` carries out what the body collects, when the body ends."""
+
+    def __init__(self, system: ActorSystem, shared: Transactions, *, dry_run: bool, timeout: float) -> None:
+        if not timeout > 0:
+            raise SpecError("transaction", f"timeout must be seconds > 0, not {timeout!r}")
+        self._system, self._shared = system, shared
+        self._dry_run, self._timeout = dry_run, timeout
+        self._change = Change(system)
+        self._draft: Draft | None = None
+        self._task: asyncio.Task[Any] | None = None
+
+    async def __aenter__(self) -> Change:
+        self._task = asyncio.current_task()
+        if self._task in self._shared.bodies:
+            raise TransactionRefused("begin", "this task is in a transaction already: collect all steps in one")
+        self._shared.bodies.add(self._task)
+        return self._change
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if error is None:
+                await self._carry_out()
+        finally:
+            self._shared.bodies.discard(self._task)
+
+    async def _carry_out(self) -> None:
+        lock = self._shared.lock
+        deadline = asyncio.get_running_loop().time() + self._timeout
+        await self._in_time("begin", deadline, lock.acquire, waits_for="another transaction is not over")
+        try:
+            await self._check(deadline)
+            if not self._dry_run:
+                await self._do(deadline)
+        except BaseException:
+            lock.release()
+            raise
+        if self._dry_run:
+            lock.release()
+        else:
+            await self._finish()
+
+    # -- before -------------------------------------------------------------------------------------------------------
+
+    async def _in_time(
+        self, step: str, deadline: float, work: Callable[[], Coroutine[Any, Any, Any]], waits_for: str = ""
+    ) -> None:
+        """Do what comes before the first step; whatever keeps it from being done is a refusal."""
+        try:
+            async with asyncio.timeout_at(deadline):
+                await work()
+        except TimeoutError as error:
+            why = f": {waits_for}" if waits_for else ""
+            raise TransactionRefused(step, f"not within {self._timeout:g} s{why}") from error
+        except HoldfastError as error:
+            raise TransactionRefused(step, said(error)) from error
+
+    async def _check(self, deadline: float) -> None:
+        """All checks of all steps, each against the tree as it will be."""
+        change, system = self._change, self._system
+        draft = self._draft = Draft(system.node)
+        before = draft.lines()
+        for operation in change.operations:
+            await self._in_time(operation.text, deadline, lambda one=operation: one.check(system, draft))  # type: ignore[misc]
+            refuse_self(operation)
+        try:
+            draft.check()
+        except HoldfastError as error:
+            raise TransactionRefused("the tree as it would be", said(error)) from error
+        change._difference = difference(before, draft.lines())
+
+    # -- the steps ----------------------------------------------------------------------------------------------------
+
+    async def _do(self, deadline: float) -> None:
+        system, change = self._system, self._change
+        texts = tuple(step.text for step in change.steps)
+        self._emit(TransactionBegan(self._address, texts))
+        begun: list[Operation] = []
+        failed = "commit"
+        try:
+            async with asyncio.timeout_at(deadline):
+                for operation in change.operations:
+                    failed = operation.text
+                    begun.append(operation)  # Before it is done: it may be cancelled in the middle.
+                    await operation.do(system)
+            for operation in change.operations:
+                failed = operation.text
+                operation.verify(system)
+            for operation in change.operations:
+                operation.seal(system)
+        except BaseException as error:
+            if isinstance(error, TimeoutError):
+                waiting = begun[-1].waiting if begun else ""
+                cause = f"not within {self._timeout:g} s{f': {waiting}' if waiting else ''}"
+            else:
+                cause = said(error)
+            undone, kept = await self._undo(begun)
+            self._emit(TransactionRolledBack(self._address, texts, failed, cause, kept))
+            if isinstance(error, (HoldfastError, TimeoutError)):
+                raise TransactionFailed(failed, cause, undone, kept) from error
+            raise
+
+    async def _undo(self, begun: list[Operation]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Undo what has begun, last one first; a cancellation waits until that is over."""
+        undone: list[str] = []
+        kept: list[str] = []
+
+        async def undo_all() -> None:
+            for operation in reversed(begun):
+                try:
+                    async with asyncio.timeout(UNDO_TIMEOUT):
+                        await operation.undo(self._system)
+                    undone.append(operation.text)
+                except Exception as error:  # The others are undone all the same, and this is told.
+                    kept.append(f"{operation.text}: {said(error)}")
+
+        work = self._system.node.loop.create_task(undo_all(), name="undoing a transaction")
+        cancelled: asyncio.CancelledError | None = None
+        while not work.done():
+            try:
+                await asyncio.shield(work)
+            except asyncio.CancelledError as error:
+                cancelled = error
+        work.result()
+        if cancelled is not None:
+            raise cancelled
+        return tuple(undone), tuple(kept)
+
+    # -- behind -------------------------------------------------------------------------------------------------------
+
+    async def _finish(self) -> None:
+        """There is no way back: what is left goes on even if nobody waits for it any more."""
+        system, shared = self._system, self._shared
+        # In nobody's name: it has to go on when the life is over from whose turn it was begun.
+        context = system.node.base_context.copy()
+        work = system.node.loop.create_task(self._finish_all(), name="end of a transaction", context=context)
+        shared.behind.add(work)
+        work.add_done_callback(shared.behind.discard)
+        if not self._removes_caller():
+            await asyncio.shield(work)
+
+    async def _finish_all(self) -> None:
+        problems: list[str] = []
+        try:
+            for operation in self._change.operations:
+                try:
+                    await operation.finish(self._system)
+                except Exception as error:  # The tree has changed; the others are tidied up all the same.
+                    problems.append(f"{operation.text}: {said(error)}")
+        finally:
+            self._shared.lock.release()
+            texts = tuple(step.text for step in self._change.steps)
+            self._emit(TransactionCommitted(self._address, texts, tuple(problems)))
+
+    def _removes_caller(self) -> bool:
+        """Whether the turn that called us belongs to an actor that goes: its end waits for that turn."""
+        caller = current.get(None)
+        place = self._draft.by_cell.get(caller.cell) if caller is not None and self._draft is not None else None
+        while place is not None:
+            if place.is_leaving:
+                return True
+            place = place.parent
+        return False
+
+    @property
+    def _address(self) -> str:
+        root = self._system.node.root
+        return root.path if root is not None else ""
+
+    def _emit(self, event: Any) -> None:
+        if self._system.node.watched:
+            self._system.node.emit(event)
+
+
+def refuse_self(operation: Operation) -> None:
+    """What is done between two turns of an actor cannot be waited for in one.
+
+    Raises:
+        TransactionRefused: it would.
+    """
+    caller = current.get(None)
+    if caller is not None and any(place.cell is caller.cell for place in operation.between_turns_of):
+        raise TransactionRefused(
+            operation.text, f"{caller.path} cannot change itself within its own turn: spawn a task"
+        )
+
+
+def said(error: BaseException) -> str:
+    """An error in words."""
+    if isinstance(error, asyncio.CancelledError):
+        return "cancelled"
+    text = error_text(error)
+    return text if isinstance(error, HoldfastError) else f"{type_name(type(error))}: {text}"

@@ -1,0 +1,157 @@
+"""Operations on what connects actors: bindings and names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from ...actors.cell import RUNNING, Cell
+from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
+from .draft import Draft, Place, Target
+from .operation import Operation, wrong
+from .structure import text_of
+
+if TYPE_CHECKING:
+    from ..system import ActorSystem
+
+
+class Bind(Operation):
+    """Point a binding elsewhere; its owner sees that from its next turn on."""
+
+    verb: ClassVar[str] = "bind"
+
+    def __init__(self, owner: Target, port: str, target: Target) -> None:
+        super().__init__(text_of(owner))
+        self._at, self._port, self._to = owner, port, target
+        self._owner: Place | None = None
+        self._bound: Place | None = None
+        self._done = False
+        self._before: Cell | None = None
+
+    @property
+    def text(self) -> str:
+        to = self._bound.path if self._bound is not None else text_of(self._to)
+        return f"bind {self._port} of {self.target} to {to}"
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        owner = self._owner = draft.find(self._at)
+        self._bound = draft.find(self._to)
+        self.target = owner.path
+        for place in (owner, self._bound):
+            place.check_lived_in(system.node)
+        kind = owner.kind
+        if kind is not None and self._port not in kind._bindings:
+            known = ", ".join(sorted(kind._bindings)) or "none"
+            raise wrong(owner.path, f"{type_name(kind)} has no binding {self._port!r} (it has: {known})")
+        owner.bindings[self._port] = self._bound
+
+    async def do(self, system: ActorSystem) -> None:
+        assert self._owner is not None
+        assert self._bound is not None
+        owner, target = self._owner.living(system.node), self._bound.living(system.node)
+        self._before = bound_to(owner, self._port)
+        system.node.bind(owner, self._port, target)
+        self._done = True
+
+    async def undo(self, system: ActorSystem) -> None:
+        if not self._done or self._owner is None:
+            return
+        owner = self._owner.living(system.node)
+        if self._before is not None:
+            system.node.bind(owner, self._port, self._before)
+            return
+        more = owner.extra()  # It was bound to nobody; another process keeps the last one it was told of.
+        more.bindings.pop(self._port, None)
+        if more.turn is not None and more.turn.rebinds is not None:
+            more.turn.rebinds.pop(self._port, None)
+
+    def verify(self, system: ActorSystem) -> None:
+        assert self._bound is not None
+        self._bound.living(system.node)
+
+
+def bound_to(owner: Cell, port: str) -> Cell | None:
+    """Where a binding points, as far as is known here."""
+    more = owner.more
+    if more is None:
+        return None
+    soon = more.turn.rebinds if more.turn is not None else None
+    return (soon or {}).get(port) or more.bindings.get(port)
+
+
+class Register(Operation):
+    """Give an actor a name beside its address."""
+
+    verb: ClassVar[str] = "register"
+
+    def __init__(self, name: str, target: Target) -> None:
+        super().__init__(text_of(target))
+        self._name, self._at = name, target
+        self._place: Place | None = None
+        self._done = False
+
+    @property
+    def text(self) -> str:
+        return f"register {self.target} as {self._name!r}"
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        place = self._place = draft.find(self._at)
+        self.target = place.path
+        place.check_lived_in(system.node)
+        holder = holder_of(self._name, draft)
+        if holder is not None and holder is not place:
+            raise NameTaken(self._name)
+        if place.cell is not None and place.cell.state is not RUNNING:
+            raise ActorStopped(place.path)
+        if holder is None:
+            place.names.append(self._name)
+
+    async def do(self, system: ActorSystem) -> None:
+        assert self._place is not None
+        cell = self._place.living(system.node)
+        if system.node.names.get(self._name) is not cell:
+            system.node.register(self._name, cell)
+            self._done = True
+
+    async def undo(self, system: ActorSystem) -> None:
+        if self._done:
+            system.node.unregister(self._name)
+
+
+class Unregister(Operation):
+    """Free a name."""
+
+    verb: ClassVar[str] = "unregister"
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self._name = name
+        self._holder: Cell | None = None
+        self._life = 0
+        self._order: list[str] = []
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        holder = holder_of(self._name, draft)
+        if holder is None:
+            raise NoSuchActor(self._name)
+        holder.names.remove(self._name)
+
+    async def do(self, system: ActorSystem) -> None:
+        holder = system.node.names.get(self._name)
+        if holder is not None:
+            self._holder, self._life, self._order = holder, holder.life, list(system.node.names)
+            system.node.unregister(self._name)
+
+    async def undo(self, system: ActorSystem) -> None:
+        holder, names = self._holder, system.node.names
+        if holder is None or holder.life != self._life or holder.state is not RUNNING:
+            return  # Names end with the life.
+        system.node.register(self._name, holder)
+        rank = {name: number for number, name in enumerate(self._order)}
+        kept = sorted(names.items(), key=lambda pair: rank.get(pair[0], len(rank)))
+        names.clear()
+        names.update(kept)
+
+
+def holder_of(name: str, draft: Draft) -> Place | None:
+    """Who has a name at this point."""
+    return next((place for place in draft.root.walk() if name in place.names), None)

@@ -1,0 +1,231 @@
+"""`holdfast apply`: a script of its user, and of nobody else, changes a running system, as it would in process."""
+
+import asyncio
+import hashlib
+import os
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+import holdfast as hf
+from holdfast.console.endpoint import control_endpoint
+from holdfast.system import script as script_module
+from holdfast.system.script import UntrustedFile, read_source
+from tests.system.trees import Add, picture, plant, ref
+
+DONE, FAILED, UNUSABLE = 0, 1, 2
+GROW = """
+import holdfast as hf
+
+
+class Ask(hf.Message[str]):
+    what: str
+
+
+class Greeter(hf.Actor):
+    @hf.on(Ask)
+    def ask(self, message: Ask) -> str:
+        return f"hello {message.what}"
+
+
+def hundred(state):
+    return {"count": state["count"] + 100}
+
+
+async def reconfigure(system):
+    async with system.transaction() as change:
+        greeter = change.add("/app/left", hf.child("greeter", hf.start(Greeter)))
+        change.register("greeter", greeter)
+        change.move("/app/left/b", "/app/right")
+        change.replace_state("/app/left/a", hundred)
+        change.remove("/app/left/c")
+"""
+
+CHANGED_MIND = """
+async def reconfigure(system):
+    async with system.transaction() as change:
+        change.remove("/app/left/b")
+        raise RuntimeError("changed my mind")
+"""
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
+        await plant(running)
+        yield running
+
+
+@pytest.fixture
+async def socket(system: hf.ActorSystem, tmp_path: Path) -> AsyncIterator[Path]:
+    async with control_endpoint(system, tmp_path / "app.sock") as where:
+        yield where
+
+
+@pytest.fixture
+def grow(tmp_path: Path) -> Path:
+    return written(tmp_path / "grow.py", GROW)
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text)
+    path.chmod(0o600)
+    return path
+
+
+async def holdfast(*arguments: object) -> tuple[int, str, str]:
+    """The command in a process of its own: exit status, output, errors."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "holdfast.console.cli", *map(str, arguments)),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+    )
+    async with asyncio.timeout(60):
+        output, errors = await process.communicate()
+    return process.returncode or 0, output.decode(), errors.decode()
+
+
+async def test_a_script_is_carried_out_in_the_running_system(system: hf.ActorSystem, socket: Path, grow: Path) -> None:
+    with system.events() as stream:
+        status, output, errors = await holdfast("apply", grow, "--socket", socket)
+        loaded = [event for event in stream.take() if isinstance(event, hf.ScriptLoaded)]
+    assert (status, errors) == (DONE, "")
+    assert "1. add /app/left/greeter\n2. register /app/left/greeter as 'greeter'\n" in output
+    assert output.endswith("done\n")
+    assert [(event.path, event.sha256) for event in loaded] == [
+        (os.path.realpath(grow), hashlib.sha256(grow.read_bytes()).hexdigest())
+    ]
+    module = sys.modules[read_source(grow).module]
+    assert await system.whereis("greeter").ask(module.Ask("you")) == "hello you"
+    assert await ref(system, "/app/left/a").ask(Add()) == 101
+    assert "/app/right/b" in system.tree()
+    assert "/app/left/c" not in system.tree()
+
+
+async def test_a_dry_run_says_what_would_be_done(system: hf.ActorSystem, socket: Path, grow: Path) -> None:
+    before = picture(system)
+    status, output, _ = await holdfast("apply", grow, "--socket", socket, "--dry-run")
+    assert status == DONE
+    assert "+ /app/left/greeter: Greeter, permanent, task, named 'greeter'" in output
+    assert output.endswith("nothing was done: this was a dry run\n")
+    assert picture(system) == before
+
+
+async def test_the_same_script_runs_in_process(system: hf.ActorSystem, grow: Path) -> None:
+    await system.apply(str(grow))
+    assert await ref(system, "/app/left/a").ask(Add()) == 101
+    assert system.whereis("greeter").path == "/app/left/greeter"
+
+
+@pytest.mark.parametrize(
+    ("text", "status", "error"),
+    [
+        ("def reconfigure(system): ...", UNUSABLE, "it has no `async def reconfigure(system)`"),
+        ("import nothing_there", UNUSABLE, "ModuleNotFoundError: No module named 'nothing_there'"),
+        ("async def reconfigure(system): 1 / 0", FAILED, "ZeroDivisionError"),
+        (
+            "async def reconfigure(system):\n async with system.transaction() as change: change.remove('/app/x')",
+            FAILED,
+            "transaction refused at: remove /app/x (there is no actor at /app/x); nothing was done",
+        ),
+        (
+            CHANGED_MIND,
+            FAILED,
+            "changed my mind",
+        ),
+    ],
+)
+async def test_what_goes_wrong_is_said_and_changes_nothing(
+    system: hf.ActorSystem, socket: Path, tmp_path: Path, text: str, status: int, error: str
+) -> None:
+    before = picture(system)
+    done = await holdfast("apply", written(tmp_path / "script.py", text), "--socket", socket)
+    assert done[0] == status
+    assert error in done[2]
+    assert picture(system) == before
+
+
+async def test_a_script_that_others_may_write_is_not_loaded(
+    system: hf.ActorSystem, socket: Path, grow: Path, tmp_path: Path
+) -> None:
+    before = picture(system)
+    grow.chmod(0o622)
+    status, _, errors = await holdfast("apply", grow, "--socket", socket)
+    assert (status, "others may write it (mode 0622)" in errors) == (UNUSABLE, True)
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    other = written(folder / "grow.py", GROW)
+    folder.chmod(0o777)
+    status, _, errors = await holdfast("apply", other, "--socket", socket)
+    assert (status, f"{folder} is not loaded: others may write it" in errors) == (UNUSABLE, True)
+    assert picture(system) == before
+
+
+def test_a_script_of_another_user_is_not_read(grow: Path) -> None:
+    with pytest.raises(UntrustedFile, match=f"belongs to the user with uid {os.geteuid()}, not to you"):
+        read_source(grow, uid=os.geteuid() + 1)
+
+
+def test_a_link_is_followed_to_what_is_checked(grow: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    hidden = written(folder / "grow.py", GROW)
+    folder.chmod(0o777)
+    link = tmp_path / "link.py"
+    link.symlink_to(hidden)
+    with pytest.raises(UntrustedFile, match="shared is not loaded"):
+        read_source(link)
+
+
+def test_a_large_script_is_not_read(grow: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(script_module, "LARGEST", 10)
+    with pytest.raises(hf.SpecError, match="at most 10 bytes"):
+        read_source(grow)
+
+
+async def test_a_module_that_others_may_write_is_not_imported(
+    system: hf.ActorSystem, socket: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system checks for itself: the command may import what it likes."""
+    library = tmp_path / "library"
+    library.mkdir()
+    module = written(library / "shady_actors.py", "import holdfast as hf\nclass Shady(hf.Actor): ...\n")
+    text = (
+        "import holdfast as hf\nfrom shady_actors import Shady\nasync def reconfigure(system):\n"
+        " async with system.transaction() as change: change.add('/app/left', hf.child('x', hf.start(Shady)))\n"
+    )
+    script = written(tmp_path / "script.py", text)
+    monkeypatch.syspath_prepend(str(library))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(library), os.environ.get("PYTHONPATH", "")]))
+    before = picture(system)
+    module.chmod(0o666)
+    status, _, errors = await holdfast("apply", script, "--socket", socket)
+    assert (status, "others may write it (mode 0666)" in errors) == (FAILED, True)
+    assert "shady_actors" not in sys.modules
+    assert picture(system) == before
+    module.chmod(0o600)
+    with system.events() as stream:
+        status, _, errors = await holdfast("apply", script, "--socket", socket)
+        told = [event.path for event in stream.take() if isinstance(event, hf.ScriptLoaded)]
+    assert (status, errors) == (DONE, "")
+    assert os.path.realpath(module) in told
+    assert "/app/left/x" in system.tree()
+    del sys.modules["shady_actors"]
+
+
+async def test_nobody_answers(grow: Path, tmp_path: Path) -> None:
+    for command in (("apply", grow), ("tree",), ("status", "/app")):
+        status, _, errors = await holdfast(*command, "--socket", tmp_path / "gone.sock")
+        assert (status, "no system answers at" in errors) == (UNUSABLE, True)
+
+
+async def test_tree_and_status_tell_of_the_running_system(system: hf.ActorSystem, socket: Path) -> None:
+    status, output, _ = await holdfast("tree", "--socket", socket)
+    assert (status, output.split()) == (DONE, system.tree())
+    status, output, _ = await holdfast("status", "/app/left/a", "--socket", socket)
+    assert status == DONE
+    assert "kind: tests.system.trees.Counter\nstate: running\nparent: /app/left\n" in output
+    status, _, errors = await holdfast("status", "/app/nowhere", "--socket", socket)
+    assert (status, errors) == (FAILED, "holdfast status: there is no actor at /app/nowhere\n")

@@ -1,0 +1,332 @@
+"""The control endpoint: whom it serves, what it refuses, and that nobody is hurt by what another sends (DESIGN 9)."""
+
+import asyncio
+import inspect
+import os
+import socket
+import stat
+import struct
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+import holdfast as hf
+from holdfast.console import endpoint as endpoint_module
+from holdfast.console.endpoint import Endpoint, EndpointInUse, control_endpoint
+from holdfast.console.remote import NotReached, RemoteRef, RemoteSystem
+from holdfast.console.wire import LARGEST, RESPONSE, BadRequest, Request, Tree, WrongUser, frame, outcome
+from tests.system.trees import Add, Counter, counter, picture, plant, ref
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
+        await plant(running)
+        yield running
+
+
+@pytest.fixture
+async def path(system: hf.ActorSystem, tmp_path: Path) -> AsyncIterator[Path]:
+    async with control_endpoint(system, tmp_path / "app.sock") as where:
+        yield where
+
+
+async def far(path: Path, work: Any) -> Any:
+    """`work(remote)` in a thread, as another process would do it: what blocks there must not block us."""
+
+    def run() -> Any:
+        with RemoteSystem(path) as remote:
+            return asyncio.run(work(remote)) if inspect.iscoroutinefunction(work) else work(remote)
+
+    return await asyncio.to_thread(run)
+
+
+async def raw(path: Path, data: bytes) -> tuple[Any, bytes]:
+    """Send bytes; the response, and what comes behind it until the end."""
+    reader, writer = await asyncio.open_unix_connection(path)
+    try:
+        writer.write(data)
+        await writer.drain()
+        (size,) = struct.unpack(">I", await reader.readexactly(4))
+        response = RESPONSE.decode(await reader.readexactly(size))
+        return response, await reader.read()
+    finally:
+        writer.close()
+        await writer.wait_closed()
+
+
+# -- the socket -------------------------------------------------------------------------------------------------------
+
+
+async def test_only_its_user_may_open_it_and_it_goes_with_the_endpoint(system: hf.ActorSystem, tmp_path: Path) -> None:
+    where = tmp_path / "app.sock"
+    umask = os.umask(0)
+    try:
+        async with control_endpoint(system, where):
+            assert stat.S_IMODE(os.lstat(where).st_mode) == 0o600
+    finally:
+        os.umask(umask)
+    assert not where.exists()
+
+
+async def test_it_has_no_wider_rights_at_the_moment_of_its_birth(
+    system: hf.ActorSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seen: list[int] = []
+
+    class Looking(socket.socket):
+        def bind(self, address: Any) -> None:
+            os.umask(0)  # Whatever the umask: the rights come from the socket itself.
+            super().bind(address)
+            seen.append(stat.S_IMODE(os.lstat(address).st_mode))
+
+    monkeypatch.setattr(socket, "socket", Looking)
+    before = os.umask(0o022)
+    try:
+        sock, _ = endpoint_module.listen(tmp_path / "app.sock")
+    finally:
+        os.umask(before)
+    sock.close()
+    os.unlink(tmp_path / "app.sock")
+    assert seen == [0o600]
+
+
+async def test_a_folder_that_others_may_write_is_refused(system: hf.ActorSystem, tmp_path: Path) -> None:
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(0o777)
+    with pytest.raises(hf.UntrustedFile, match="others may write it"):
+        async with control_endpoint(system, folder / "app.sock"):
+            pass
+    assert list(folder.iterdir()) == []
+
+
+async def test_a_live_endpoint_is_not_replaced(system: hf.ActorSystem, path: Path) -> None:
+    with pytest.raises(EndpointInUse, match="a live process listens there"):
+        async with control_endpoint(system, path):
+            pass
+    assert await far(path, lambda remote: remote.tree()) == system.tree()
+
+
+async def test_the_socket_of_a_dead_process_is_replaced(system: hf.ActorSystem, tmp_path: Path) -> None:
+    where = tmp_path / "app.sock"
+    program = (
+        "import socket, sys; s = socket.socket(socket.AF_UNIX); s.bind(sys.argv[1]); s.listen(); import os; os._exit(9)"
+    )
+    assert subprocess.run([sys.executable, "-c", program, where], check=False, timeout=60).returncode == 9
+    assert where.is_socket()
+    async with control_endpoint(system, where):
+        assert await far(where, lambda remote: remote.tree()) == system.tree()
+
+
+async def test_what_is_no_socket_is_left_alone(system: hf.ActorSystem, tmp_path: Path) -> None:
+    where = tmp_path / "notes"
+    where.write_text("mine")
+    with pytest.raises(EndpointInUse, match="something else"):
+        async with control_endpoint(system, where):
+            pass
+    assert where.read_text() == "mine"
+
+
+async def test_another_user_is_not_served(system: hf.ActorSystem, tmp_path: Path) -> None:
+    """The check asks the kernel who is there; here the endpoint serves a user that we are not."""
+    endpoint = Endpoint(system, os.geteuid() + 1)
+    server = await asyncio.start_unix_server(endpoint.serve, tmp_path / "app.sock")
+    try:
+        response, rest = await raw(tmp_path / "app.sock", frame(Tree()))
+        with pytest.raises(WrongUser, match=f"uid {os.geteuid()}, and only uid {os.geteuid() + 1} is served"):
+            outcome(response)
+        assert rest == b""
+    finally:
+        server.close()
+        await endpoint.close()
+        await server.wait_closed()
+
+
+# -- what is sent -----------------------------------------------------------------------------------------------------
+
+HEAD = struct.Struct(">I")
+BAD = {
+    "no MessagePack": HEAD.pack(3) + b"\xc1\xc1\xc1",
+    "no request": HEAD.pack(1) + b"\x01",
+    "unknown request": HEAD.pack(20) + msgspec.msgpack.encode({"ask": "shutdown all"})[:20].ljust(20, b"\0"),
+    "too large": HEAD.pack(LARGEST + 1),
+    "unknown field": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "tree", "all": True})),
+    "wrong type": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "whereis", "name": 5})),
+}
+
+
+@pytest.mark.parametrize("what", BAD)
+async def test_what_is_no_request_ends_its_own_connection_only(system: hf.ActorSystem, path: Path, what: str) -> None:
+    reader, writer = await asyncio.open_unix_connection(path)  # Another client, in the middle of its session.
+    response, rest = await raw(path, BAD[what])
+    with pytest.raises(BadRequest):
+        outcome(response)
+    assert rest == b""
+    writer.write(frame(Tree()))
+    (size,) = HEAD.unpack(await reader.readexactly(4))
+    assert outcome(RESPONSE.decode(await reader.readexactly(size))) == system.tree()
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_client_that_goes_in_the_middle_of_a_frame_hurts_nobody(system: hf.ActorSystem, path: Path) -> None:
+    _, writer = await asyncio.open_unix_connection(path)
+    writer.write(frame(Tree())[:3])
+    writer.close()
+    await writer.wait_closed()
+    assert await far(path, lambda remote: remote.tree()) == system.tree()
+
+
+async def test_too_many_clients_are_turned_away(
+    system: hf.ActorSystem, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(endpoint_module, "MOST_CLIENTS", 2)
+    held = [await asyncio.open_unix_connection(path) for _ in range(2)]
+    for reader, writer in held:
+        writer.write(frame(Tree()))
+        assert await reader.readexactly(4)  # It is served: it counts from now on.
+    response, _ = await raw(path, frame(Tree()))
+    with pytest.raises(BadRequest, match="2 connections already"):
+        outcome(response)
+    for _, writer in held:
+        writer.close()
+        await writer.wait_closed()
+
+
+def test_every_request_is_typed() -> None:
+    assert all(kind.__struct_config__.forbid_unknown_fields for kind in Request.__subclasses__())
+
+
+# -- what a script can do ---------------------------------------------------------------------------------------------
+
+
+async def test_the_tree_is_looked_at_and_actors_are_controlled(system: hf.ActorSystem, path: Path) -> None:
+    a = ref(system, "/app/left/a")
+    await a.ask(Add(4))
+
+    async def work(remote: RemoteSystem) -> list[Any]:
+        one = remote.ref("/app/left/a", Counter)
+        assert remote.whereis("first") == one == RemoteRef("/app/left/a")
+        with pytest.raises(hf.NoSuchActor, match="nobody"):
+            remote.whereis("nobody")
+        with pytest.raises(hf.NoSuchActor):
+            await remote.get_state("/app/nowhere")
+        await remote.statistics(one, True)
+        await remote.suspend(one)
+        found = [await remote.get_state(one), (await remote.get_status(one)).state]
+        await remote.resume(one)
+        counts = await remote.statistics(one)
+        assert counts is not None
+        return found
+
+    assert await far(path, work) == [{"count": 4}, "suspended"]
+    assert await a.ask(Add(1)) == 5
+
+
+async def test_a_transaction_is_carried_out_as_one(system: hf.ActorSystem, path: Path) -> None:
+    async def work(remote: RemoteSystem) -> str:
+        async with remote.transaction() as change:
+            g = change.add("/app/left", counter("g", 7))
+            change.register("seven", g)
+            change.move("/app/left/b", "/app/right")
+            change.bind(remote.ref("/app/right/client"), "peer", g)
+            change.reorder("/app/left", ["g", "a", "c"])
+            change.intensity("/app/left", 5, 2.5)
+        return change.describe()
+
+    told = await far(path, work)
+    assert "2. register /app/left/g as 'seven'" in told
+    assert "+ /app/left/g: Counter, permanent, task, named 'seven'" in told
+    assert await system.whereis("seven").ask(Add()) == 8
+    assert "/app/right/b" in system.tree()
+
+
+async def test_a_transaction_that_fails_changes_nothing_and_says_why(system: hf.ActorSystem, path: Path) -> None:
+    before = picture(system)
+
+    async def fails(remote: RemoteSystem) -> None:
+        async with remote.transaction() as change:
+            change.move("/app/left/b", "/app/right")
+            change.replace_state("/app/left/c", raises)
+
+    async def refused(remote: RemoteSystem) -> None:
+        async with remote.transaction() as change:
+            change.move("/app/left/b", "/app/right")
+            change.remove("/app/left/x")
+
+    with pytest.raises(hf.TransactionFailed, match="cannot be done") as failed:
+        await far(path, fails)
+    assert failed.value.undone == ("replace state of /app/left/c", "move /app/left/b to /app/right")
+    with pytest.raises(hf.TransactionRefused, match="there is no actor at /app/left/x"):
+        await far(path, refused)
+    assert picture(system) == before
+
+
+def raises(state: Any) -> Any:
+    raise ValueError("cannot be done")
+
+
+async def test_a_transaction_whose_client_goes_is_rolled_back(system: hf.ActorSystem, path: Path) -> None:
+    before = picture(system)
+    await system.suspend(ref(system, "/app/right"))  # It will not start anybody.
+    async with asyncio.timeout(30):
+        with system.events() as stream:
+
+            async def work(remote: RemoteSystem) -> None:
+                async with remote.transaction(timeout=60.0) as change:
+                    change.unregister("first")
+                    change.add("/app/pool", hf.child("slow", hf.start(Endless)))
+
+            client = asyncio.create_task(far(path, lambda remote: go_in_the_middle(remote, work)))
+            reason = await rolled_back(stream)
+        await client
+    await system.resume(ref(system, "/app/right"))
+    assert reason == "cancelled"
+    assert picture(system) == before
+
+
+async def rolled_back(stream: hf.EventStream) -> str:
+    async for event in stream:
+        if isinstance(event, hf.TransactionRolledBack):
+            return event.reason
+    raise AssertionError("the stream has ended")
+
+
+class Endless(Counter):
+    async def on_start(self, restored: bool) -> None:
+        await asyncio.get_running_loop().create_future()
+
+
+def go_in_the_middle(remote: RemoteSystem, work: Any) -> None:
+    async def main() -> None:
+        task = asyncio.create_task(work(remote))
+        while "/app/pool/slow" not in await asyncio.to_thread(other.tree):
+            await asyncio.sleep(0)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    with RemoteSystem(remote._client.path) as other:
+        asyncio.run(main())
+
+
+async def test_nobody_listens(tmp_path: Path) -> None:
+    with pytest.raises(NotReached, match="is it running, with a control endpoint there"):
+        RemoteSystem(tmp_path / "gone.sock")
+
+
+async def test_the_endpoint_ends_with_clients_connected(system: hf.ActorSystem, tmp_path: Path) -> None:
+    async with control_endpoint(system, tmp_path / "app.sock") as where:
+        reader, writer = await asyncio.open_unix_connection(where)
+        writer.write(frame(Tree()))
+        assert await reader.readexactly(4)
+    async with asyncio.timeout(10):
+        await reader.read()
+    writer.close()
+    await writer.wait_closed()
