@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ..actors.errors import AskFailed
 from ..actors.events import RolledBack
 from .method import OnEscalate
 from .saved import FORMAT, Meta, decode_meta, put
@@ -43,8 +42,6 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
     home.older = None
     home.topics = dict.fromkeys(meta.topics)
     home.timers.replace(meta.timers)
-    for key in [key for key in home.later if key not in meta.later]:
-        home.later.pop(key).fail(AskFailed(home.path, UNDONE))
     home.node.emit(RolledBack(home.path, first, meta.base, why))
 
 

@@ -22,8 +22,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     """A snapshot, with what the home knew when it came.
 
     `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
-    were undone. An empty `state` stands for none: the actor begins afresh. `later` are the inputs whose reply was to
-    come later. (Stores of before have neither `base` nor `later`.)
+    were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh.
     """
 
     format: int
@@ -35,7 +34,6 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     epoch: int
     state: bytes
     base: int = -1
-    later: list[int] = []
 
 
 def decode_meta(data: bytes) -> Meta:
@@ -52,7 +50,7 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     turn, older = record.turn, home.newest
     meta = Meta(
         FORMAT, turn, home.next_id, record.stash, home.timers.saved(), list(home.topics), home.journal.epoch, state,
-        turn, list(home.later),
+        turn,
     )  # fmt: skip
     put(home, meta, home.method.keep)
     # In a store that lasts it is read back when it is wanted.

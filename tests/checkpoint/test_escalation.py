@@ -157,8 +157,25 @@ async def test_who_waits_for_a_later_reply_from_an_undone_turn_is_told(isolation
         waiting = at(system).ask(Do(["later"]), timeout=20.0)
         await add(system, "a")
         await rolled_back(system, isolation)
-        with pytest.raises((hf.AskFailed, hf.ActorStopped)):
+        with pytest.raises(hf.ActorStopped):
             await waiting
+
+
+async def test_who_is_started_by_hand_after_an_escalation_has_left_it_behind(store: str | None, isolation: str) -> None:
+    async with running(store) as system:
+        spec = tree(isolation, doing(isolation, on_escalate="fresh"), intensity=0, restart="transient")
+        await system.start(spec)
+        await add(system, "a")
+        with system.events() as stream:
+            at(system).tell(Do(["raise it"]))
+            await back(stream, hf.SupervisorGaveUp, "/app/top")
+        await until(lambda: "/app/top" not in system.tree())
+        await system.ref("/app", hf.Supervisor).ask(hf.RestartChild("top"), timeout=20.0)
+        assert await seen(system) == ["a"]
+        with system.events() as stream:
+            top(system).kill()
+            await back(stream, hf.ChildRestarted, "/app/top")
+        assert await seen(system) == ["a"]
 
 
 async def test_an_escalation_through_two_supervisors_counts_for_the_one_it_began_with(store: str | None) -> None:
