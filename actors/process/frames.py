@@ -31,13 +31,13 @@ class Tell(Frame, tag=1):
 
 
 class Ask(Frame, tag=2):
-    """A message whose outcome is awaited under `id`; `left` seconds from now."""
+    """A message whose outcome is awaited under `id`, `until` then on the clock that a machine's processes share."""
 
     id: int
     to: Name
     name: Name
     body: Raw
-    left: float
+    until: float
     number: int = 0
     sender: Name | None = None
     chain: tuple[tuple[str, int], ...] = ()

@@ -6,6 +6,7 @@ import asyncio
 import math
 import types
 from collections.abc import Callable, Iterable
+from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
@@ -70,11 +71,11 @@ class Peer:
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
         self._last_id = key = self._last_id + 1
-        left = ask.deadline - self.node.loop.time()
+        until = monotonic() + ask.deadline - self.node.loop.time()
         to = connection.name_out(path)
         name, body = self._payload(ask.message)
         sender = None if ask.sender is None else connection.name_out(ask.sender.path)
-        frame = frames.Ask(key, to, name, body, left, number, sender, ask.chain)
+        frame = frames.Ask(key, to, name, body, until, number, sender, ask.chain)
         connection.send(frame, path)
         self.pending[key] = ask
         ask.started = True  # From here on we cannot know.
@@ -315,7 +316,7 @@ class RelayedAsk(Ask, eq=False):
     @classmethod
     def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
         """The ask that a frame carries; its message is decoded behind it."""
-        left = frame.left
+        left = frame.until - monotonic()
         deadline = peer.node.loop.time() + left
         return cls(None, None, frame.chain, left, deadline, None, cell, False, peer, frame.id, frame.number, page)
 
