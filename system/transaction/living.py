@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import functools
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.actor import Actor, Start
 from ...actors.cell import Cell
@@ -225,8 +225,6 @@ class Isolate(OnLiving):
             raise SpecError(self.target, f"isolation must be one of task, process, not {self._to!r}")
         if place.spec is None:
             raise wrong(self.target, "nobody supervises it: it has no isolation to change")
-        if getattr(system, "set_isolation", None) is None:
-            raise wrong(self.target, "actors cannot change their process while they live")
         place.spec = dataclasses.replace(place.spec, isolation=self._to)
 
     async def do(self, system: ActorSystem) -> None:
@@ -234,7 +232,7 @@ class Isolate(OnLiving):
         before: Isolation = cell.spec.isolation
         if before != self._to:
             self._before = before
-            moving = cast("Any", system).set_isolation(cell.ref, self._to)
+            moving = system.set_isolation(cell.ref, self._to)
             self._moving = system.node.loop.create_task(moving, name=f"isolation of {cell.path}")
             await asyncio.shield(self._moving)
 
@@ -247,4 +245,4 @@ class Isolate(OnLiving):
                 self._moving.exception()
         cell = self.cell(system)
         if cell.spec.isolation != self._before:  # Else it stayed where it was.
-            await cast("Any", system).set_isolation(cell.ref, self._before)
+            await system.set_isolation(cell.ref, self._before)
