@@ -90,13 +90,17 @@ class Host(Protocol):
 
 
 class More:
-    """What only some cells have; made when first needed, so that an idle actor stays small."""
+    """What only some cells have; made when first needed, so that an idle actor stays small.
+
+    So are the collections in it: most supervised actors never have any of them.
+    """
 
     __slots__ = (
         "bindings",
         "bound",
         "calls",
         "enders",
+        "has_ties",
         "last",
         "links",
         "monitors",
@@ -118,15 +122,21 @@ class More:
         "watching",
     )
 
+    bindings: dict[str, Cell]
+    calls: list[Call]  # control that waits for the actor's process to be up
+    links: dict[Cell, None]
+    monitors: list[Any]  # who watches us (links.Monitor)
+    names: list[str]
+    tasks: set[asyncio.Task[Any]]
+    timers: set[Any]
+    topics: set[str]
+    watching: dict[Any, None]  # whom we watch (links.Monitor)
+
     def __init__(self) -> None:
-        self.bindings: dict[str, Cell] = {}
         self.bound: Bound | None = None
-        self.calls: list[Call] = []  # control that waits for the actor's process to be up
-        self.enders: list[asyncio.Future[ExitReason]] = []
+        self.enders: list[asyncio.Future[ExitReason]] | None = None
+        self.has_ties = False  # whether any of the collections was made
         self.last: Actor | None = None  # the actor of the ended life, if it wants what stays undelivered
-        self.links: dict[Cell, None] = {}
-        self.monitors: list[Any] = []  # who watches us (links.Monitor)
-        self.names: list[str] = []
         self.outlet: Any = None  # the way into another process (process.remote.Outlet)
         self.reason: ExitReason = SHUTDOWN
         self.start: Start[Any] | None = None
@@ -135,13 +145,32 @@ class More:
         self.stash: deque[Any] | None = None
         self.suspended = False
         self.tap: Tap | None = None  # whoever counts or follows what the actor does
-        self.tasks: set[asyncio.Task[Any]] = set()
-        self.timers: set[Any] = set()
-        self.topics: set[str] = set()
         self.trap_exits = False
         self.turn: Suspended | None = None
         self.urgent: deque[Item] | None = None
-        self.watching: dict[Any, None] = {}  # whom we watch (links.Monitor)
+
+    def __getattr__(self, name: str) -> Any:
+        """A collection is asked for the first time. (Python calls this for an empty slot only.)"""
+        make = _COLLECTIONS.get(name)
+        if make is None:
+            raise AttributeError(name)
+        made = make()
+        self.has_ties = True
+        setattr(self, name, made)
+        return made
+
+
+_COLLECTIONS: dict[str, Callable[[], Any]] = {
+    "bindings": dict,
+    "calls": list,
+    "links": dict,
+    "monitors": list,
+    "names": list,
+    "tasks": set,
+    "timers": set,
+    "topics": set,
+    "watching": dict,
+}
 
 
 class _Hot:
@@ -274,7 +303,10 @@ class Cell(_Hot):
         if self.state in (DOWN, GONE):
             future.set_result(self.more.reason if self.more is not None else SHUTDOWN)
         else:
-            self.extra().enders.append(future)
+            more = self.extra()
+            if more.enders is None:
+                more.enders = []
+            more.enders.append(future)
         return future
 
     # -- the fate of what is left -----------------------------------------------------------------------------------

@@ -94,7 +94,7 @@ def sever(one: Cell, other: Cell) -> bool:
 def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
     """A life has ended: EXIT over its links, DOWN to its monitors."""
     more = cell.more
-    if more is None:
+    if more is None or not more.has_ties:
         return
     if more.links and not recovering:
         peers, more.links = more.links, {}
@@ -118,7 +118,7 @@ def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
 def gone(cell: Cell, reason: ExitReason) -> None:
     """The address is gone for good: tell who watches it."""
     more = cell.more
-    if more is None or not more.monitors:
+    if more is None or not more.has_ties or not more.monitors:
         return
     watchers = [watch for watch in more.monitors if watch.for_good]
     more.monitors = [watch for watch in more.monitors if not watch.for_good]

@@ -396,8 +396,8 @@ def ended(cell: Cell, reason: ExitReason) -> None:
 
 def tell_enders(more: Any, reason: ExitReason) -> None:
     """Whoever waits for the end hears of it."""
-    enders, more.enders = more.enders, []
-    for future in enders:
+    enders, more.enders = more.enders, None
+    for future in enders or ():
         if not future.done():
             future.set_result(reason)
 
@@ -405,17 +405,18 @@ def tell_enders(more: Any, reason: ExitReason) -> None:
 def _undo(cell: Cell) -> None:
     """Timers, tasks, subscriptions, names and the suspension end with the life; the stash goes back to the queue."""
     more = cell.extra()
-    for timer in list(more.timers):
-        timer.cancel()
-    for task in more.tasks:
-        task.cancel()
-    more.tasks.clear()
-    for topic in list(more.topics):
-        cell.node.topics.unsubscribe(topic, cell)
-    for name in more.names:
-        cell.node.names.pop(name, None)
-    more.names.clear()
-    more.watching.clear()
+    if more.has_ties:
+        for timer in list(more.timers):
+            timer.cancel()
+        for task in more.tasks:
+            task.cancel()
+        more.tasks.clear()
+        for topic in list(more.topics):
+            cell.node.topics.unsubscribe(topic, cell)
+        for name in more.names:
+            cell.node.names.pop(name, None)
+        more.names.clear()
+        more.watching.clear()
     more.suspended = False
     queue = cell.queue
     if queue:
@@ -453,8 +454,10 @@ def retire(cell: Cell, why: object) -> None:
             more.bound.release()
         links.announce(cell, more.reason, recovering=False)  # Links of a recorded actor wait for this.
         links.gone(cell, more.reason)
-        commands: list[Item] = [*more.calls, *(more.urgent or ())]
-        more.calls, more.urgent = [], None
+        commands: list[Item] = [*(more.calls if more.has_ties else ()), *(more.urgent or ())]
+        if more.has_ties:
+            more.calls = []
+        more.urgent = None
         for command in commands:
             command.undelivered(cell, str(why))
         if more.tap is not None:

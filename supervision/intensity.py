@@ -25,5 +25,8 @@ def admit_restart(
     >>> admit_restart((3.0, 4.0), 5.0, intensity=2, period=3.0) is None
     True
     """
-    recent = (*(t for t in restarts if now - t <= period), now)
+    old, count = 0, len(restarts)
+    while old < count and now - restarts[old] > period:
+        old += 1
+    recent = (*restarts[old:], now)
     return recent if len(recent) <= intensity else None

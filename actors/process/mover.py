@@ -54,7 +54,7 @@ class Move:
             raise
         finally:
             enders = self.cell.extra().enders
-            if ended in enders:
+            if enders is not None and ended in enders:
                 enders.remove(ended)
 
     def _life_ended(self, ended: asyncio.Future[ExitReason]) -> None:
