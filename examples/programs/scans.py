@@ -1,0 +1,85 @@
+"""Matching a laser scan with a map, as the two laser programs do it.
+
+A scan fits a map where its end points lie on occupied cells. The *likelihood field* of a map holds the distance from each
+cell to the nearest occupied one; the pose of the scan is where these distances, taken at its end points, are least.
+
+Source: Pedrosa, Pereira and Lau 2017 (LaMa); the search itself is SciPy's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.optimize import least_squares
+
+from holdfast.console.demo.grid import Geometry, OccupancyGrid
+
+Floats = NDArray[np.float64]
+
+FARTHEST = 1.0  # metres: from there on it does not matter how far away the next wall is
+TOLERANCE = 0.05  # metres: end points farther than this from a wall pull less and less, as what has moved should
+
+
+def place(points: Floats, pose: Floats) -> Floats:
+    """Points seen from a pose (x, y, heading), in the world; shape (n, 2).
+
+    >>> place(np.array([[1.0, 0.0]]), np.array([2.0, 3.0, np.pi / 2])).round(6).tolist()
+    [[2.0, 4.0]]
+    """
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    return points @ np.array([[cosine, sine], [-sine, cosine]]) + pose[:2]
+
+
+def compose(pose: Floats, step: Floats) -> Floats:
+    """The pose after a step that is seen from the pose."""
+    return np.array([*place(step[None, :2], pose)[0], wrap(pose[2] + step[2])])
+
+
+def between(pose: Floats, later: Floats) -> Floats:
+    """The step from a pose to a later one: `compose(pose, between(pose, later))` is `later`."""
+    cosine, sine = np.cos(pose[2]), np.sin(pose[2])
+    dx, dy = later[:2] - pose[:2]
+    return np.array([cosine * dx + sine * dy, cosine * dy - sine * dx, wrap(later[2] - pose[2])])
+
+
+def wrap(angle: float) -> float:
+    """An angle between -pi and pi."""
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+def end_points(ranges: NDArray[np.float32], *, start: float, step: float, nearest: float, farthest: float) -> Floats:
+    """Where the beams of a scan end, seen from the laser; those outside these ranges (metres) are left out."""
+    bearings = start + step * np.arange(len(ranges))
+    good = (ranges > nearest) & (ranges < farthest)
+    return ranges[good, None] * np.column_stack([np.cos(bearings[good]), np.sin(bearings[good])])
+
+
+@dataclass
+class LikelihoodField:
+    """Distances to the nearest occupied cell, in metres, at most `FARTHEST`; shape (rows, columns)."""
+
+    geometry: Geometry
+    distances: Floats
+
+    @staticmethod
+    def of(grid: OccupancyGrid) -> LikelihoodField:
+        """The field of a map."""
+        cells = distance_transform_edt(grid.cells <= 0)
+        return LikelihoodField(grid.geometry, np.minimum(cells * grid.geometry.resolution, FARTHEST))
+
+    def at(self, points: Floats) -> Floats:
+        """Distances at points, interpolated between the middles of cells; outside the map: `FARTHEST`."""
+        columns, rows = (points - (self.geometry.x0, self.geometry.y0)).T / self.geometry.resolution - 0.5
+        return map_coordinates(self.distances, (rows, columns), order=1, mode="constant", cval=FARTHEST)
+
+    def match(self, points: Floats, guess: Floats) -> Floats:
+        """The pose near `guess` from which the end points of a scan fit the map best."""
+
+        def misfit(pose: Floats) -> Floats:
+            return self.at(place(points, pose))
+
+        found = least_squares(misfit, guess, loss="cauchy", f_scale=TOLERANCE, diff_step=1e-3, max_nfev=15)
+        return np.array([found.x[0], found.x[1], wrap(found.x[2])])
