@@ -59,14 +59,14 @@ def end_points(ranges: NDArray[np.float32], *, start: float, step: float, neares
 
 @dataclass
 class LikelihoodField:
-    """Distances to the nearest occupied cell, in metres, at most `FARTHEST`; shape (rows, columns)."""
+    """Distances to the nearest occupied cell, in metres; `distances` has shape (rows, columns)."""
 
     geometry: Geometry
     distances: Floats
 
     @staticmethod
     def of(grid: OccupancyGrid) -> LikelihoodField:
-        """The field of a map."""
+        """The field of a map; distances end at `FARTHEST`."""
         cells = distance_transform_edt(grid.cells <= 0)
         return LikelihoodField(grid.geometry, np.minimum(cells * grid.geometry.resolution, FARTHEST))
 
