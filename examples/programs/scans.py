@@ -20,7 +20,7 @@ from holdfast.console.demo.grid import Geometry, OccupancyGrid
 Floats = NDArray[np.float64]
 
 FARTHEST = 1.0  # metres: from there on it does not matter how far away the next wall is
-TOLERANCE = 0.05  # metres: end points farther than this from a wall pull less and less, as what has moved should
+TOLERANCE = 0.1  # metres: end points farther than this from a wall pull less and less, as what has moved should
 
 
 def place(points: Floats, pose: Floats) -> Floats:
@@ -75,11 +75,18 @@ class LikelihoodField:
         columns, rows = (points - (self.geometry.x0, self.geometry.y0)).T / self.geometry.resolution - 0.5
         return map_coordinates(self.distances, (rows, columns), order=1, mode="constant", cval=FARTHEST)
 
-    def match(self, points: Floats, guess: Floats) -> Floats:
-        """The pose near `guess` from which the end points of a scan fit the map best."""
+    def match(self, points: Floats, guess: Floats, *, trust: float = 0.0) -> Floats:
+        """The pose near `guess` from which the end points of a scan fit the map best.
+
+        Args:
+            points: where the beams end, seen from the laser; shape (n, 2).
+            guess: a pose to begin the search at.
+            trust: how many times a metre (or radian) away from the guess is as bad as one of a beam from a wall. In a long
+                corridor nothing but the guess says how far along the robot is.
+        """
 
         def misfit(pose: Floats) -> Floats:
-            return self.at(place(points, pose))
+            return np.concatenate([self.at(place(points, pose)), trust * (pose - guess)])
 
         found = least_squares(misfit, guess, loss="cauchy", f_scale=TOLERANCE, diff_step=1e-3, max_nfev=15)
         return np.array([found.x[0], found.x[1], wrap(found.x[2])])
