@@ -33,6 +33,7 @@ import asyncio
 import gzip
 import signal
 import time
+import zipfile
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Iterator
@@ -237,7 +238,7 @@ def reading(path: Path) -> Iterator[None]:
     """
     try:
         yield
-    except (OSError, EOFError, ValueError, zlib.error) as error:
+    except (OSError, EOFError, ValueError, zlib.error, zipfile.BadZipFile) as error:
         raise DamagedData(f"{path}: {error}") from error
 
 
