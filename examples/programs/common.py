@@ -14,30 +14,25 @@ Each runs alone:
 
     python examples/programs/mapping.py --method fresh --kill-at 9s --kill-at 300
 
-Data: the folder `HOLDFAST_DATA`, else `../shared/data` beside the checkout; the Killian Court log comes with `rtb-data`.
+Data: the folder `HOLDFAST_DATA`, else `../shared/data` beside the checkout; the Killian Court log is in `rtb-data`.
 
 Source: Zou and Bai, *Effective Crash Recovery of Robot Software Programs in ROS*, section IV.
 """
 
 from __future__ import annotations
 
-import os
-
-# One thread for linear algebra, or sums are rounded in another order in another run. Said before numpy is loaded;
-# processes of actors have it anyway.
-for _library in ("OMP", "OPENBLAS", "MKL"):
-    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
-
 import argparse
 import asyncio
 import gzip
+import os
 import signal
+import sys
 import time
 import zipfile
 import zlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Generator, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -46,7 +41,7 @@ import holdfast as hf
 from holdfast.actors.values import encode_value, state_digest
 from holdfast.checkpoint.method import Method
 
-DATA = Path(os.environ.get("HOLDFAST_DATA", Path(__file__).parents[2] / "../shared/data"))
+DATA = Path(os.environ.get("HOLDFAST_DATA", Path(__file__).resolve().parents[3] / "shared/data"))
 PATIENCE = 60.0  # seconds for one answer, a recovery included
 
 Isolation = Literal["task", "process"]
@@ -83,17 +78,17 @@ class Program(ABC):
 
     name: ClassVar[str]
 
+    @abstractmethod
     def __init__(self, data: Path = DATA, limit: int | None = None) -> None:
         """Read the data.
 
         Args:
             data: the folder with the files.
-            limit: the most messages that the feed gives; None for all.
+            limit: the most messages that the feed gives, at least 2; None for all.
 
         Raises:
             MissingData, DamagedData: naming the file.
         """
-        self.data, self.limit = data, limit
 
     @abstractmethod
     def start(self) -> hf.Start[Any]:
@@ -144,7 +139,8 @@ async def run(
         method: how it is recovered; None: `hybrid` with a snapshot every 2 s, as in the paper.
         kill_at: when the actor's process gets SIGKILL, each time with a message on its way: the number of that message,
             from 1, as an int, or seconds of the recording as a float.
-        isolation: "task" runs the actor in this process, where it cannot be killed.
+        isolation: "task" runs the actor in this process, where it cannot be killed. Set OMP_NUM_THREADS=1 before it
+            starts, as processes of actors have it: with more threads sums may be rounded otherwise.
         speed: a multiple of the pace of the recording; 0: each message as soon as the one before is answered.
 
     Raises:
@@ -207,7 +203,8 @@ class _Drive:
         answer = self._ref.ask(message, timeout=PATIENCE)
         if kill:
             await asyncio.sleep(0)  # The message leaves for the process.
-            os.kill(self._system.pid_of(self._ref), signal.SIGKILL)
+            with suppress(hf.NoSuchActor, ProcessLookupError):  # It is still dead from the time before.
+                os.kill(self._system.pid_of(self._ref), signal.SIGKILL)
         try:
             return await answer
         except hf.AskFailed:  # Without recovery the message in its turn is gone.
@@ -230,7 +227,7 @@ def find_file(data: Path, name: str) -> Path:
 
 
 @contextmanager
-def reading(path: Path) -> Iterator[None]:
+def reading(path: Path) -> Generator[None]:
     """Report whatever goes wrong while a file is read as damage of that file.
 
     Raises:
@@ -250,7 +247,7 @@ def read_numbers(path: Path, *, columns: int) -> Iterator[list[float]]:
     """
     number = 0
     with reading(path), gzip.open(path, "rt") if path.suffix == ".gz" else path.open() as lines:
-        for number, line in enumerate(lines, start=1):  # noqa: B007
+        for number, line in enumerate(lines, start=1):
             fields = line.split()
             if fields and len(fields) != columns:
                 raise ValueError(f"line {number} has {len(fields)} fields, expected {columns}")
@@ -270,14 +267,22 @@ def main(kind: Callable[[Path, int | None], Program]) -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--limit", type=int, metavar="N", help="only the first N messages")
     parser.add_argument("--method", choices=("hybrid", "fresh"), default="hybrid")
-    parser.add_argument("--kill-at", action="append", type=_moment, default=[], metavar="N|SECONDS", help="as 300, or as 9s")
-    parser.add_argument("--speed", type=float, default=0.0, metavar="X", help="times the recording's pace; 0: full speed")
+    parser.add_argument(
+        "--kill-at", action="append", type=_moment, default=[], metavar="N|SECONDS", help="as 300, or as 9s"
+    )
+    parser.add_argument(
+        "--speed", type=float, default=0.0, metavar="X", help="times the recording's pace; 0: full speed"
+    )
     options = parser.parse_args()
+    if options.limit is not None and options.limit < 2:
+        parser.error("--limit: two messages at least")
     try:
         program = kind(DATA, options.limit)
     except MissingData as error:
         print(f"skipped: {error}")
         return
+    except DamagedData as error:
+        sys.exit(str(error))
     method = hf.hybrid(interval=2.0) if options.method == "hybrid" else hf.fresh()
     result = hf.run(run(program, method, kill_at=options.kill_at, speed=options.speed))
     print(f"{program.name}: {'correct' if result.verdict.correct else 'NOT correct'}: {result.verdict.figures}")

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from common import DATA, Feed, Program, Timed, Verdict, find_file, main, read_numbers
+from common import DATA, DamagedData, Feed, Program, Timed, Verdict, find_file, main, read_numbers
 from scans import Floats, LikelihoodField, between, compose, end_points, place
 
 import holdfast as hf
@@ -69,6 +69,8 @@ class Mapping(Program):
     def __init__(self, data: Path = DATA, limit: int | None = None) -> None:
         rows = islice(read_numbers(find_file(data, FILE), columns=COLUMNS), limit)
         self.scans = [(row[0] / 1e6, np.array(row[FIRST_RANGE : FIRST_RANGE + BEAMS], "<f4") / 1000) for row in rows]
+        if not self.scans:
+            raise DamagedData(f"{data / FILE}: no scan in it")
 
     def start(self) -> hf.Start[Any]:
         return hf.start(Mapper)
@@ -86,7 +88,9 @@ class Mapping(Program):
         ]
         fit = float(np.mean(fits)) if fits else 0.0
         known = int(np.count_nonzero(grid.cells)) * MAP.resolution**2
-        figures = f"{len(trail)} of {len(self.scans)} scans, {100 * fit:.1f} % of what they saw on walls, {known:.0f} m2"
+        figures = (
+            f"{len(trail)} of {len(self.scans)} scans, {100 * fit:.1f} % of what they saw on walls, {known:.0f} m2"
+        )
         return Verdict(len(trail) == len(self.scans) and fit > 0.85, figures)
 
 

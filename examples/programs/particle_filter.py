@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from common import DATA, Feed, Program, Timed, Verdict, main
 from planning import Roads
-from scans import Floats, LikelihoodField, compose, place, wrap
+from scans import Floats, LikelihoodField, compose
 from willow import LASER_RANGE, PERIOD, Robot, bearings_of_beams, read_map, steer
 
 import holdfast as hf
@@ -100,7 +100,9 @@ class ParticleFilter(hf.Actor):
         """Beams that would end far from any wall speak against a guess."""
         seen = np.flatnonzero(ranges[::EVERY] < LASER_RANGE) * EVERY
         bearings = self.particles[:, 2:] + bearings_of_beams()[seen]
-        ends = self.particles[:, None, :2] + ranges[seen, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=-1)
+        ends = self.particles[:, None, :2] + ranges[seen, None] * np.stack(
+            [np.cos(bearings), np.sin(bearings)], axis=-1
+        )
         distances = self._field.at(ends.reshape(-1, 2)).reshape(PARTICLES, -1)
         fits = 0.9 * np.exp(-0.5 * (distances / HIT_WIDTH) ** 2) + 0.1
         self.log_weights += CAUTION * np.log(fits).sum(axis=1)
@@ -127,8 +129,7 @@ class Localisation(Program):
     name = "particle_filter"
 
     def __init__(self, data: Path = DATA, limit: int | None = None) -> None:
-        self.grid, self.limit = read_map(data), MOST_MESSAGES if limit is None else limit
-        self.is_cut = limit is not None
+        self.grid, self.limit = read_map(data), limit
         self.robot = Robot(self.grid, START)
         self.way = Roads(self.grid).way(START[:2], GOAL)
         self.errors: list[float] = []  # metres, one for each answer
@@ -140,7 +141,7 @@ class Localisation(Program):
         yield Timed(0.0, Start(*START))
         random = np.random.default_rng(2)
         believed, way = np.array(START), self.way
-        for number in range(1, self.limit):
+        for number in range(1, self.limit or MOST_MESSAGES):
             way = _left_of(way, believed)
             step = self.robot.drive(*steer(believed, (float(way[0, 0]), float(way[0, 1]))))
             step = step + ODOMETRY_NOISE * random.standard_normal(3) * (np.abs(step).sum() > 0)
@@ -160,7 +161,7 @@ class Localisation(Program):
         worst = max(self.errors)
         end = "hit a wall" if hit else "at the goal" if there else "not at the goal"
         figures = f"{end} after {self.robot.travelled:.0f} m; error {np.mean(self.errors):.2f} m, at most {worst:.2f} m"
-        return Verdict(worst < GOOD and not hit and (there or self.is_cut), figures)
+        return Verdict(worst < GOOD and not hit and (there or self.limit is not None), figures)
 
 
 def _left_of(way: Floats, pose: Floats) -> Floats:

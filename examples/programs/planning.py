@@ -24,14 +24,22 @@ from holdfast.console.demo.grid import OccupancyGrid
 Place = tuple[float, float]
 
 START = (27.0, 4.0, 1.1)
-GOALS: tuple[Place, ...] = ((31.0, 13.0), (37.0, 17.0), (24.0, 18.5), (16.0, 15.0), (18.0, 37.0), (30.0, 53.0), (50.0, 44.0))
+GOALS: tuple[Place, ...] = (
+    (31.0, 13.0),
+    (37.0, 17.0),
+    (24.0, 18.5),
+    (16.0, 15.0),
+    (18.0, 37.0),
+    (30.0, 53.0),
+    (50.0, 44.0),
+)
 ARRIVED = 0.2  # metres from the goal
 PATIENCE = 25  # messages: the robot gives up when it has stood still for so long
 
 SPACING = 2  # cells between the places that a way may lead over
 ROBOT_RADIUS = 0.35  # metres
 COMFORT = 0.3  # metres: a way so much farther from a wall costs a third of what it adds
-REPLAN = 5  # positions between one plan and the next
+REPLAN = 2  # positions between one plan and the next
 LOOK_AHEAD = 0.6  # metres
 
 
@@ -64,7 +72,7 @@ class Planner(hf.Actor):
     def __init__(self, grid: OccupancyGrid) -> None:
         self._roads = Roads(grid)
         self.goal: Place | None = None
-        self.way = np.zeros((0, 2))  # what is left of it; shape (n, 2)
+        self.way: Floats = np.zeros((0, 2))  # what is left of it; shape (n, 2)
         self.heard = 0
         self.arrivals: list[Place] = []
 
@@ -111,7 +119,7 @@ class Roads:
         return bool(self._number[self._cell(place)] >= 0)
 
     def way(self, start: Place, goal: Place) -> Floats:
-        """The cheapest way as points, shape (n, 2); the last is the goal itself, and the only one if there is no way."""
+        """The cheapest way as points, shape (n, 2); the last is the goal, and the only one if there is no way."""
         _, towards = dijkstra(self._graph, indices=self._nearest(goal), return_predecessors=True)
         at, way = self._nearest(start), list[Floats]()
         while (at := int(towards[at])) >= 0:

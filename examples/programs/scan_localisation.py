@@ -44,7 +44,7 @@ class Estimate(hf.Message):
 
 
 class Moved(hf.Message[Estimate]):
-    """The robot went a step (seen from before it), and saw this; `ends` are float32 pairs, metres, seen from the laser."""
+    """The robot went a step (seen from before it); where beams end, seen from the laser: float32 pairs, metres."""
 
     forward: float
     left: float
@@ -57,7 +57,7 @@ class Localiser(hf.Actor):
 
     def __init__(self, grid: OccupancyGrid) -> None:
         self._field = LikelihoodField.of(grid)
-        self.pose = np.zeros(3)
+        self.pose: Floats = np.zeros(3)
         self.matched = 0
 
     @hf.on(Start)

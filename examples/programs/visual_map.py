@@ -1,7 +1,7 @@
-"""A map from photos that closes loops, as RTAB-Map makes it: it knows a place again by its features, and bends the way.
+"""A map from photos that closes loops, as RTAB-Map makes it: it knows a place again, and bends the way.
 
-Data: 84 photos of two laps through a corridor (rtabmap_samples.zip). They have no odometry: the steps are those of two laps
-of a circle, with a drift to one side.
+Data: 84 photos of two laps through corridors (rtabmap_samples.zip). They have no odometry: the steps are those of two
+laps of a circle, with a drift to one side.
 Correct: all photos are in the map, most of what was seen twice is known again, and the way is where it was.
 Command: python examples/programs/visual_map.py [--limit N] [--method fresh] [--kill-at 60s]
 """
@@ -40,7 +40,7 @@ Words = NDArray[np.uint8]  # ORB descriptors, shape (n, 32)
 
 
 class Photo(hf.Message[int]):
-    """A photo (JPEG), and the step that the robot went since the one before. The reply: the photo it knows again, or -1."""
+    """A photo (JPEG), and the step since the one before. The reply: the photo of the same place, or -1."""
 
     jpeg: bytes
     east: float
@@ -57,7 +57,7 @@ class VisualMap(hf.Actor):
         self.contents: list[NDArray[np.int64]] = []  # words in each photo, each once, rising
         self.steps: list[tuple[float, float]] = []
         self.loops: list[tuple[int, int]] = []  # later and earlier photo of one place
-        self.positions = np.zeros((0, 2))
+        self.positions: Floats = np.zeros((0, 2))
 
     @hf.on(Photo)
     def add(self, photo: Photo) -> int:
@@ -112,9 +112,9 @@ def _matcher(*, mutual: bool = False) -> cv2.BFMatcher:
 def _features(jpeg: bytes) -> tuple[NDArray[np.float32], Words]:
     """Corners and their descriptors; a blank wall has none."""
     grey = cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_GRAYSCALE)
-    found, descriptors = cv2.ORB_create(FEATURES).detectAndCompute(grey, None)
+    found, descriptors = cv2.ORB.create(FEATURES).detectAndCompute(np.asarray(grey), np.zeros(0))
     corners = np.array([corner.pt for corner in found], np.float32).reshape(-1, 2)
-    return corners, np.zeros((0, 32), np.uint8) if descriptors is None else descriptors
+    return corners, np.array([] if descriptors is None else descriptors, np.uint8).reshape(-1, 32)
 
 
 def _inliers(corners: NDArray[np.float32], words: Words, old_corners: NDArray[np.float32], old_words: Words) -> int:
@@ -132,10 +132,10 @@ def _inliers(corners: NDArray[np.float32], words: Words, old_corners: NDArray[np
 def solve(steps: list[tuple[float, float]], loops: list[tuple[int, int]]) -> Floats:
     """Where the photos were taken, shape (n, 2): steps as measured and loops closed, in the sense of least squares.
 
-    >>> solve([(0, 0), (1, 0), (-1, 0.3)], []).round(3).tolist()
-    [[0.0, 0.0], [1.0, 0.0], [0.0, 0.3]]
-    >>> solve([(0, 0), (1, 0), (-1, 0.3)], [(2, 0)]).round(3).tolist()
-    [[0.0, 0.0], [1.0, -0.147], [0.0, 0.006]]
+    >>> np.round(solve([(0, 0), (1, 0), (-1, 0.3)], []) + 1, 3).tolist()
+    [[1.0, 1.0], [2.0, 1.0], [1.0, 1.3]]
+    >>> np.round(solve([(0, 0), (1, 0), (-1, 0.3)], [(2, 0)]) + 1, 3).tolist()
+    [[1.0, 1.0], [2.0, 0.853], [1.0, 1.006]]
     """
     size = len(steps)
     rows = np.eye(size) - np.eye(size, k=-1)  # Each position less the one before; the first less nothing.
@@ -181,6 +181,8 @@ class Mapping(Program):
 def _read_photos(path: Path) -> list[bytes]:
     with reading(path), zipfile.ZipFile(path) as archive:
         photos = [archive.read(name) for name in sorted(archive.namelist())]
+    if not photos:
+        raise DamagedData(f"{path}: no photo in it")
     for number, photo in enumerate(photos, start=1):
         if cv2.imdecode(np.frombuffer(photo, np.uint8), cv2.IMREAD_GRAYSCALE) is None:
             raise DamagedData(f"{path}: photo {number} cannot be decoded")

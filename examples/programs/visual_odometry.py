@@ -20,7 +20,11 @@ from scipy.spatial.transform import Rotation
 
 import holdfast as hf
 
-TRACKS, CALIBRATION, REFERENCE = "kitti00_stereo_tracks.txt.gz", "kitti00_calibration.txt", "kitti00_reference_poses.txt"
+TRACKS, CALIBRATION, REFERENCE = (
+    "kitti00_stereo_tracks.txt.gz",
+    "kitti00_calibration.txt",
+    "kitti00_reference_poses.txt",
+)
 PERIOD = 0.1  # seconds from frame to frame
 LEAST_DISPARITY = 4.0  # pixels: what is farther has no depth to speak of
 LEAST_POINTS = 10  # known ones, to find the camera by
@@ -47,7 +51,8 @@ class Camera:
         depth = self.focal[0] * self.baseline / (pixels[:, 0] - pixels[:, 1])
         x = (pixels[:, 0] - self.middle[0]) * depth / self.focal[0]
         y = (pixels[:, 2] - self.middle[1]) * depth / self.focal[1]
-        return Rotation.from_rotvec(pose[:3]).apply(np.column_stack([x, y, depth])) + pose[3:]
+        turned: Floats = Rotation.from_rotvec(pose[:3]).apply(np.column_stack([x, y, depth]))
+        return turned + pose[3:]
 
     def project(self, points: Floats, pose: Floats) -> Floats:
         """The pixels where points of the world are seen, shape (n, 3)."""
@@ -63,11 +68,12 @@ class Camera:
         def misfit(pose: Floats) -> Floats:
             return (self.project(points, pose) - pixels).ravel()
 
-        return least_squares(misfit, guess, loss="cauchy", f_scale=OUTLIER, max_nfev=20).x
+        found: Floats = least_squares(misfit, guess, loss="cauchy", f_scale=OUTLIER, max_nfev=20).x
+        return found
 
 
 class Frame(hf.Message[int]):
-    """Features of one pair of pictures: numbers of their landmarks (int64), and (left x, right x, y) in pixels (float64)."""
+    """Features of a pair of pictures: numbers of their landmarks (int64), (left x, right x, y) in pixels (float64)."""
 
     landmarks: bytes
     pixels: bytes
@@ -78,11 +84,11 @@ class VisualOdometry(hf.Actor):
 
     def __init__(self, camera: Camera) -> None:
         self._camera = camera
-        self.pose = np.zeros(6)  # of the camera in the world: rotation vector, position
-        self.step = np.zeros(6)  # the last one, added to the pose to guess the next
+        self.pose: Floats = np.zeros(6)  # of the camera in the world: rotation vector, position
+        self.step: Floats = np.zeros(6)  # the last one, added to the pose to guess the next
         self.trail: list[Floats] = []
         self.numbers = np.zeros(0, np.int64)
-        self.points = np.zeros((0, 3))
+        self.points: Floats = np.zeros((0, 3))
         self.sightings = np.zeros(0, np.int64)
 
     @hf.on(Frame)

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from common import find_file, reading
 from numpy.typing import NDArray
-from scans import Floats, LikelihoodField, compose, place
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scans import Floats, LikelihoodField, compose, distances, place
+from scipy.ndimage import maximum_filter
 
 from holdfast.console.demo.grid import Geometry, OccupancyGrid
 
@@ -34,14 +34,16 @@ def read_map(data: Path) -> OccupancyGrid:
     path = find_file(data, FILE)
     with reading(path):
         grey = _read_grey(gzip.decompress(path.read_bytes()))
+        if (grey < FREE).all():
+            raise ValueError("no cell of it is free")
     free = grey[::-1] >= FREE  # The picture begins in the north, the map in the south.
-    edge = binary_dilation(free, np.ones((3, 3))) & ~free
+    edge = (maximum_filter(free, size=3) != 0) & ~free
     return OccupancyGrid(Geometry(RESOLUTION, 0.0, 0.0, *free.T.shape), edge.astype(np.int8) - free.astype(np.int8))
 
 
 def room_of(grid: OccupancyGrid) -> LikelihoodField:
     """How far each place is from what is not free."""
-    return LikelihoodField(grid.geometry, distance_transform_edt(grid.cells < 0) * grid.geometry.resolution)
+    return LikelihoodField(grid.geometry, distances(grid.cells < 0, grid))
 
 
 def _read_grey(pgm: bytes) -> NDArray[np.uint8]:
