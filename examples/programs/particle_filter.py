@@ -125,7 +125,7 @@ def draw(weights: Floats, offset: float) -> np.ndarray:
     return np.minimum(np.searchsorted(np.cumsum(weights), ticks), len(weights) - 1)
 
 
-class Localisation(Program):
+class ParticleLocalisation(Program):
     name = "particle_filter"
 
     def __init__(self, data: Path = DATA, limit: int | None = None) -> None:
@@ -171,4 +171,4 @@ def _left_of(way: Floats, pose: Floats) -> Floats:
 
 
 if __name__ == "__main__":
-    main(Localisation)
+    main(ParticleLocalisation)

@@ -67,14 +67,14 @@ class Position(hf.Message[Drive]):
 
 
 class Planner(hf.Actor):
-    """Holds the goal and the way there. The map is given to every life anew."""
+    """Holds the goal and the way there, and where the robot has been. The map is given to every life anew."""
 
     def __init__(self, grid: OccupancyGrid) -> None:
         self._roads = Roads(grid)
         self.goal: Place | None = None
         self.way: Floats = np.zeros((0, 2))  # what is left of it; shape (n, 2)
         self.heard = 0
-        self.arrivals: list[Place] = []
+        self.trail: list[Place] = []
 
     @hf.on(Goal)
     def take_goal(self, goal: Goal) -> bool:
@@ -84,10 +84,10 @@ class Planner(hf.Actor):
 
     @hf.on(Position)
     def drive(self, here: Position) -> Drive:
+        self.trail.append((here.x, here.y))
         if self.goal is None:
             return Drive(0.0, 0.0)
         if np.hypot(here.x - self.goal[0], here.y - self.goal[1]) < ARRIVED:
-            self.arrivals.append(self.goal)
             self.goal = None
             return Drive(0.0, 0.0, arrived=True)
         if self.heard % REPLAN == 0:

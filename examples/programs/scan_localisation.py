@@ -53,12 +53,12 @@ class Moved(hf.Message[Estimate]):
 
 
 class Localiser(hf.Actor):
-    """Holds where the robot is. The map is given to every life anew."""
+    """Holds where the robot is and was. The map is given to every life anew."""
 
     def __init__(self, grid: OccupancyGrid) -> None:
         self._field = LikelihoodField.of(grid)
         self.pose: Floats = np.zeros(3)
-        self.matched = 0
+        self.trail: list[Floats] = []
 
     @hf.on(Start)
     def begin(self, start: Start) -> None:
@@ -70,12 +70,12 @@ class Localiser(hf.Actor):
         self.pose = compose(self.pose, np.array([moved.forward, moved.left, moved.turned]))
         if len(ends):
             self.pose = self._field.match(ends, self.pose, trust=TRUST)
-            self.matched += 1
+        self.trail.append(self.pose)
         x, y, heading = self.pose.tolist()
         return Estimate(x, y, heading)
 
 
-class Localisation(Program):
+class ScanLocalisation(Program):
     name = "scan_localisation"
 
     def __init__(self, data: Path = DATA, limit: int | None = None) -> None:
@@ -139,4 +139,4 @@ def _ends(scan: LaserScan) -> Floats:
 
 
 if __name__ == "__main__":
-    main(Localisation)
+    main(ScanLocalisation)

@@ -147,7 +147,7 @@ def solve(steps: list[tuple[float, float]], loops: list[tuple[int, int]]) -> Flo
     return found
 
 
-class Mapping(Program):
+class VisualMapping(Program):
     name = "visual_map"
 
     def __init__(self, data: Path = DATA, limit: int | None = None) -> None:
@@ -190,4 +190,4 @@ def _read_photos(path: Path) -> list[bytes]:
 
 
 if __name__ == "__main__":
-    main(Mapping)
+    main(VisualMapping)

@@ -14,10 +14,10 @@ import sys
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
-from typing import cast
 
 import pytest
 from common import DATA, DamagedData, MissingData, Program, run
+from programs import PROGRAMS
 
 import holdfast as hf
 
@@ -26,15 +26,14 @@ FOLDER = Path(__file__).parents[2] / "examples/programs"
 
 @dataclass(frozen=True)
 class Case:
-    """A program, how many messages of it are enough, and after which ones it is killed."""
+    """A program, how many messages of it are enough, and at which ones it is killed."""
 
-    module: str
-    kind: str
+    name: str
     limit: int
     kills: tuple[int, int]
 
     def load(self, data: Path = DATA) -> Program:
-        return cast("Program", getattr(importlib.import_module(self.module), self.kind)(data, self.limit))
+        return PROGRAMS[self.name](data, self.limit)
 
     def load_or_skip(self) -> Program:
         try:
@@ -44,12 +43,15 @@ class Case:
 
 
 CASES = {
-    "mapping": Case("mapping", "Mapping", 100, (40, 70)),
-    "visual_map": Case("visual_map", "Mapping", 56, (30, 50)),
-    "visual_odometry": Case("visual_odometry", "Odometry", 30, (15, 25)),
-    "planning": Case("planning", "Planning", 250, (100, 200)),
-    "particle_filter": Case("particle_filter", "Localisation", 120, (50, 90)),
-    "scan_localisation": Case("scan_localisation", "Localisation", 150, (60, 120)),
+    case.name: case
+    for case in (
+        Case("mapping", 100, (40, 70)),
+        Case("visual_map", 56, (30, 50)),
+        Case("visual_odometry", 30, (15, 25)),
+        Case("planning", 250, (100, 200)),
+        Case("particle_filter", 120, (50, 90)),
+        Case("scan_localisation", 150, (60, 120)),
+    )
 }
 each_program = pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 
