@@ -12,8 +12,9 @@ BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py exa
 demo: $(VENV)/.demo
 	$(BIN)/holdfast demo
 
+# The tests of one file stay in one process.
 test: $(VENV)/.dev
-	$(BIN)/python -m pytest -q $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(PYTEST_ARGS)
 
 # The static part of `check`, cheapest first.
 lint: $(VENV)/.dev .link/holdfast
