@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from ..actors.cell import Cell
-from ..actors.errors import NoSuchActor, StartFailed
+from ..actors.errors import HoldfastError, NoSuchActor, StartFailed
 from ..actors.exits import ExitReason
-from ..actors.mail import Item
+from ..actors.mail import Item, ReplyHandle
 from .admin import ChildInfo
 from .spec import ChildSpec
 
@@ -74,6 +75,20 @@ class Row:
 
     waiting: deque[Child]
     reason: ExitReason  # of the end for which they are started again
+    asked: Asked | None = None  # it is a first start, of one child
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class Asked:
+    """Who waits for a start that takes longer than the turn in which it was asked for."""
+
+    handle: ReplyHandle[Any]
+    undo: Callable[[], None]  # what follows if it fails
+
+    def failed(self, error: HoldfastError) -> None:
+        """It has not come up: the answer is an error, and it is not tried again."""
+        self.undo()
+        self.handle.fail(error)
 
 
 class Retry(Item):

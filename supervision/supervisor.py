@@ -9,11 +9,11 @@ from __future__ import annotations
 import asyncio
 import functools
 from collections import deque
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import Any, ClassVar
 
 from ..actors import lives
-from ..actors.actor import Actor, on
+from ..actors.actor import on
 from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
@@ -22,36 +22,29 @@ from ..actors.mail import Item, ReplyHandle
 from .admin import (
     AlreadyPresent,
     AlreadyStarted,
-    Boxed,
     ChangeSupervisor,
     ChildBusy,
-    ChildCounts,
-    ChildInfo,
-    CountChildren,
     DeleteChild,
-    GetChildSpec,
-    NoSuchChild,
     RestartChild,
     StartChild,
     TerminateChild,
-    WhichChildren,
     opened,
 )
 from .change import check_place, new_plan, succession
-from .children import RECOVERING, RESTARTING, STOPPED, UP, Child, Retry, Row, StartOver, new_cell
+from .children import RECOVERING, RESTARTING, STOPPED, UP, Asked, Child, Retry, Row, StartOver, new_cell
 from .decisions import affected, decide, is_reported
+from .inquiries import Inquiries
 from .intensity import admit_restart
 from .spec import ChildSpec, Flags, Plan, check_spec
 
 
-class Supervisor(Actor):
+class Supervisor(Inquiries):
     """Keeps its children alive. Built by `supervisor(...)`, or derived from, with an `init` that returns a `Plan`."""
 
     _supervises: ClassVar[bool] = True
     _is_dynamic: ClassVar[bool] = False
 
     _flags: Flags
-    _children: dict[str, Child]
     _restarts: tuple[float, ...]
 
     def __init__(self, flags: Flags | None = None, children: tuple[ChildSpec, ...] = ()) -> None:
@@ -290,12 +283,18 @@ class Supervisor(Actor):
                     up.add_done_callback(functools.partial(self._started, one))
                     return
                 self._is_up(one)
+            if row.asked is not None:
+                row.asked.handle.reply(one.cell.ref if one.state == UP and one.cell is not None else None)
 
     def _started(self, one: Child, up: asyncio.Future[None]) -> None:
         self._post(StartOver(one, up))
 
     def _attempt_failed(self, one: Child, error: HoldfastError, row: Row) -> None:
         """A child of the row did not start: the others are stopped, or stay up, until it is tried again."""
+        if row.asked is not None:
+            self._start_failed(one, error)
+            row.asked.failed(error)
+            return
         for other in row.waiting:
             if other.row is row:
                 other.state, other.row = STOPPED, None
@@ -326,6 +325,8 @@ class Supervisor(Actor):
             return None
         else:
             self._is_up(one)
+        if row.asked is not None:
+            row.asked.handle.reply(cell.ref if one.state == UP else None)
         self._go_on(row)
         if one.state != UP or cell.state is not DOWN:
             return None
@@ -340,6 +341,7 @@ class Supervisor(Actor):
         """Stop a child as its spec says; its address and queue stay."""
         cell = one.cell
         one.retry += 1
+        self._no_answer(one)
         one.state, one.row = STOPPED, None
         starting, one.up = one.up, None
         if cell is None or cell.state is GONE:
@@ -350,10 +352,17 @@ class Supervisor(Actor):
         elif starting is not None:
             cell.kill()
 
+    def _no_answer(self, one: Child) -> None:
+        """The child is stopped while somebody waits for its first start."""
+        if one.row is not None and one.row.asked is not None:
+            one.row.asked.handle.fail(StartFailed(self._path_of(one), "it was stopped while it started"))
+
     async def _stop_children(self) -> None:
         """We end: the children go in reverse start order, which need not be the order in which their addresses came."""
         below = list((self.ctx.cell.children or {}).values())
         children: dict[str, Child] = self.__dict__.get("_children", {})
+        for one in children.values():
+            self._no_answer(one)
         living = set(below)
         ours = [one.cell for one in children.values() if one.cell is not None and one.cell in living]
         places = set(ours)
@@ -376,12 +385,24 @@ class Supervisor(Actor):
             if message.fresh:
                 self._erase(one)
             self._enlist(one)
+            if spec.recovery is not None:
+                return self._start_meanwhile(one, lambda: self._unlist(one))
             return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:
-            self._forget(one)
-            if one.cell is not None:
-                lives.retire(one.cell, "it could not be started")
+            self._unlist(one)
             return self._fail(error)
+
+    def _unlist(self, one: Child) -> None:
+        """A child could not be started for the first time."""
+        self._forget(one)
+        if one.cell is not None:
+            lives.retire(one.cell, "it could not be started")
+
+    def _start_meanwhile(self, one: Child, undo: Callable[[], None]) -> ReplyHandle[Any]:
+        """Start a child that may have much to replay: others are answered meanwhile, the caller when it is up."""
+        handle = self.ctx.reply_handle()
+        self._start_row(Row(deque([one]), SHUTDOWN, Asked(handle, undo)))
+        return handle
 
     def _enlist(self, one: Child) -> None:
         """A child is to be started for the first time. Raises HoldfastError if that cannot be."""
@@ -425,6 +446,8 @@ class Supervisor(Actor):
         try:
             if message.fresh:
                 self._erase(one)
+            if one.spec.recovery is not None:
+                return self._start_meanwhile(one, lambda: self._give_up_address(one, "it could not be started"))
             return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:
             self._give_up_address(one, "it could not be started")
@@ -446,25 +469,6 @@ class Supervisor(Actor):
         self._forget(one)
         return None
 
-    @on(WhichChildren, readonly=True)
-    def _which_children(self, message: WhichChildren) -> list[ChildInfo]:
-        """What there is, in start order."""
-        return [one.info(self.ctx.path) for one in self._children.values()]
-
-    @on(CountChildren, readonly=True)
-    def _count_children(self, message: CountChildren) -> ChildCounts:
-        """How many there are."""
-        children = self._children.values()
-        supervisors = sum(one.spec.is_supervisor for one in children)
-        active = sum(one.is_running for one in children)
-        return ChildCounts(len(children), active, supervisors, len(children) - supervisors)
-
-    @on(GetChildSpec, readonly=True)
-    def _get_child_spec(self, message: GetChildSpec) -> Any:
-        """One child's spec."""
-        spec = self._child(message.id).spec
-        return spec if self.ctx.cell.node.uplink is None else Boxed(spec)
-
     @on(ChangeSupervisor)
     def _change(self, message: ChangeSupervisor) -> Any:
         """Take new flags and specs; nothing is started or stopped, and nothing changes if they are not valid."""
@@ -485,15 +489,3 @@ class Supervisor(Actor):
     def _specs(self) -> tuple[ChildSpec, ...]:
         """The specs as they are now."""
         return tuple(one.spec for one in self._children.values())
-
-    def _child(self, name: str) -> Child:
-        one = self._children.get(name)
-        if one is None:
-            raise NoSuchChild(name)
-        return one
-
-    def _fail(self, error: HoldfastError) -> ReplyHandle[Any]:
-        """Answer an admin call with an error: it is the caller's business, not our crash."""
-        handle = self.ctx.reply_handle()
-        handle.fail(error)
-        return handle

@@ -191,6 +191,17 @@ class Doer(hf.Actor):
         self.seen.append(f"down {recovering}")
 
 
+class Late(Doer):
+    """Its start takes until somebody lets it through."""
+
+    def __init__(self, path: str) -> None:
+        super().__init__()
+        self._path = path
+
+    async def on_start(self, restored: bool) -> None:
+        await gate(self._path)
+
+
 async def gate(path: str) -> None:
     """Say that we are here, and wait until somebody lets us through."""
     Path(path).touch()

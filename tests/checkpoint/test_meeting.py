@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.supervision.spec import Strategy
-from tests.checkpoint.players import Do, Doer, Note, Seen, until
+from tests.checkpoint.players import Do, Doer, Late, Note, Seen, until
 from tests.checkpoint.strikes import NEVER, event, let_through, sink
 from tests.checkpoint.trees import add, at, back, doing, end_process, running, seen, top, tree
 
@@ -244,14 +244,15 @@ async def test_each_attempt_counts_once_also_one_that_fails_inside_the_recovery(
         await system.start(tree(isolation, doing(isolation), intensity=3, period=60.0, restart="temporary"))
         await at(system).ask(Do([f"replayed {tmp_path / 'marker'}"]), timeout=20.0)
         restarted: list[int] = []
-        failed = 0
+        failed, gave_up = 0, False
         with system.events() as stream:
             at(system).kill()
-            async for one in stream:
+            async for one in stream:  # A supervisor in a process may be heard before the root tells of the recovery.
                 if isinstance(one, hf.ChildRestarted) and one.address == "/app/top/doer":
                     restarted.append(one.attempt)
                 failed += isinstance(one, hf.RecoveryFailed)
-                if isinstance(one, hf.SupervisorGaveUp):
+                gave_up = gave_up or isinstance(one, hf.SupervisorGaveUp)
+                if gave_up and failed >= 3:
                     break
         assert (restarted, failed) == ([1, 2, 3], 3)
 
@@ -274,6 +275,58 @@ async def test_the_supervisor_answers_while_a_child_is_recovered_and_later_sibli
         let_through(gate)
         assert await seen(system) == ["one"]
         assert await seen(system, "later") == []
+
+
+@pytest.mark.parametrize("how", ["start", "restart"])
+@pytest.mark.parametrize("end", ["up", "terminated", "supervisor stopped"])
+async def test_the_supervisor_answers_while_a_recorded_child_starts_by_order(
+    store: str | None, gate: Path, how: str, end: str
+) -> None:
+    late = hf.child("late", hf.start(Late, str(gate)), recovery=hf.hybrid(NEVER), shutdown=1.0)
+    async with running(store) as system:
+        await system.start(tree("task"))
+        asked = asyncio.ensure_future(top(system).ask(hf.StartChild(late), timeout=20.0))
+        await until(gate.exists)
+        if how == "restart":
+            let_through(gate)
+            await asked
+            await top(system).ask(hf.TerminateChild("late"), timeout=5.0)
+            Path(f"{gate}.open").unlink()
+            gate.unlink()
+            asked = asyncio.ensure_future(top(system).ask(hf.RestartChild("late"), timeout=20.0))
+            await until(gate.exists)
+        infos = await top(system).ask(hf.WhichChildren(), timeout=5.0)
+        assert [(one.id, one.state) for one in infos] == [("late", "recovering")]
+        again = await asyncio.gather(top(system).ask(hf.StartChild(late), timeout=5.0), return_exceptions=True)
+        assert isinstance(again[0], hf.AlreadyStarted)
+        assert not asked.done()
+        if end == "up":
+            let_through(gate)
+            assert (await asked).path == "/app/top/late"
+            assert await seen(system, "late") == []
+        elif end == "terminated":
+            await top(system).ask(hf.TerminateChild("late"), timeout=5.0)
+            with pytest.raises(hf.StartFailed, match="stopped while it started"):
+                await asked
+        else:
+            await system.stop(top(system))
+            with pytest.raises((hf.StartFailed, hf.ActorStopped)):
+                await asked
+
+
+async def test_a_recorded_child_that_cannot_start_by_order_leaves_nothing(store: str | None) -> None:
+    async with running(store) as system:
+        await system.start(tree("task"))
+        bad = hf.child("bad", hf.start(Unable), recovery=hf.hybrid(NEVER))
+        for _ in range(2):
+            with pytest.raises(hf.StartFailed, match="no such device"):
+                await top(system).ask(hf.StartChild(bad), timeout=20.0)
+            assert await top(system).ask(hf.WhichChildren(), timeout=5.0) == []
+
+
+class Unable(hf.Actor):
+    async def on_start(self, restored: bool) -> None:
+        raise OSError("no such device")
 
 
 # -- who hears of it --------------------------------------------------------------------------------------------------

@@ -1,0 +1,48 @@
+"""What a supervisor says of its children without doing anything to them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..actors.actor import Actor, on
+from ..actors.errors import HoldfastError
+from ..actors.mail import ReplyHandle
+from .admin import Boxed, ChildCounts, ChildInfo, CountChildren, GetChildSpec, NoSuchChild, WhichChildren
+from .children import Child
+
+
+class Inquiries(Actor):
+    """Base of supervisors: they have children, and answer what is asked about them."""
+
+    _children: dict[str, Child]
+
+    @on(WhichChildren, readonly=True)
+    def _which_children(self, message: WhichChildren) -> list[ChildInfo]:
+        """What there is, in start order."""
+        return [one.info(self.ctx.path) for one in self._children.values()]
+
+    @on(CountChildren, readonly=True)
+    def _count_children(self, message: CountChildren) -> ChildCounts:
+        """How many there are."""
+        children = self._children.values()
+        supervisors = sum(one.spec.is_supervisor for one in children)
+        active = sum(one.is_running for one in children)
+        return ChildCounts(len(children), active, supervisors, len(children) - supervisors)
+
+    @on(GetChildSpec, readonly=True)
+    def _get_child_spec(self, message: GetChildSpec) -> Any:
+        """One child's spec."""
+        spec = self._child(message.id).spec
+        return spec if self.ctx.cell.node.uplink is None else Boxed(spec)
+
+    def _child(self, name: str) -> Child:
+        one = self._children.get(name)
+        if one is None:
+            raise NoSuchChild(name)
+        return one
+
+    def _fail(self, error: HoldfastError) -> ReplyHandle[Any]:
+        """Answer an admin call with an error: it is the caller's business, not our crash."""
+        handle = self.ctx.reply_handle()
+        handle.fail(error)
+        return handle
