@@ -37,6 +37,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
+import psutil
+
 import holdfast as hf
 from holdfast.actors.values import encode_value, state_digest
 from holdfast.checkpoint.method import Method
@@ -110,8 +112,10 @@ class Result:
     Attributes:
         digest: of the actor's key variables at the end; equal only if every bit is.
         messages: given by the feed, of which `lost` were not answered.
-        seconds: from asking to answer, summed over all messages.
+        start_seconds: until the actor was up for the first time.
+        waits: seconds from asking to answer, of each message.
         state_bytes: size of the key variables in a snapshot.
+        memory: bytes of all processes at the end, what they share counted once (PSS).
         recoveries: reports of the recoveries, one per kill (none with `fresh`).
     """
 
@@ -119,9 +123,16 @@ class Result:
     verdict: Verdict
     messages: int
     lost: int
-    seconds: float
+    start_seconds: float
+    waits: tuple[float, ...]
     state_bytes: int
+    memory: int
     recoveries: tuple[hf.Recovered, ...]
+
+    @property
+    def seconds(self) -> float:
+        """From asking to answer, summed over all messages."""
+        return sum(self.waits)
 
 
 async def run(
@@ -131,6 +142,7 @@ async def run(
     kill_at: Collection[int | float] = (),
     isolation: Isolation = "process",
     speed: float = 0.0,
+    store: str | None = None,
 ) -> Result:
     """Run a program to the end of its feed.
 
@@ -142,19 +154,23 @@ async def run(
         isolation: "task" runs the actor in this process, where it cannot be killed. Set OMP_NUM_THREADS=1 before it
             starts, as processes of actors have it: with more threads sums may be rounded otherwise.
         speed: a multiple of the pace of the recording; 0: each message as soon as the one before is answered.
+        store: where journal and snapshots go; None: memory.
 
     Raises:
         ValueError: an actor without a process was to be killed.
     """
     if kill_at and isolation == "task":
         raise ValueError("only an actor in a process can be killed")
-    async with hf.ActorSystem("robot", log=False, intensity=len(kill_at) + 1) as system:
+    async with hf.ActorSystem("robot", store=store, log=False, intensity=len(kill_at) + 1) as system:
         recovery = hf.hybrid(interval=2.0) if method is None else method
+        began = time.perf_counter()
         ref = await system.start(hf.child("program", program.start(), isolation=isolation, recovery=recovery))
+        start_seconds = time.perf_counter() - began
         with system.events() as events:
             drive = _Drive(system, ref, kill_at, speed)
             await drive.through(program.feed())
             state = await system.get_state(ref, timeout=PATIENCE)
+            memory = resident_bytes()
             await system.node.settled()  # The last report of a recovery comes a little after it.
             recoveries = tuple(event for event in events.take() if isinstance(event, hf.Recovered))
     return Result(
@@ -162,8 +178,10 @@ async def run(
         verdict=program.judge(state),
         messages=drive.messages,
         lost=drive.lost,
-        seconds=drive.seconds,
+        start_seconds=start_seconds,
+        waits=tuple(drive.waits),
         state_bytes=len(encode_value(state)),
+        memory=memory,
         recoveries=recoveries,
     )
 
@@ -177,7 +195,8 @@ class _Drive:
         self._system, self._ref, self._speed = system, ref, speed
         self._kill_numbers = {moment for moment in kill_at if isinstance(moment, int)}
         self._kill_times = sorted(moment for moment in kill_at if isinstance(moment, float))
-        self.messages, self.lost, self.seconds = 0, 0, 0.0
+        self.messages, self.lost = 0, 0
+        self.waits: list[float] = []
 
     async def through(self, feed: Feed) -> None:
         began = time.perf_counter()
@@ -211,7 +230,13 @@ class _Drive:
             self.lost += 1
             return None
         finally:
-            self.seconds += time.perf_counter() - asked
+            self.waits.append(time.perf_counter() - asked)
+
+
+def resident_bytes() -> int:
+    """Memory of this process and all below it; what several share is counted once."""
+    own = psutil.Process()
+    return sum(one.memory_full_info().pss for one in (own, *own.children(recursive=True)))
 
 
 def find_file(data: Path, name: str) -> Path:
