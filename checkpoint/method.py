@@ -62,7 +62,9 @@ class Method:
         """
         for port in self.safe_state.to if self.safe_state is not None else ():
             if not port.startswith("/") and port not in kind._bindings:
-                raise SpecError(where, f"safe_state: {type_name(kind)} has no binding {port!r}; addresses begin with '/'")
+                raise SpecError(
+                    where, f"safe_state: {type_name(kind)} has no binding {port!r}; addresses begin with '/'"
+                )
         if self.records and not kind.deterministic:
             raise SpecError(where, f"{type_name(kind)} is not deterministic, so {self.name} cannot replay its messages")
 

@@ -4,5 +4,6 @@ from __future__ import annotations
 
 from .controller import RecoveryController
 from .part import Part
+from .switch import MessageSwitch
 
-PARTS: tuple[tuple[str, type[Part]], ...] = (("controller", RecoveryController),)
+PARTS: tuple[tuple[str, type[Part]], ...] = (("controller", RecoveryController), ("switch", MessageSwitch))

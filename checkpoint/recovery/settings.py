@@ -77,9 +77,7 @@ def as_safe_state(where: str, given: str | Sequence[str] | SafeState | None) -> 
         case list() | tuple():
             return safe_state(*given)
         case _:
-            raise SpecError(
-                where, f"safe_state must be an address, a list of them, or safe_state(...), not {given!r}"
-            )
+            raise SpecError(where, f"safe_state must be an address, a list of them, or safe_state(...), not {given!r}")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
