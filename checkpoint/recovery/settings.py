@@ -145,8 +145,8 @@ Hook = Callable[[RecoveryStep], Any]
 class RecoveryHooks:
     """What is called before and after phases of recoveries; made by `recovery_hooks`. (No data: it stays here.)"""
 
-    def __init__(self, before: Mapping[str, Hook], after: Mapping[str, Hook], timeout: float) -> None:
-        self._hooks = {
+    def __init__(self, before: Mapping[Phase, Hook], after: Mapping[Phase, Hook], timeout: float) -> None:
+        self._hooks: dict[tuple[str, str], Hook] = {
             **{("before", phase): hook for phase, hook in before.items()},
             **{("after", phase): hook for phase, hook in after.items()},
         }
@@ -185,7 +185,7 @@ def recovery_hooks(
             if not callable(hook):
                 raise SpecError("recovery_hooks", f"{which}[{phase!r}] must be a function, not {hook!r}")
     check_seconds("recovery_hooks", "timeout", timeout)
-    return RecoveryHooks(dict(before or {}), dict(after or {}), float(timeout))
+    return RecoveryHooks(before or {}, after or {}, float(timeout))
 
 
 def check_seconds(where: str, name: str, value: object) -> float:
