@@ -52,6 +52,7 @@ class Recovery:
         self.number, self.path, self.method, self.noticed = number, path, method, noticed
         self.attempt = 1
         self.has_crashed = False  # else it is only started with what it had
+        self.is_safe = False  # its receivers have been told in this attempt
         self.is_isolated = False  # a life of this attempt was to begin
         self.since = noticed  # when the phase at hand has begun
         self.stages: dict[str, bool] = {}  # of this attempt that were asked for: whether they are passed
@@ -124,7 +125,7 @@ class Recoveries:
 
     def _next_attempt(self, recovery: Recovery) -> None:
         recovery.attempt += 1
-        recovery.is_isolated = False
+        recovery.is_safe = recovery.is_isolated = False
         recovery.stages.clear()
         recovery.called.clear()
         waits, recovery.waits = recovery.waits, {}
@@ -259,9 +260,10 @@ class Recoveries:
         return here and recovery.stages.get(stage) is False
 
     def enter_safe_state(self, recovery: Recovery) -> None:
-        """S1. Only a crash is a reason for it."""
+        """S1, once in an attempt. Only a crash is a reason for it."""
         state = recovery.method.safe_state
-        if state is not None and recovery.has_crashed:
+        if state is not None and recovery.has_crashed and not recovery.is_safe:
+            recovery.is_safe = True
             self.safety.enter(recovery.path, state, recovery.method.safe_state_timeout)
             self.phase(recovery, "safe_state", time.monotonic())
 
