@@ -37,23 +37,53 @@ class TaskHost(HomeHost, lives.LocalHost):
     def __init__(self, homes: Homes, method: Method) -> None:
         super().__init__(homes, method)
         self.life: Life | None = None
+        self._starting: asyncio.Task[None] | None = None
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
         assert start is not None
         cell.table = start.kind._table
-        switch, live, recovering = self.open(cell)
+        switch, live, recovering = self.enter(cell)
+        if self.is_gated:
+            begun = self._step_by_step(cell, switch, live, recovering)
+        else:
+            self.isolated()
+            self._begin(cell, switch)
+            self._replay(cell, switch)
+            begun = self._follow(cell, live, recovering)
+        task = self._starting = cell.node.loop.create_task(begun, name=f"start of {cell.path}")
+        task.add_done_callback(seen)
+        return task
+
+    def _begin(self, cell: Cell, switch: Switch) -> None:
+        """S3, the new life with its state."""
+        start = cell.extra().start
+        assert start is not None
         life = self.life = Life(cell, LocalHome(self, cell), self.method.interval, None)
         for record in switch.restore_records():
             life.from_home(record)
         life.begin(start, switch.state_turn, switch.stash)
         assert self.clock is not None
         self.clock.mark("restart")
+
+    def _replay(self, cell: Cell, switch: Switch) -> None:
+        """S3, what it has handled since."""
+        start = cell.extra().start
+        assert start is not None
+        assert self.life is not None
         self.subscribe(cell, start.kind._topics)
-        switch.attach(LocalLife(life))
-        task = cell.node.loop.create_task(self._follow(cell, live, recovering), name=f"start of {cell.path}")
-        task.add_done_callback(seen)
-        return task
+        switch.attach(LocalLife(self.life))
+
+    async def _step_by_step(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
+        """A recovery on whose way others have something to do."""
+        await self.gate("restart")
+        if cell.state is not DOWN:
+            raise StartFailed(cell.path, "it was stopped while it started")
+        self._begin(cell, switch)
+        await self.gate("replay")
+        if not live.done():  # Else it has ended meanwhile.
+            self._replay(cell, switch)
+        await self._follow(cell, live, recovering)
 
     async def _follow(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
         try:
@@ -80,11 +110,19 @@ class TaskHost(HomeHost, lives.LocalHost):
         else:
             super().push(cell, item)
 
+    def kill(self, cell: Cell) -> None:
+        if cell.state is DOWN and self._starting is not None:
+            self._starting.cancel()
+        else:
+            super().kill(cell)
+
     def running(self, cell: Cell) -> int:
         feed = self.life.feed if self.life is not None else None
         return -1 if feed is None else feed.id
 
     def retired(self, cell: Cell) -> None:
+        if self._starting is not None and not self._starting.done():
+            self._starting.cancel()
         start = cell.extra().start
         self.give_up(cell, start.kind._topics if start is not None else (), restarting=parent_ended(cell))
 
@@ -133,13 +171,14 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         assert start is not None
         cell.table = start.kind._table
         # Now, not in the task: from here on what is sent is admitted by the home.
-        return self.begin(cell, self._recover(cell, *self.open(cell)))
+        return self.begin(cell, self._recover(cell, *self.enter(cell)))
 
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
         start = cell.extra().start
         assert start is not None
         clock = self.clock
         assert clock is not None
+        await self.gate("restart")
         worker, recipe = await self.take(cell)
         worker.record_taker = functools.partial(own_records, switch)
         self.subscribe(cell, start.kind._topics)
@@ -150,7 +189,9 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         try:
             await worker.launch(cell, recipe, options)
             clock.mark("restart")
-            switch.attach(port)
+            await self.gate("replay")
+            if not live.done():  # Else it has ended meanwhile.
+                switch.attach(port)
             await self.until_live(cell, live, recovering)
         except StartFailed:
             await worker.gone()  # The next life begins when this one is over.
@@ -172,7 +213,8 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         if worker is None or cell.state is not RUNNING:
             return
         running = int(worker.page[0]) - 1
-        self.over(cell, running, str(reason), ordered=reason == KILLED, noticed=worker.noticed_at)
+        noticed = worker.noticed_at
+        self.over(cell, running, str(reason), ordered=reason == KILLED, noticed=noticed, reason=reason)
         lives.ended(cell, reason)
 
     def push(self, cell: Cell, item: Item) -> None:

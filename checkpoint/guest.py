@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
@@ -211,6 +212,9 @@ class InnerLifeHost(LifeHost):
         more = cell.extra()
         start = more.start
         assert start is not None
+        if self._method.hooks is not None:
+            why = "recovery hooks run in the root process: give them to ActorSystem(recovery_hooks=...)"
+            raise StartFailed(cell.path, why)
         if isinstance(cell.node.keeper, GuestKeeper):
             cell.node.keeper.begins(cell.path)
         cell.table = start.kind._table
@@ -224,8 +228,16 @@ class InnerLifeHost(LifeHost):
         port.on_started = lambda record: self._started(cell, record)
         port.on_closed = lambda: self._closed(cell)
         kind = message_name(start.kind)
-        port.to_home(Wanted(self._number, kind, list(start.kind._topics), self._method, self._bound))
+        port.to_home(Wanted(self._number, kind, list(start.kind._topics), self._with_ports(cell), self._bound))
         return self._up
+
+    def _with_ports(self, cell: Cell) -> Method:
+        """The method; where this actor's bindings lead is known here only."""
+        state = self._method.safe_state
+        if state is None:
+            return self._method
+        ports = tuple((port, target.path) for port, target in cell.extra().bindings.items() if port in state.to)
+        return dataclasses.replace(self._method, safe_state=dataclasses.replace(state, ports=ports))
 
     def _begin(self, cell: Cell, record: Begin) -> None:
         port, up = self._port, self._up

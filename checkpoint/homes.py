@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from ..actors.cell import GONE, RUNNING, Cell
@@ -15,6 +15,8 @@ from ..actors.keeper import child_key
 from .bound import HomeBound
 from .journal import Journal
 from .method import Method
+from .recovery.held import hold, inlet, let_go
+from .recovery.register import Recoveries, Recovery
 from .rollback import roll_back
 from .switch import Switch
 
@@ -32,6 +34,8 @@ class Homes:
     def __init__(self, node: Node, journal: Journal) -> None:
         self.node, self.journal = node, journal
         self._switches: dict[str, Switch] = {}
+        self.recoveries = Recoveries(node)
+        self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         unfinished = journal.notes(ERASING).get(ERASING)
@@ -44,11 +48,16 @@ class Homes:
         switch = self._switches.get(cell.path)
         if switch is None:
             switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self.journal)
+            switch.recoveries = self.recoveries
+            if self.on_first is not None:
+                begin, self.on_first = self.on_first, None
+                begin()
         self.absolve(cell.path)
         switch.method = method
         switch.cell = cell
         more = cell.extra()
         if more.bound is not None:
+            let_go(switch)
             switch.bound, more.bound = HomeBound(switch, more.bound), None
         cell.admit = switch.admit
         more.outlet = switch
@@ -134,6 +143,7 @@ class Homes:
 
     def close(self) -> None:
         """Close the store."""
+        self.recoveries.close()
         self.journal.close()
 
 
@@ -148,6 +158,10 @@ class Clock:
     def mark(self, phase: str, when: float | None = None) -> None:
         """This phase is over now."""
         self._marks[phase] = time.monotonic() if when is None else when
+
+    def when(self, phase: str) -> float:
+        """The end of a phase."""
+        return self._marks[phase]
 
     def phases(self, restore_seconds: float) -> dict[str, float]:
         """Seconds by phase."""
@@ -173,6 +187,38 @@ class HomeHost:
         self.homes, self.method = homes, method
         self.switch: Switch | None = None
         self.clock: Clock | None = None
+        self.recovery: Recovery | None = None  # that of the life which is begun now
+
+    def enter(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
+        """As `open`, and it is a recovery if anything comes back, or if one is not over."""
+        switch, live, recovering = self.open(cell)
+        recoveries = self.homes.recoveries
+        self.recovery = None
+        if recovering or recoveries.of(cell.path) is not None:
+            self.recovery = recoveries.starts(cell.path, self.method)
+            hold(switch)
+            switch.waits_for_release = recoveries.needs(self.recovery, "release")
+        return switch, live, recovering
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether the recovery of the life at hand waits for somebody on its way."""
+        return self.recovery is not None and self.homes.recoveries.is_gated(self.recovery)
+
+    async def gate(self, stage: str) -> None:
+        """Wait until the recovery may go on to this stage; not for long."""
+        recovery = self.recovery
+        if recovery is not None:
+            wait = self.homes.recoveries.gate(recovery, stage)
+            if wait is not None:
+                await asyncio.shield(wait)
+            if stage == "restart":
+                self.isolated()
+
+    def isolated(self) -> None:
+        """S2 is over: nothing reaches the actor, and nothing of its old life gets out."""
+        if self.recovery is not None:
+            self.homes.recoveries.phase(self.recovery, "isolate", time.monotonic())
 
     def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
         """A life is to begin: its home holds what comes. Returns the home, when it is live, and if it recovers."""
@@ -185,10 +231,30 @@ class HomeHost:
         """Have the home admit what is published, also between two lives."""
         assert self.switch is not None
         for topic in (*topics, *self.switch.topics):
-            cell.node.topics.subscribe(topic, cell)
+            cell.node.topics.subscribe(topic, inlet(self.switch, topic))
 
-    def over(self, cell: Cell, running: int, why: str, *, ordered: bool, noticed: float | None = None) -> None:
-        """A life has ended; the home keeps everything."""
+    def over(
+        self,
+        cell: Cell,
+        running: int,
+        why: str,
+        *,
+        ordered: bool,
+        noticed: float | None = None,
+        reason: ExitReason | None = None,
+        recovers: bool | None = None,
+    ) -> None:
+        """A life has ended; the home keeps everything.
+
+        Args:
+            cell: its address.
+            running: the input in hand, -1 if none.
+            why: in words.
+            ordered: we have killed it.
+            noticed: when its end was noticed, if before now.
+            reason: why it has ended; that of the cell if left out.
+            recovers: whether it is brought back; judged by its spec if left out.
+        """
         switch = self.switch
         if switch is None:
             return
@@ -196,6 +262,12 @@ class HomeHost:
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
         switch.died(running, ordered=ordered)
+        if recovers is None:
+            end = cell.extra().reason if reason is None else reason
+            recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
+        if recovers:
+            hold(switch, running)
+            self.homes.recoveries.crashed(cell.path, self.method, noticed)
         cell.extra().topics.clear()  # These would be unsubscribed with the life.
         if switch.live is not None and not switch.live.done():
             switch.live.set_exception(StartFailed(cell.path, why))
@@ -222,8 +294,11 @@ class HomeHost:
         if self.switch is None:
             return
         for topic in (*topics, *self.switch.topics):
-            cell.node.topics.unsubscribe(topic, cell)
+            cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
         self.switch.ends.drop_all("it has stopped", keep_tells=restarting)
+        let_go(self.switch)
+        why = "its supervisor has ended" if restarting else "it is not started again"
+        self.homes.recoveries.given_up(cell.path, why)
 
     async def until_live(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
         """Wait until a life has caught up, and tell of it.
@@ -237,6 +312,7 @@ class HomeHost:
         try:
             restore_seconds = await live
             clock.mark("replay", switch.live_at)
+            await self._let_at(switch, clock, restore_seconds)
         except HoldfastError as error:
             if not isinstance(error, StartIgnored):
                 node.emit(RecoveryFailed(cell.path, str(error)))
@@ -249,6 +325,23 @@ class HomeHost:
             clock.mark("release")
             if node.watched:
                 node.emit(Recovered(cell.path, cell.life, switch.replayed, clock.phases(restore_seconds)))
+        self.homes.recoveries.over(cell.path)
+
+    async def _let_at(self, switch: Switch, clock: Clock, restore_seconds: float) -> None:
+        """S4, if anybody has a say in it; else the home has done it.
+
+        Raises:
+            StartFailed: the life has ended meanwhile.
+        """
+        recovery, port = self.recovery, switch.port
+        if recovery is None:
+            return
+        self.homes.recoveries.came_up(recovery, clock.when("restart"), switch.live_at, restore_seconds)
+        if switch.waits_for_release:
+            await self.gate("release")
+            if port is None or switch.port is not port:
+                raise StartFailed(switch.path, ENDED)
+            switch.release()
 
 
 def parent_ended(cell: Cell) -> bool:

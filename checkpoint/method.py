@@ -3,10 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping, Sequence
 from typing import Literal, get_args
 
 from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
+from .recovery.settings import (
+    SAFE_STATE_TIMEOUT,
+    Held,
+    RecoveryHooks,
+    SafeState,
+    as_held,
+    as_safe_state,
+    check_seconds,
+)
 
 Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]
@@ -22,6 +32,11 @@ class Method:
     journal_limit: int = 256_000_000
     keep: int = 2
     on_escalate: OnEscalate | None = None
+    safe_state: SafeState | None = None
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT
+    held: Held | None = None
+    held_topics: tuple[tuple[str, Held], ...] = ()
+    hooks: RecoveryHooks | None = None
 
     def after_escalation(self, times: int) -> OnEscalate:
         """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
@@ -42,8 +57,14 @@ class Method:
         """Refuse what cannot work for this class.
 
         Raises:
-            SpecError: the class says it is not deterministic, and this method replays.
+            SpecError: the class says it is not deterministic, and this method replays; or it has no such
+                binding.
         """
+        for port in self.safe_state.to if self.safe_state is not None else ():
+            if not port.startswith("/") and port not in kind._bindings:
+                raise SpecError(
+                    where, f"safe_state: {type_name(kind)} has no binding {port!r}; addresses begin with '/'"
+                )
         if self.records and not kind.deterministic:
             raise SpecError(where, f"{type_name(kind)} is not deterministic, so {self.name} cannot replay its messages")
 
@@ -61,6 +82,10 @@ def hybrid(
     journal_limit: int = 256_000_000,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
+    safe_state: str | Sequence[str] | SafeState | None = None,
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT,
+    held: Held | Mapping[str, Held] | None = None,
+    hooks: RecoveryHooks | None = None,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -74,6 +99,11 @@ def hybrid(
             is; go back to the "older_snapshot", without the turns since; begin "fresh". In all cases what has not been
             handled stays queued. Left out: an older snapshot the second time within the window of whoever restarted
             the supervisor, else restore.
+        safe_state: who is to be safe while it is recovered: an address, a list of them, the name of a binding of its
+            class, or `safe_state(...)` with messages.
+        safe_state_timeout: seconds after which a receiver that has not heard of the end raises SafeStateOverdue.
+        held: `held(...)`, or a mapping of topics ("*": all else) to that: how many messages are held meanwhile.
+        hooks: `recovery_hooks(...)`: what is called before and after the phases, besides those of the system.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -91,4 +121,19 @@ def hybrid(
     if on_escalate is not None and on_escalate not in get_args(OnEscalate):
         known = ", ".join(map(repr, get_args(OnEscalate)))
         raise SpecError("hybrid", f"on_escalate must be one of {known} or left out, not {on_escalate!r}")
-    return Method("hybrid", float(interval), max_deliveries, journal_limit, int(keep), on_escalate)
+    if hooks is not None and not isinstance(hooks, RecoveryHooks):
+        raise SpecError("hybrid", f"hooks must come from recovery_hooks(...), not be {hooks!r}")
+    for_all, by_topic = as_held("hybrid", held)
+    return Method(
+        "hybrid",
+        float(interval),
+        max_deliveries,
+        journal_limit,
+        int(keep),
+        on_escalate,
+        safe_state=as_safe_state("hybrid", safe_state),
+        safe_state_timeout=check_seconds("hybrid", "safe_state_timeout", safe_state_timeout),
+        held=for_all,
+        held_topics=by_topic,
+        hooks=hooks,
+    )

@@ -224,7 +224,7 @@ class RecordedToTask(FromProcess):
             transit.over(cell, old)
             return
         cell.host = old
-        old.over(cell, -1, str(self.dead), ordered=False, noticed=worker.noticed_at)
+        old.over(cell, -1, str(self.dead), ordered=False, noticed=worker.noticed_at, reason=self.dead)
         lives.ended(cell, self.dead)
         transit.over(cell, old)
 

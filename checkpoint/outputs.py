@@ -13,6 +13,7 @@ from ..actors.mail import Envelope
 from .asks import SwitchAsk, answer_ask
 from .inputs import Batch
 from .records import MESSAGE, Answer, Out
+from .recovery.held import Inlet, inlet
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -78,6 +79,8 @@ class Outputs:
         cell = home.cell if sender is None else home.node.cell_at(sender)
         assert cell is not None
         if switch is not None:
+            if isinstance(target, Inlet):
+                target.mark()
             try:
                 if switch.bound is None or switch.bound.makes_room(None, out.name, out.body, cell.path):
                     source = switch.record(MESSAGE, out.name, out.body, cell.path, batch)
@@ -219,11 +222,11 @@ class Outputs:
         if out.verb == "subscribe":
             home.topics[out.to] = None
             if home.cell is not None:
-                home.node.topics.subscribe(out.to, home.cell)
+                home.node.topics.subscribe(out.to, inlet(home, out.to))
         else:
             home.topics.pop(out.to, None)
             if home.cell is not None:
-                home.node.topics.unsubscribe(out.to, home.cell)
+                home.node.topics.unsubscribe(out.to, inlet(home, out.to))
 
 
 def switch_of(cell: Cell) -> Switch | None:

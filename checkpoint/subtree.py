@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import itertools
+from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any
 
 from ..actors import links, lives
@@ -24,7 +25,7 @@ from ..actors.process.limits import Limits
 from ..actors.process.remote import ProcessHost
 from ..actors.process.workers import Worker, Workers
 from .controller import FROM_LIFE, RemoteLife
-from .homes import HomeHost, Homes
+from .homes import HomeHost, Homes, seen
 from .records import Begin, Closed, Started, ToHome, Wanted
 
 if TYPE_CHECKING:
@@ -91,6 +92,8 @@ class SubtreeHome(HomeHost):
         self.homes, self.path = homes, path
         self.switch: Switch | None = None
         self.clock = None
+        self.recovery = None
+        self._starting: asyncio.Task[None] | None = None
         self.cell: Cell | None = None
         self.restarting = False  # it is its supervisor that has ended
         self._top: Cell | None = None
@@ -133,21 +136,54 @@ class SubtreeHome(HomeHost):
         if not self._slot:
             port.to_life(Started(wanted.number, "its process holds as many recorded actors as it can"))
             return
-        switch, live, recovering = self.open(cell)
+        switch, live, recovering = self.enter(cell)
+        if self.is_gated:
+            self._run(cell, self._step_by_step(cell, wanted, live, recovering))
+        else:
+            self.isolated()
+            self._launch(cell, wanted)
+            switch.attach(port)
+            self._send_calls(cell, worker)
+            self._run(cell, self._follow(cell, wanted, live, recovering))
+
+    def _run(self, cell: Cell, start: Coroutine[Any, Any, None]) -> None:
+        self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
+        self._starting.add_done_callback(seen)
+
+    def _launch(self, cell: Cell, wanted: Wanted) -> None:
+        """S3, the new life with its state."""
+        worker, switch = self._worker, self.switch
+        assert worker is not None
+        assert switch is not None
         cell.life += 1
         cell.state = RUNNING
         self.subscribe(cell, wanted.topics)
+        port = RemoteLife(self.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
         port.to_life(Begin(wanted.number, cell.life, switch.state_turn, switch.stash, self._slot))
         assert self.clock is not None
         self.clock.mark("restart")
-        switch.attach(port)
+
+    def _send_calls(self, cell: Cell, worker: Worker) -> None:
         calls, cell.extra().calls = cell.extra().calls, []
         for call in calls:
             send_call(worker, cell.path, call)
-        task = cell.node.loop.create_task(self._follow(cell, wanted, live, recovering), name=f"start of {cell.path}")
-        task.add_done_callback(lambda done: None if done.cancelled() else done.exception())
+
+    async def _step_by_step(self, cell: Cell, wanted: Wanted, live: asyncio.Future[float], recovering: bool) -> None:
+        """A recovery on whose way others have something to do; it may be given up, or its process end, meanwhile."""
+        worker, switch = self._worker, self.switch
+        assert worker is not None
+        assert switch is not None
+        await self.gate("restart")
+        if self._wanted is not wanted or cell.state is GONE:
+            return
+        self._launch(cell, wanted)
+        await self.gate("replay")
+        if not live.done():  # Else it has ended meanwhile.
+            switch.attach(RemoteLife(self.path, worker))
+            self._send_calls(cell, worker)
+        await self._follow(cell, wanted, live, recovering)
 
     async def _follow(self, cell: Cell, wanted: Wanted, live: asyncio.Future[float], recovering: bool) -> None:
         worker = self._worker
@@ -176,11 +212,12 @@ class SubtreeHome(HomeHost):
         self._wanted = None
         if cell is None or cell.state is not RUNNING:
             return
-        self.over(cell, running, str(reason), ordered=ordered, noticed=noticed)
+        recovers = recovers and self.recovers(reason)
+        self.over(cell, running, str(reason), ordered=ordered, noticed=noticed, recovers=recovers)
         cell.state = DOWN
         more = cell.extra()
         more.reason = reason
-        links.announce(cell, reason, recovering=recovers and self.recovers(reason))
+        links.announce(cell, reason, recovering=recovers)
         lives.tell_enders(more, reason)
 
     def lost(self, worker: Worker, reason: ExitReason) -> None:
@@ -225,5 +262,7 @@ class SubtreeHome(HomeHost):
             self.restarting = bool(data["with_parent"])
 
     def retired(self, cell: Cell) -> None:
+        if self._starting is not None and not self._starting.done() and cell.state is GONE:
+            self._starting.cancel()
         topics = self._wanted.topics if self._wanted is not None else ()
         self.give_up(cell, topics, restarting=self.restarting)

@@ -65,11 +65,13 @@ from .records import (
     Wanted,
     pieces,
 )
+from .recovery.held import Holding, Inlet, let_go
 from .saved import Meta, cut, load
 from .timers import Timers
 
 if TYPE_CHECKING:
     from ..actors.node import Node
+    from .recovery.register import Recoveries
 
 
 class LifePort(Protocol):
@@ -98,7 +100,11 @@ class Switch:
         self.outputs = Outputs(self)
         self.ends = Ends(self)
         self.limit = Limit(self)
-        self.bound: HomeBound | None = None
+        self.bound: HomeBound | Holding | None = None
+        self.holding: Holding | None = None  # stands as the bound while the actor is recovered
+        self.inlets: dict[str, Inlet] = {}
+        self.recoveries: Recoveries | None = None
+        self.waits_for_release = False  # somebody else says when the actor gets what is new
         self.pipes_done: dict[int, set[int]] = {}
         self.topics: dict[str, None] = {}
         self.newest: Meta | None = None  # the snapshot to begin with
@@ -231,7 +237,7 @@ class Switch:
 
     def prepare(self) -> asyncio.Future[float]:
         """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
-        self.is_released = False
+        self.is_released = self.waits_for_release = False
         self.replayed = 0
         self.diverged = None
         self.is_void = False
@@ -266,9 +272,12 @@ class Switch:
         stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)
         port.to_life(Go(recovered, self.turn, tuple(key for key in stashed if key not in self.open)))
 
-    def _release(self) -> None:
+    def release(self) -> None:
         """Let new inputs at the actor: first the turn that had begun to send, then the others as they were admitted."""
-        self.is_released = True
+        self.is_released, self.waits_for_release = True, False
+        holding = let_go(self)
+        if holding is not None:
+            holding.report()
         port = self.port
         assert port is not None
         stashed = self.stashed()
@@ -281,6 +290,8 @@ class Switch:
                 port.to_life(source.feed(-1, pipes if index == 0 else (), has_begun=begun))
         if self.bound is not None:
             self.bound.refill()
+        if holding is not None:
+            holding.let_in()
 
     def stashed(self) -> set[int]:
         """The inputs that the actor has put aside."""
@@ -355,7 +366,8 @@ class Switch:
         self.live_at = time.monotonic()
         if self.live is not None and not self.live.done():
             self.live.set_result(record.restore_seconds)
-        self._release()
+        if not self.waits_for_release:
+            self.release()
 
     def _released(self, record: Released) -> None:
         batch = Batch()

@@ -26,6 +26,7 @@ from ..actors.topics import NOT_TAKEN
 from ..actors.watch import LoopWatch, check_limits
 from ..checkpoint.controller import RecordedProcessHost, TaskHost
 from ..checkpoint.homes import Homes
+from ..checkpoint.recovery.settings import RecoveryHooks
 from ..checkpoint.stores import open_journal
 from ..checkpoint.subtree import SubtreeHost
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
@@ -35,6 +36,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .recovery import RecoveryTree
 from .script import load_script
 from .transaction.addresses import Moved
 from .transaction.transaction import Transaction, Transactions
@@ -65,6 +67,7 @@ class ActorSystem(Controls):
         watch_lag: tell (LoopLagged) when this process's event loop comes later than this many seconds.
         watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
             For actors in processes see `Limits(hung_after=...)`.
+        recovery_hooks: `recovery_hooks(...)`: what is called before and after the phases of every recovery.
 
     Leaving the context stops all actors, newest first. If the root supervisor gives up, the body is cancelled and
     TreeFailed is raised.
@@ -83,6 +86,7 @@ class ActorSystem(Controls):
         takeover: bool = False,
         watch_lag: float | None = None,
         watch_turns: float | None = None,
+        recovery_hooks: RecoveryHooks | None = None,
     ) -> None:
         if not name or "/" in name:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
@@ -93,6 +97,11 @@ class ActorSystem(Controls):
         self._preload = tuple(preload)
         self._log = log
         self._seed = seed
+        if recovery_hooks is not None and not isinstance(recovery_hooks, RecoveryHooks):
+            raise SpecError(
+                "ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {recovery_hooks!r}"
+            )
+        self._recovery_hooks = recovery_hooks
         self._watch_limits = check_limits(watch_lag, watch_turns)
         self._node: Node | None = None
         self._root: Cell | None = None
@@ -109,6 +118,8 @@ class ActorSystem(Controls):
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
         self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
+        self._homes.recoveries.hooks = self._recovery_hooks
+        self._recovery = RecoveryTree(node, self._homes)
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
         self._moves = Moves(node, self._workers)

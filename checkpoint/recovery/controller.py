@@ -1,0 +1,135 @@
+"""The recovery controller as an actor: it sees each recovery through its phases (RORY, S1 to S4)."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from typing import Any
+
+from ...actors.actor import on
+from ...actors.cell import Cell
+from ...actors.errors import error_text, type_name
+from ...actors.exits import ExitReason
+from ...actors.message import Message
+from ...actors.ref import ActorRef
+from .part import Part
+from .register import ENTER, LEAVE, STAGES, Point, Recovery
+from .safety import Receiver
+from .settings import Hook
+
+
+class Look(Message):
+    """Something has come up: in the recovery of `address`, or ("") there are phases to tell of."""
+
+    address: str
+
+
+class Seen(Message):
+    """The stages of one recovery that were asked for are done."""
+
+
+class RecoveryController(Part):
+    """Has receivers enter and leave safe state, calls hooks, tells of phases.
+
+    What it does is noted with the homes before it is done. If it dies, they go on without it, and without the hooks
+    that it did not come to; its next life takes up what is there.
+    """
+
+    def on_start(self, restored: bool) -> None:
+        recoveries, cell = self._homes.recoveries, self.ctx.cell
+
+        def wake(path: str) -> None:
+            cell.admit(cell, Look(path))
+
+        self._in_hand: set[tuple[int, int, str]] = set()
+        recoveries.attach(wake)
+        cell.ended().add_done_callback(lambda _: recoveries.detach(wake))
+        recoveries.safety.on_entered = self._watch
+        for receiver in recoveries.safety.safe():
+            recoveries.safety.check(receiver)
+            self._watch(receiver)
+        for recovery in recoveries.all():
+            self._see_to(recovery)
+        recoveries.tell()
+
+    @on(Look)
+    def _look(self, message: Look) -> None:
+        recovery = self._homes.recoveries.of(message.address)
+        if recovery is not None:
+            self._see_to(recovery)
+        self._homes.recoveries.tell()
+
+    @on(Seen)
+    def _seen(self, message: Seen) -> None:
+        self._homes.recoveries.tell()
+
+    # -- stages -----------------------------------------------------------------------------------------------------
+
+    def _see_to(self, recovery: Recovery) -> None:
+        """Begin with what the recovery waits for."""
+        for stage, is_passed in list(recovery.stages.items()):
+            key = (recovery.number, recovery.attempt, stage)
+            if is_passed or key in self._in_hand:
+                continue
+            if any(self._homes.recoveries.hooks_at(recovery, point) for point in STAGES[stage]):
+                self._in_hand.add(key)
+                self.ctx.pipe_to_self(self._go_through(recovery, stage), lambda _: Seen())
+            else:
+                for point in STAGES[stage]:
+                    self._do(recovery, point)
+                self._homes.recoveries.passed(recovery, stage)
+
+    async def _go_through(self, recovery: Recovery, stage: str) -> None:
+        recoveries, attempt = self._homes.recoveries, recovery.attempt
+        for point in STAGES[stage]:
+            if not recoveries.is_current(recovery, attempt, stage):
+                break  # It has crashed again, or had to go on without us.
+            self._do(recovery, point)
+            for index, (hooks, hook) in enumerate(recoveries.hooks_at(recovery, point)):
+                if recoveries.calls(recovery, point, index):
+                    await self._call(recovery, point, hook, hooks.timeout)
+        self._in_hand.discard((recovery.number, attempt, stage))
+        if recoveries.is_current(recovery, attempt, stage):
+            recoveries.passed(recovery, stage)
+
+    def _do(self, recovery: Recovery, point: Point) -> None:
+        recoveries = self._homes.recoveries
+        if point == ENTER:
+            recoveries.enter_safe_state(recovery)
+        elif point == LEAVE:
+            recoveries.safety.leave(recovery.path)
+
+    async def _call(self, recovery: Recovery, point: Point, hook: Hook, timeout: float) -> None:
+        """Call a hook; whatever it does, the recovery goes on."""
+        recoveries = self._homes.recoveries
+        try:
+            async with asyncio.timeout(timeout):
+                result: Any = hook(recovery.step(point))
+                if inspect.isawaitable(result):
+                    await result
+        except TimeoutError:
+            recoveries.hook_failed(recovery, point, f"it took longer than {timeout:g} s")
+        except asyncio.CancelledError:
+            recoveries.hook_failed(recovery, point, "it was cut off: the recovery controller has ended")
+            raise
+        except Exception as error:
+            recoveries.hook_failed(recovery, point, f"{type_name(type(error))}: {error_text(error)}")
+
+    # -- receivers --------------------------------------------------------------------------------------------------
+
+    def _watch(self, receiver: Receiver) -> None:
+        """A receiver that begins a new life meanwhile has to be told again."""
+        if not self.ctx.closed:
+            self.ctx.monitor(self._cell_of(receiver).ref)
+
+    def _cell_of(self, receiver: Receiver) -> Cell:
+        return self.ctx.cell.node.cell_at(receiver.path)
+
+    def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
+        """A receiver's life has ended."""
+        safety = self._homes.recoveries.safety
+        mine = [receiver for receiver in safety.safe() if receiver.path == source.path]
+        for receiver in mine:
+            safety.check(receiver)
+        if mine and not source._cell.is_dead and not recovering:
+            self.ctx.monitor(source)
