@@ -47,6 +47,7 @@ from holdfast.actors.events import (
     DeadLetter,
     Event,
     EventStream,
+    JournalFull,
     LogLine,
     LoopLagged,
     MessageIn,
@@ -57,6 +58,7 @@ from holdfast.actors.events import (
     ProcessStarted,
     Recovered,
     RecoveryFailed,
+    ReplayPaced,
     RolledBack,
     ShutdownError,
     SnapshotFailed,
@@ -65,7 +67,9 @@ from holdfast.actors.events import (
     SupervisorGaveUp,
     TurnBegan,
     TurnEnded,
+    TurnsLost,
     TurnSlow,
+    TurnsSkipped,
 )
 from holdfast.actors.exits import (
     KILLED,
@@ -91,7 +95,8 @@ from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
-from holdfast.checkpoint.method import Method, fresh, hybrid
+from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
+from holdfast.checkpoint.readonly import NotReadonly
 from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -195,6 +200,7 @@ __all__ = [
     "Ignore",
     "InputRefused",
     "Job",
+    "JournalFull",
     "KILLED",
     "KeyFreed",
     "KeyRegistered",
@@ -221,6 +227,7 @@ __all__ = [
     "NoSuchChild",
     "Normal",
     "NotAnActor",
+    "NotReadonly",
     "NotSupported",
     "NotSuspended",
     "NotUnique",
@@ -250,6 +257,7 @@ __all__ = [
     "RegistryEntry",
     "RemoteCrash",
     "ReplayDiverged",
+    "ReplayPaced",
     "ReplyHandle",
     "ResizePartitions",
     "ResizePool",
@@ -289,6 +297,8 @@ __all__ = [
     "TurnBegan",
     "TurnEnded",
     "TurnSlow",
+    "TurnsLost",
+    "TurnsSkipped",
     "Unbound",
     "UnknownMessage",
     "UntrustedFile",
@@ -296,6 +306,7 @@ __all__ = [
     "WrongActor",
     "bounded",
     "check_children",
+    "checkpoint_only",
     "child",
     "dynamic",
     "fresh",
@@ -308,6 +319,7 @@ __all__ = [
     "pool_of",
     "program",
     "registry",
+    "replay_only",
     "rule",
     "run",
     "start",

@@ -13,6 +13,7 @@ from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
 from .bound import HomeBound
+from .forgotten import forget_turns
 from .journal import Journal
 from .method import Method
 from .rollback import roll_back
@@ -177,6 +178,8 @@ class HomeHost:
     def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
         """A life is to begin: its home holds what comes. Returns the home, when it is live, and if it recovers."""
         switch = self.switch = self.homes.of(cell, self.method)
+        if not self.method.replays:
+            forget_turns(switch)
         self.clock = self.clock or Clock()
         self.clock.mark("isolate")
         return switch, switch.prepare(), not switch.is_new
