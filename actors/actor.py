@@ -13,6 +13,7 @@ from .bindings import Binding
 from .errors import type_name
 from .mail import Table
 from .message import Message
+from .safe import SafeStateChange, watch
 from .threads import in_thread
 
 if TYPE_CHECKING:
@@ -146,7 +147,16 @@ class Actor:
         """A queued message that will not be handled, because the actor stops; without this it is a dead letter."""
 
     def on_safe_state(self, entered: bool) -> Any:
-        """Recovery of an actor this one is bound to begins (True) or is over (False)."""
+        """An actor whose recovery method names this one begins to be recovered (True), or is back (False).
+
+        May be async. Of several recoveries at a time it hears once: of the first beginning, and of the last end.
+        """
+
+    @on(SafeStateChange)
+    def _on_safe_state(self, message: SafeStateChange) -> Any:
+        """An ordinary message, in its place, and journaled if we are recorded."""
+        watch(self.ctx.cell, message)
+        return self.on_safe_state(message.entered)
 
     def on_recovered(self) -> Any:
         """State and messages are back; called before new messages are let in."""

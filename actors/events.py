@@ -119,6 +119,61 @@ class RecoveryFailed(Event, frozen=True, eq=False):
     reason: str
 
 
+class RecoveryPhase(Event, frozen=True, eq=False):
+    """A phase of a recovery is over: detect, safe_state, isolate, restart, restore, replay, release.
+
+    `recovery` numbers the recoveries of a system, `attempt` counts from 1 within one; `since_noticed` are the seconds
+    from the notice of the crash to the end of the phase, `seconds` those it took.
+    """
+
+    recovery: int
+    attempt: int
+    phase: str
+    since_noticed: float
+    seconds: float
+
+
+class RecoveryHookFailed(Event, frozen=True, eq=False):
+    """A hook of a recovery ("before isolate") raised, took too long, or was not called; the recovery went on."""
+
+    hook: str
+    reason: str
+
+
+class SafeStateEntered(Event, frozen=True, eq=False):
+    """An actor was told to be safe, because of the recovery of another."""
+
+    because: str
+
+
+class SafeStateLeft(Event, frozen=True, eq=False):
+    """An actor was told that all recoveries are over because of which it was safe; `because` is the last one's."""
+
+    because: str
+
+
+class SafeStateKept(Event, frozen=True, eq=False):
+    """A recovery has failed: `receivers` stay safe until the actor is back."""
+
+    receivers: tuple[str, ...]
+    reason: str
+
+
+class SafeStateOverdue(Event, frozen=True, eq=False):
+    """An actor has not heard within `seconds` that it need not be safe any more. It stays safe."""
+
+    seconds: float
+    because: str
+
+
+class HeldMessages(Event, frozen=True, eq=False):
+    """While an actor was recovered, messages came: `held` wait for it, `dropped` and `refused` by its held policy."""
+
+    held: int
+    dropped: int
+    refused: int
+
+
 class RolledBack(Event, frozen=True, eq=False):
     """An actor comes back with an older state: what its turns after `to_turn` did to it, up to `from_turn`, is undone.
 

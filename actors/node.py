@@ -49,6 +49,7 @@ class Node(RunLoop):
         self.names: dict[str, Cell] = {}
         self.kept: weakref.WeakKeyDictionary[Cell, Any] = weakref.WeakKeyDictionary()  # what outlives an actor's lives
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
+        self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
         self.dead_letters = 0
         self.late_replies = 0
         self.wall: Callable[[], float] = time.time
@@ -62,6 +63,13 @@ class Node(RunLoop):
         self._seeds = random.Random(seed)
         self._numbers = itertools.count(1)
         self._turns = itertools.count(1)
+
+    async def close(self) -> None:
+        """End every runner, and what still waits for its time."""
+        for timer in self.safe.values():
+            timer.cancel()
+        self.safe.clear()
+        await super().close()
 
     # -- events -----------------------------------------------------------------------------------------------------
 

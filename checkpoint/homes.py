@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from ..actors.cell import GONE, RUNNING, Cell
@@ -33,6 +33,7 @@ class Homes:
     def __init__(self, node: Node, journal: Journal) -> None:
         self.node, self.journal = node, journal
         self._switches: dict[str, Switch] = {}
+        self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         unfinished = journal.notes(ERASING).get(ERASING)
@@ -45,6 +46,9 @@ class Homes:
         switch = self._switches.get(cell.path)
         if switch is None:
             switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self.journal)
+            if self.on_first is not None:
+                begin, self.on_first = self.on_first, None
+                begin()
         self.absolve(cell.path)
         switch.method = method
         switch.cell = cell

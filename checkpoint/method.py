@@ -3,17 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal, cast, get_args
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, get_args
 
 import msgspec
 
 from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
+from .recovery.settings import (
+    SAFE_STATE_TIMEOUT,
+    Held,
+    RecoveryHooks,
+    SafeState,
+    as_held,
+    as_safe_state,
+    check_seconds,
+)
 
 Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]
 Pacing = Literal["fast", "original"] | float
 JOURNAL_LIMIT = 256_000_000
+OF_LIVES = ("name", "interval", "check_readonly", "key_variables", "origin")
+"""The settings that concern a life, not its home."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -34,6 +46,11 @@ class Method:
     check_readonly: bool = False
     key_variables: tuple[str, ...] | None = None
     origin: str = ""
+    safe_state: SafeState | None = None
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT
+    held: Held | None = None
+    held_topics: tuple[tuple[str, Held], ...] = ()
+    hooks: RecoveryHooks | None = None
 
     def __post_init__(self) -> None:
         """Raises SpecError: naming the method, the setting, and what it may be."""
@@ -90,20 +107,26 @@ class Method:
         return 1.0 if self.pacing == "original" else float(self.pacing)
 
     def data(self) -> dict[str, Any]:
-        """As another process gets it."""
-        return cast("dict[str, Any]", msgspec.to_builtins(self))
+        """What a life in another process has to know of it."""
+        return {name: msgspec.to_builtins(getattr(self, name)) for name in OF_LIVES}
 
     @classmethod
     def of(cls, data: dict[str, Any]) -> Method:
-        """The method again."""
+        """The method again, as far as a life has to know it."""
         return msgspec.convert(data, cls)
 
     def check(self, where: str, kind: type[Actor]) -> None:
         """Refuse what cannot work for this class.
 
         Raises:
-            SpecError: the class says it is not deterministic, and this method replays.
+            SpecError: the class says it is not deterministic, and this method replays; or it has no such
+                binding.
         """
+        for port in self.safe_state.to if self.safe_state is not None else ():
+            if not port.startswith("/") and port not in kind._bindings:
+                raise SpecError(
+                    where, f"safe_state: {type_name(kind)} has no binding {port!r}; addresses begin with '/'"
+                )
         if self.replays and not kind.deterministic:
             raise SpecError(
                 where,
@@ -124,6 +147,10 @@ def checkpoint_only(
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
+    safe_state: str | Sequence[str] | SafeState | None = None,
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT,
+    held: Held | Mapping[str, Held] | None = None,
+    hooks: RecoveryHooks | None = None,
 ) -> Method:
     """State comes back from the last snapshot alone; what was handled since is lost from it (`TurnsLost` counts it).
 
@@ -134,7 +161,15 @@ def checkpoint_only(
     Source:
         Zou and Bai, the first of the two methods they compare theirs with.
     """
-    return Method("checkpoint_only", interval, max_deliveries, journal_limit, keep, on_escalate)
+    return Method(
+        "checkpoint_only",
+        interval,
+        max_deliveries,
+        journal_limit,
+        keep,
+        on_escalate,
+        **_meanwhile("checkpoint_only", safe_state, safe_state_timeout, held, hooks),
+    )
 
 
 def replay_only(
@@ -145,6 +180,10 @@ def replay_only(
     on_escalate: OnEscalate | None = None,
     skip: bool = True,
     check_readonly: bool = False,
+    safe_state: str | Sequence[str] | SafeState | None = None,
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT,
+    held: Held | Mapping[str, Held] | None = None,
+    hooks: RecoveryHooks | None = None,
 ) -> Method:
     """State comes back by handling everything again since the very first start; no snapshot is ever taken.
 
@@ -162,6 +201,7 @@ def replay_only(
         pacing=pacing,
         skip=skip,
         check_readonly=check_readonly,
+        **_meanwhile("replay_only", safe_state, safe_state_timeout, held, hooks),
     )
 
 
@@ -175,6 +215,10 @@ def hybrid(
     on_escalate: OnEscalate | None = None,
     skip: bool = True,
     check_readonly: bool = False,
+    safe_state: str | Sequence[str] | SafeState | None = None,
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT,
+    held: Held | Mapping[str, Held] | None = None,
+    hooks: RecoveryHooks | None = None,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -194,6 +238,11 @@ def hybrid(
             `@on(supersedes=...)` those that a later one has made useless.
         check_readonly: end the life (NotReadonly) when a handler that is declared readonly changes the state. This
             saves the state twice for each of its turns: for tests and for finding faults.
+        safe_state: who is to be safe while it is recovered: an address, a list of them, the name of a binding of its
+            class, or `safe_state(...)` with messages.
+        safe_state_timeout: seconds after which a receiver that has not heard of the end raises SafeStateOverdue.
+        held: `held(...)`, or a mapping of topics ("*": all else) to that: how many messages are held meanwhile.
+        hooks: `recovery_hooks(...)`: what is called before and after the phases, besides those of the system.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -208,7 +257,28 @@ def hybrid(
         pacing=pacing,
         skip=skip,
         check_readonly=check_readonly,
+        **_meanwhile("hybrid", safe_state, safe_state_timeout, held, hooks),
     )
+
+
+def _meanwhile(
+    where: str,
+    safe_state: str | Sequence[str] | SafeState | None,
+    safe_state_timeout: float,
+    held: Held | Mapping[str, Held] | None,
+    hooks: RecoveryHooks | None,
+) -> dict[str, Any]:
+    """What is done while an actor is recovered, checked."""
+    if hooks is not None and not isinstance(hooks, RecoveryHooks):
+        raise SpecError(where, f"hooks must come from recovery_hooks(...), not be {hooks!r}")
+    for_all, by_topic = as_held(where, held)
+    return {
+        "safe_state": as_safe_state(where, safe_state),
+        "safe_state_timeout": check_seconds(where, "safe_state_timeout", safe_state_timeout),
+        "held": for_all,
+        "held_topics": by_topic,
+        "hooks": hooks,
+    }
 
 
 def _number(value: Any) -> bool:

@@ -35,6 +35,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .recovery import RecoveryTree
 from .script import load_script
 from .transaction.addresses import Moved
 from .transaction.transaction import Transaction, Transactions
@@ -109,6 +110,7 @@ class ActorSystem(Controls):
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
         self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
+        self._recovery = RecoveryTree(node, self._homes)
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
         self._moves = Moves(node, self._workers)
