@@ -102,6 +102,7 @@ from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
+from holdfast.checkpoint.file import RecoveryFile, load_recovery
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.readonly import NotReadonly
 from holdfast.checkpoint.recovery.settings import (
@@ -269,6 +270,7 @@ __all__ = [
     "Quarantined",
     "Recovered",
     "RecoveryFailed",
+    "RecoveryFile",
     "RecoveryHookFailed",
     "RecoveryHooks",
     "RecoveryPhase",
@@ -339,6 +341,7 @@ __all__ = [
     "fresh",
     "held",
     "hybrid",
+    "load_recovery",
     "load_tree",
     "on",
     "partition_of",

@@ -235,10 +235,12 @@ class InnerLifeHost(LifeHost):
         cell.life = record.life - 1
         page = self._guest.page[record.slot : record.slot + 1]
         self._life = life = Life(cell, port, self._method, page)
+        port.on_closed = None  # A start that fails is told of here, with its reason.
         try:
             port.begin(life, record.turn, record.stash)
+            port.on_closed = lambda: self._closed(cell)
         except StartFailed as error:
-            port.life = None
+            port.life = self._life = None
             self._fail(cell, error)
             self._say_closed(cell)
 

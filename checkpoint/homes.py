@@ -13,6 +13,7 @@ from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
 from .bound import HomeBound
+from .file import RecoveryFile
 from .forgotten import forget_turns
 from .journal import Journal
 from .method import Method
@@ -35,6 +36,7 @@ class Homes:
         self._switches: dict[str, Switch] = {}
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
+        self.file: RecoveryFile | None = None
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         unfinished = journal.notes(ERASING).get(ERASING)
         self._stored = set(journal.addresses())

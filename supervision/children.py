@@ -45,6 +45,12 @@ class Child:
         return ChildInfo(self.spec.id, self.state, f"{above}/{self.spec.id}", self.spec.is_supervisor)
 
 
+def complete(own: Cell, spec: ChildSpec) -> ChildSpec:
+    """A child's spec with what is said of it elsewhere. Raises SpecError: the two do not go together."""
+    completed: ChildSpec = own.node.complete(spec, f"{own.path}/{spec.id}")
+    return completed
+
+
 def new_cell(own: Cell, spec: ChildSpec) -> Cell:
     """An address below a supervisor's, for the lives of a child.
 
