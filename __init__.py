@@ -98,6 +98,7 @@ from holdfast.actors.links import Monitor
 from holdfast.actors.mail import ReplyHandle
 from holdfast.actors.mailbox import bounded
 from holdfast.actors.message import Message, Refusal
+from holdfast.actors.plain import Bus, Calls, Wrapped, calls, wrap
 from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
@@ -188,6 +189,8 @@ __all__ = [
     "Backoff",
     "BadMessage",
     "Binding",
+    "Bus",
+    "Calls",
     "CannotMove",
     "Change",
     "ChangeSupervisor",
@@ -332,8 +335,10 @@ __all__ = [
     "UnknownMessage",
     "UntrustedFile",
     "WhichChildren",
+    "Wrapped",
     "WrongActor",
     "bounded",
+    "calls",
     "check_children",
     "checkpoint_only",
     "child",
@@ -360,4 +365,5 @@ __all__ = [
     "supervisor",
     "tasks",
     "tree_from",
+    "wrap",
 ]

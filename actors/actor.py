@@ -182,7 +182,7 @@ def _check(cls: type, name: str, handler: Any, kind: type) -> None:
         declared = typing.get_type_hints(handler).get(parameters[1].name)
     except NameError:  # A name that is only imported for checking, or defined further down.
         return
-    if isinstance(declared, type) and not issubclass(kind, declared):
+    if isinstance(declared, type) and declared is not Any and not issubclass(kind, declared):
         raise TypeError(f"{type_name(cls)}.{name} is @on({kind.__name__}) but takes a {declared.__name__}")
 
 

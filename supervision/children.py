@@ -51,13 +51,14 @@ def complete(own: Cell, spec: ChildSpec) -> ChildSpec:
     return completed
 
 
-def new_cell(own: Cell, spec: ChildSpec) -> Cell:
+def new_cell(own: Cell, one: Child) -> Cell:
     """An address below a supervisor's, for the lives of a child.
 
     Raises:
         StartFailed: a binding points nowhere. NameTaken: somebody else lives there.
     """
-    node = own.node
+    node, spec = own.node, complete(own, one.spec)
+    one.spec = spec
     targets = {port: node.find(path) for port, path in spec.bindings.items()}
     for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
         if target is None:

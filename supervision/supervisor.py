@@ -116,8 +116,7 @@ class Supervisor(Actor):
         """
         cell = one.cell
         if cell is None or cell.state is GONE:
-            one.spec = complete(self.ctx.cell, one.spec)
-            cell = one.cell = new_cell(self.ctx.cell, one.spec)
+            cell = one.cell = new_cell(self.ctx.cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
         return cell.host.start(cell)
 
@@ -489,10 +488,9 @@ class Supervisor(Actor):
         return tuple(one.spec for one in self._children.values())
 
     def _child(self, name: str) -> Child:
-        one = self._children.get(name)
-        if one is None:
+        if name not in self._children:
             raise NoSuchChild(name)
-        return one
+        return self._children[name]
 
     def _fail(self, error: HoldfastError) -> ReplyHandle[Any]:
         """Answer an admin call with an error: it is the caller's business, not our crash."""
