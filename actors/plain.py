@@ -31,7 +31,7 @@ class Calls:
         self._kind = kind
         self.messages = types.MappingProxyType(messages)
 
-    def __getattr__(self, name: str) -> type[Message[Any]]:
+    def __getattr__(self, name: str) -> Callable[..., Message[Any]]:
         try:
             return self.messages[name]
         except KeyError:
@@ -72,14 +72,18 @@ def _call(kind: type, name: str, method: Any) -> type[Message[Any]]:
             raise TypeError(f"{type_name(kind)}.{name} takes {parameter}: no message has such fields; use methods=")
         declared[parameter.name] = hints.get(parameter.name, Any)
         if parameter.default is not Parameter.empty:
-            default = parameter.default
-            fields[parameter.name] = msgspec.field(default_factory=lambda value=default: value)
-    reply = Message[hints.get("return", Any)]  # type: ignore[misc]  # known only now
+            fields[parameter.name] = msgspec.field(default_factory=_always(parameter.default))
+    message: Any = Message
+    reply = message[hints.get("return", Any)]
     try:
         made = types.new_class(name, (reply,), {"frozen": True}, lambda namespace: namespace.update(fields))
     except TypeError as error:
         raise TypeError(f"{type_name(kind)}.{name} cannot be called by a message: {error}; use methods=") from error
     return cast("type[Message[Any]]", made)
+
+
+def _always(value: Any) -> Callable[[], Any]:
+    return lambda: value
 
 
 class BusTick(Message):
@@ -239,11 +243,13 @@ def wrap(
         namespace[f"_call_{number}"] = on(kind)(_caller(factory, kind, method))
     kinds: dict[str, type[Message[Any]]] = {}
     for number, (topic, fed) in enumerate((callbacks or {}).items()):
-        kind, method = fed if isinstance(fed, tuple) else (fed, None)
+        if isinstance(fed, tuple):
+            kind, handler = fed[0], _caller(factory, *fed, is_callback=True)
+        else:
+            kind, handler = fed, _fed(topic)
+            namespace["_has_bus"] = True
         kinds[topic] = kind
-        handler = _fed(topic) if method is None else _caller(factory, kind, method, is_callback=True)
         namespace[f"_feed_{number}"] = subscribe(topic)(on(kind)(handler))
-        namespace["_has_bus"] = namespace.get("_has_bus", False) or method is None
     namespace["_kinds"] = kinds
     if namespace.get("_has_bus"):
         namespace["_tick"] = on(BusTick)(_ticking())

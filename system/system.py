@@ -98,7 +98,7 @@ class ActorSystem(Controls):
         self._preload = tuple(preload)
         self._log = log
         self._seed = seed
-        self._recovery = recovery
+        self._recovery_file = recovery
         self._watch_limits = check_limits(watch_lag, watch_turns)
         self._node: Node | None = None
         self._root: Cell | None = None
@@ -113,7 +113,7 @@ class ActorSystem(Controls):
     async def __aenter__(self) -> ActorSystem:
         if self._node is not None:
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
-        recovery = self._recovery
+        recovery = self._recovery_file
         file = recovery if isinstance(recovery, RecoveryFile) or recovery is None else load_recovery(recovery)
         if file is not None:
             file.check_classes()

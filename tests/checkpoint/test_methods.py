@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import holdfast as hf
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, start, until
-from tests.checkpoint.strikes import NEVER, event, let_through, strike
+from tests.checkpoint.strikes import NEVER, event, home, host_of, let_through, strike
 
 Ended = Literal["kept", "lost"]
 
@@ -49,11 +49,11 @@ async def snapshot(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     """Have one taken after the last turn, by whatever would take one."""
     from holdfast.checkpoint.records import SnapshotNow
 
-    home = ref._cell.host.switch  # type: ignore[attr-defined]
-    turn = home.turn
-    home.port.to_life(SnapshotNow())
-    if home.method.snapshots:
-        await until(lambda: home.state_turn >= turn)
+    switch = home(ref)
+    turn = switch.turn
+    switch.port.to_life(SnapshotNow())
+    if switch.method.snapshots:
+        await until(lambda: switch.state_turn >= turn)
 
 
 async def doer(system: hf.ActorSystem, isolation: str, name: str) -> hf.ActorRef[Doer]:
@@ -159,13 +159,13 @@ async def test_a_root_that_starts_anew_forgets_the_same_again(tmp_path: Path) ->
         await ref.ask(Note("lost"))
         await back(system, ref)
         await ref.ask(Note("lost too"))
-        home = ref._cell.host.switch
-        turn, home.method = home.turn, hf.fresh()  # No last snapshot: the root dies here.
-        ref._cell.host.life.method = method("replay_only")
+        switch = home(ref)
+        turn, switch.method = switch.turn, hf.fresh()  # No last snapshot: the root dies here.
+        host_of(ref).life.method = method("replay_only")
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
         ref = await system.start(spec)
         assert await ref.ask(Seen()) == ["kept"]
-        assert ref._cell.host.switch.turn == turn + 1
+        assert home(ref).turn == turn + 1
 
 
 class Gambler(hf.Actor):
@@ -247,7 +247,8 @@ async def test_a_replay_waits_as_long_as_there_was_between_its_messages(pacing: 
         assert loop.time() - before == pytest.approx(seconds, abs=0.01)
         assert again == [*seen, "new"], "ctx.now() is what it was (T24)"
         if seconds:
-            assert (told[0].turns, told[0].seconds) == (3, pytest.approx(seconds))
+            assert told[0].turns == 3
+            assert told[0].seconds == pytest.approx(seconds)
             assert [one.held for one in told] == [2] * len(told)
             assert sorted((one.seconds for one in told), reverse=True) == [one.seconds for one in told]
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.checkpoint.players import Note, Notes, Sink, start, until
-from tests.checkpoint.strikes import NEVER, strike
+from tests.checkpoint.players import Note, Notes, start, until
+from tests.checkpoint.strikes import NEVER, actor_of, home, strike
 
 
 class Arm:
@@ -101,11 +101,19 @@ NavigatorActor = hf.wrap(
 Direct = hf.wrap(Robot, "Direct", callbacks={"/turn": (Turn, "turn")}, methods={Move: "move"})
 
 
-class Out(Sink):
+class Out(hf.Actor):
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
     @hf.subscribe("/out")
     @hf.on(Note)
     def note(self, message: Note) -> int:
-        return super().note(message)
+        self.notes.append(message.text)
+        return len(self.notes)
+
+    @hf.on(Notes, readonly=True)
+    def read(self, message: Notes) -> list[str]:
+        return self.notes
 
 
 async def test_methods_are_called_by_messages_and_the_state_comes_back(isolation: str, store: str | None) -> None:
@@ -126,7 +134,7 @@ async def test_chosen_methods_by_fields_or_with_the_whole_message(isolation: str
         ref = await start(system, isolation, "robot", hf.start(Chosen), recovery=hf.checkpoint_only(0.005))
         ref.tell(Turn(90))
         assert await ref.ask(Move(3, 2.0)) == 6.0
-        switch = ref._cell.host.switch  # type: ignore[attr-defined]
+        switch = home(ref)
         await until(lambda: switch.state_turn >= 2)
         strike(system, ref)
         assert await ref.ask(Move(0, 0.0), timeout=8.0) == 6.0
@@ -149,7 +157,7 @@ async def test_a_topic_can_feed_a_method(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("robot", hf.start(Direct), recovery=hf.hybrid()))
     await system.publish("/turn", Turn(7))
     assert await ref.ask(Move(1, 1.0)) == 1.0
-    assert ref._cell.actor.program.log == ["turn 7", "move 1.0"]
+    assert actor_of(ref).program.log == ["turn 7", "move 1.0"]
 
 
 class Clockwork:
@@ -170,11 +178,11 @@ ClockworkActor = hf.wrap(Clockwork, "ClockworkActor", callbacks={"/scan": Scan})
 async def test_a_programs_timers_go_on_over_crashes(system: hf.ActorSystem, recovery: Any) -> None:
     ref = await system.start(hf.child("clock", hf.start(ClockworkActor), recovery=recovery))
     await asyncio.sleep(3.5)
-    before = list(ref._cell.actor.program.ticks)
+    before = list(actor_of(ref).program.ticks)
     assert len(before) == 3
     ref.kill()
     await asyncio.sleep(2.1)
-    after = ref._cell.actor.program.ticks
+    after = actor_of(ref).program.ticks
     assert len(after) == (2 if recovery is None else 5)
     assert recovery is None or after[:3] == before, "time and random numbers too"
 

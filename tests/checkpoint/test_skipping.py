@@ -13,7 +13,7 @@ import holdfast as hf
 from holdfast.actors.values import state_digest
 from holdfast.checkpoint.keys import save_state
 from tests.checkpoint.players import Note, Notes, Sink, start
-from tests.checkpoint.strikes import NEVER, event, strike, struck
+from tests.checkpoint.strikes import NEVER, actor_of, event, home, strike, struck
 
 
 class Aim(hf.Message[int]):
@@ -172,7 +172,7 @@ async def test_readonly_turns_are_left_out(system: hf.ActorSystem, isolation: st
     assert await ref.ask(Sum()) == 2 + 3
     assert await notes.ask(Notes()) == ["w0", "w1", "w3"]
     if isolation == "task":
-        assert ref._cell.actor._handled == ["aim", "step"] * 3 + ["sum"]
+        assert actor_of(ref)._handled == ["aim", "step"] * 3 + ["sum"]
 
 
 async def test_superseded_turns_are_left_out_if_nothing_in_between_could_have_seen_them(
@@ -224,7 +224,7 @@ async def test_a_key_that_cannot_be_had_leaves_nothing_out_and_is_told(system: h
     told = await skipped(system, ref)
     assert "unhashable" in told.problem
     assert told.superseded == 0
-    assert ref._cell.actor.pairs == [[2], 1]
+    assert actor_of(ref).pairs == [[2], 1]
 
 
 async def test_skip_false_replays_everything(system: hf.ActorSystem) -> None:
@@ -234,7 +234,7 @@ async def test_skip_false_replays_everything(system: hf.ActorSystem) -> None:
         await ref.ask(Sum())
     recovered = await struck(system, ref)
     assert recovered.replayed == 7
-    assert ref._cell.actor._handled == ["gain", "sum"] * 3
+    assert actor_of(ref)._handled == ["gain", "sum"] * 3
 
 
 async def test_a_full_journal_gives_up_what_no_replay_needs(store: str | None) -> None:
@@ -249,7 +249,7 @@ async def test_a_full_journal_gives_up_what_no_replay_needs(store: str | None) -
             if n % 100 == 0:
                 await ref.ask(Step())
         expected = await ref.ask(Sum())
-        assert len(ref._cell.host.switch.turns) < 100
+        assert len(home(ref).turns) < 100
         for _ in range(2):
             await struck(system, ref)
             assert await ref.ask(Sum()) == expected
@@ -325,7 +325,7 @@ def test_replays_that_leave_out_and_that_do_not_come_to_the_same(messages: list[
                         case "crash":
                             pass
                         case "snapshot":
-                            ref._cell.host.switch.limit._want_snapshot()
+                            home(ref).limit._want_snapshot()
                         case _:
                             ref.tell(message)
             for ref in actors[:2]:
@@ -333,7 +333,7 @@ def test_replays_that_leave_out_and_that_do_not_come_to_the_same(messages: list[
                 ref.kill()
             for ref in actors:
                 await ref.ask(Sum(), timeout=20.0)
-            digests = {state_digest(save_state(ref._cell.actor)) for ref in actors}
+            digests = {state_digest(save_state(actor_of(ref))) for ref in actors}
             assert len(digests) == 1
 
     asyncio.run(play())
