@@ -48,6 +48,7 @@ from holdfast.actors.events import (
     Event,
     EventStream,
     HeldMessages,
+    JournalFull,
     LogLine,
     LoopLagged,
     MessageIn,
@@ -60,6 +61,7 @@ from holdfast.actors.events import (
     RecoveryFailed,
     RecoveryHookFailed,
     RecoveryPhase,
+    ReplayPaced,
     RolledBack,
     SafeStateEntered,
     SafeStateKept,
@@ -72,7 +74,9 @@ from holdfast.actors.events import (
     SupervisorGaveUp,
     TurnBegan,
     TurnEnded,
+    TurnsLost,
     TurnSlow,
+    TurnsSkipped,
 )
 from holdfast.actors.exits import (
     KILLED,
@@ -94,11 +98,14 @@ from holdfast.actors.links import Monitor
 from holdfast.actors.mail import ReplyHandle
 from holdfast.actors.mailbox import bounded
 from holdfast.actors.message import Message, Refusal
+from holdfast.actors.plain import Bus, Calls, Wrapped, calls, wrap
 from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
-from holdfast.checkpoint.method import Method, fresh, hybrid
+from holdfast.checkpoint.file import RecoveryFile, load_recovery
+from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
+from holdfast.checkpoint.readonly import NotReadonly
 from holdfast.checkpoint.recovery.settings import (
     Held,
     RecoveryHooks,
@@ -182,6 +189,8 @@ __all__ = [
     "Backoff",
     "BadMessage",
     "Binding",
+    "Bus",
+    "Calls",
     "CannotMove",
     "Change",
     "ChangeSupervisor",
@@ -213,6 +222,7 @@ __all__ = [
     "Ignore",
     "InputRefused",
     "Job",
+    "JournalFull",
     "KILLED",
     "KeyFreed",
     "KeyRegistered",
@@ -239,6 +249,7 @@ __all__ = [
     "NoSuchChild",
     "Normal",
     "NotAnActor",
+    "NotReadonly",
     "NotSupported",
     "NotSuspended",
     "NotUnique",
@@ -262,6 +273,7 @@ __all__ = [
     "Quarantined",
     "Recovered",
     "RecoveryFailed",
+    "RecoveryFile",
     "RecoveryHookFailed",
     "RecoveryHooks",
     "RecoveryPhase",
@@ -272,6 +284,7 @@ __all__ = [
     "RegistryEntry",
     "RemoteCrash",
     "ReplayDiverged",
+    "ReplayPaced",
     "ReplyHandle",
     "ResizePartitions",
     "ResizePool",
@@ -316,18 +329,24 @@ __all__ = [
     "TurnBegan",
     "TurnEnded",
     "TurnSlow",
+    "TurnsLost",
+    "TurnsSkipped",
     "Unbound",
     "UnknownMessage",
     "UntrustedFile",
     "WhichChildren",
+    "Wrapped",
     "WrongActor",
     "bounded",
+    "calls",
     "check_children",
+    "checkpoint_only",
     "child",
     "dynamic",
     "fresh",
     "held",
     "hybrid",
+    "load_recovery",
     "load_tree",
     "on",
     "partition_of",
@@ -337,6 +356,7 @@ __all__ = [
     "program",
     "recovery_hooks",
     "registry",
+    "replay_only",
     "rule",
     "run",
     "safe_state",
@@ -345,4 +365,5 @@ __all__ = [
     "supervisor",
     "tasks",
     "tree_from",
+    "wrap",
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import typing
 from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar, cast, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast, overload
 
 import msgspec
 
@@ -45,9 +45,16 @@ class Handles(typing.NamedTuple):
     kind: type[Message[Any]]
     readonly: bool
     to_thread: bool
+    supersedes: str | bool | Callable[[Any], Any] | None = None
 
 
-def on(kind: type[Message[R]], *, readonly: bool = False, to_thread: bool = False) -> _On[R]:
+def on(
+    kind: type[Message[R]],
+    *,
+    readonly: bool = False,
+    to_thread: bool = False,
+    supersedes: str | Literal[True] | Callable[[Any], Any] | None = None,
+) -> _On[R]:
     """Make a method the handler of one message type (and of types derived from it that have none of their own).
 
     Args:
@@ -55,12 +62,22 @@ def on(kind: type[Message[R]], *, readonly: bool = False, to_thread: bool = Fals
         readonly: the handler changes no state, so a replay may leave it out.
         to_thread: the handler, a plain `def`, blocks: it is run in a worker thread. The actor handles nothing else
             meanwhile. In it, `self.ctx` and refs' `tell` work, and what has to be awaited does not.
+        supersedes: the handler overwrites all that it wrote for an earlier message with the same key, and reads
+            nothing: the latest wins. A replay may leave the earlier ones out. The key is the field of this name, what
+            a function makes of the message, or (True) the same for all messages of this type.
     """
     if not (isinstance(kind, type) and issubclass(kind, Message)):
         raise TypeError(f"@on takes a Message class, not {kind!r}")
+    if isinstance(supersedes, str):
+        if supersedes not in kind.__struct_fields__:
+            raise TypeError(f"@on({kind.__name__}, supersedes={supersedes!r}): {kind.__name__} has no such field")
+    elif supersedes is not None and supersedes is not True and not callable(supersedes):
+        raise TypeError(f"@on({kind.__name__}): supersedes is a field, a function or True, not {supersedes!r}")
+    if readonly and supersedes is not None:
+        raise TypeError(f"@on({kind.__name__}): a readonly handler writes nothing, so it supersedes nothing")
 
     def mark(handler: Any) -> Any:
-        handler.__handles__ = (*getattr(handler, "__handles__", ()), Handles(kind, readonly, to_thread))
+        handler.__handles__ = (*getattr(handler, "__handles__", ()), Handles(kind, readonly, to_thread, supersedes))
         return handler
 
     return cast("_On[R]", mark)
@@ -95,13 +112,13 @@ class Actor:
     """Raise it when the saved state changes its shape."""
 
     _table: ClassVar[Table] = Table()
-    _readonly: ClassVar[frozenset[type]] = frozenset()
+    _declared: ClassVar[dict[type, Handles]] = {}
     _topics: ClassVar[tuple[str, ...]] = ()
     _bindings: ClassVar[frozenset[str]] = frozenset()
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
-        table, readonly, topics = Table(), set[type](), list[str]()
+        table, declared, topics = Table(), dict[type, Handles](), list[str]()
         for name in dir(cls):
             handler = inspect.getattr_static(cls, name)
             for handles in getattr(handler, "__handles__", ()):
@@ -109,10 +126,9 @@ class Actor:
                 if handles.kind in table:
                     raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
                 table[handles.kind] = in_thread(handler) if handles.to_thread else handler
-                if handles.readonly:
-                    readonly.add(handles.kind)
+                declared[handles.kind] = handles
             topics.extend(getattr(handler, "__topics__", ()))
-        cls._table, cls._readonly, cls._topics = table, frozenset(readonly), tuple(topics)
+        cls._table, cls._declared, cls._topics = table, declared, tuple(topics)
         cls._bindings = cls._bindings | _declared_bindings(cls)
 
     def on_start(self, restored: bool) -> Any:
@@ -145,6 +161,10 @@ class Actor:
     def on_recovered(self) -> Any:
         """State and messages are back; called before new messages are let in."""
 
+    def _state_root(self) -> Any:
+        """Whose attributes the key variables are."""
+        return self
+
     async def _stop_children(self) -> None:
         """The life ends: its children go first, newest first."""
         for child in reversed(list((self.ctx.cell.children or {}).values())):
@@ -162,7 +182,7 @@ def _check(cls: type, name: str, handler: Any, kind: type) -> None:
         declared = typing.get_type_hints(handler).get(parameters[1].name)
     except NameError:  # A name that is only imported for checking, or defined further down.
         return
-    if isinstance(declared, type) and not issubclass(kind, declared):
+    if isinstance(declared, type) and declared is not Any and not issubclass(kind, declared):
         raise TypeError(f"{type_name(cls)}.{name} is @on({kind.__name__}) but takes a {declared.__name__}")
 
 

@@ -185,6 +185,38 @@ class RolledBack(Event, frozen=True, eq=False):
     reason: str
 
 
+class TurnsLost(Event, frozen=True, eq=False):
+    """An actor comes back with the state of its snapshot after `turn` (-1: it has none, and begins afresh).
+
+    What it handled since, `count` messages, timers and signals, is lost from its state (`checkpoint_only`).
+    """
+
+    count: int
+    turn: int
+
+
+class ReplayPaced(Event, frozen=True, eq=False):
+    """A replay that waits between messages: `turns` are still to be fed, and the last is due in `seconds`.
+
+    `held` messages have come meanwhile. Told when it begins, and now and then.
+    """
+
+    turns: int
+    seconds: float
+    held: int
+
+
+class TurnsSkipped(Event, frozen=True, eq=False):
+    """A replay left out `readonly` turns that changed nothing and `superseded` ones that are written over.
+
+    `problem`: why a key could not be had; nothing was left out because of it.
+    """
+
+    readonly: int
+    superseded: int
+    problem: str = ""
+
+
 class MessageQuarantined(Event, frozen=True, eq=False):
     """A message that ended the process `deliveries` times in a row was put aside."""
 
@@ -213,10 +245,11 @@ class StoreRefused(Event, frozen=True, eq=False):
 
 
 class JournalFull(Event, frozen=True, eq=False):
-    """The journal reached its limit; `turn` is the last one a snapshot covers."""
+    """The journal reached its limit; `turn` is the last one a snapshot covers, `way_out` says what can help."""
 
     turn: int
     size_bytes: int
+    way_out: str = ""
 
 
 class TurnSlow(Event, frozen=True, eq=False):

@@ -59,6 +59,7 @@ class Node(RunLoop):
         self.here: Host = LOCAL  # lives in this very process
         self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
         self.keeper: Keeper = NothingKept()
+        self.complete: Callable[[Any, str], Any] = lambda spec, path: spec  # what else is known of a child spec
         self.respec: Callable[[Cell, Start[Any]], None] = begin_with  # has an actor's next lives begin with this
         self._seeds = random.Random(seed)
         self._numbers = itertools.count(1)

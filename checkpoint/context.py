@@ -211,6 +211,8 @@ class RecordedContext(ActorContext):
         )
         tasks.add(task)
         task.add_done_callback(tasks.discard)
+        if asyncio.iscoroutine(work):  # Cancelled before its first step, the task would leave it unawaited.
+            task.add_done_callback(lambda _: work.close())
 
     async def _piped(self, turn: int, k: int, work: Any, then: Any, failed: Any) -> None:
         try:

@@ -59,7 +59,7 @@ class TaskHost(HomeHost, lives.LocalHost):
         """S3, the new life with its state."""
         start = cell.extra().start
         assert start is not None
-        life = self.life = Life(cell, LocalHome(self, cell), self.method.interval, None)
+        life = self.life = Life(cell, LocalHome(self, cell), self.method, None)
         for record in switch.restore_records():
             life.from_home(record)
         life.begin(start, switch.state_turn, switch.stash)
@@ -185,7 +185,7 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
-        options = {"recorded": {"interval": self.method.interval, "turn": switch.state_turn, "stash": switch.stash}}
+        options = {"recorded": {"method": self.method.data(), "turn": switch.state_turn, "stash": switch.stash}}
         try:
             await worker.launch(cell, recipe, options)
             clock.mark("restart")

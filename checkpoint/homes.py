@@ -13,6 +13,8 @@ from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
 from .bound import HomeBound
+from .file import RecoveryFile
+from .forgotten import forget_turns
 from .journal import Journal
 from .method import Method
 from .recovery.held import hold, inlet, let_go
@@ -37,6 +39,7 @@ class Homes:
         self.recoveries = Recoveries(node)
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
+        self.file: RecoveryFile | None = None
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         unfinished = journal.notes(ERASING).get(ERASING)
         self._stored = set(journal.addresses())
@@ -223,6 +226,8 @@ class HomeHost:
     def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
         """A life is to begin: its home holds what comes. Returns the home, when it is live, and if it recovers."""
         switch = self.switch = self.homes.of(cell, self.method)
+        if not self.method.replays:
+            forget_turns(switch)
         self.clock = self.clock or Clock()
         self.clock.mark("isolate")
         return switch, switch.prepare(), not switch.is_new

@@ -7,6 +7,8 @@ from typing import Any
 from ..actors.actor import Actor
 from ..actors.errors import HoldfastError, type_name
 from ..actors.values import UnsavableValue, decode_value, encode_value
+from ..actors.values.classes import slots_of
+from .method import Method
 
 
 class StateMismatch(HoldfastError):
@@ -17,7 +19,7 @@ class StateMismatch(HoldfastError):
         self.actor, self.problem = actor, problem
 
     def __str__(self) -> str:
-        return f"the saved state of {self.actor} does not fit: {self.problem}"
+        return f"the state of {self.actor} does not fit: {self.problem}"
 
 
 def save_state(actor: Actor) -> bytes:
@@ -26,19 +28,17 @@ def save_state(actor: Actor) -> bytes:
     Raises:
         UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there.
     """
-    where, kind = actor.ctx.path, type_name(type(actor))
-    get_state = getattr(actor, "get_state", None)
+    where, names = actor.ctx.path, key_names(actor)
+    root = actor._state_root()
+    kind = type_name(type(root))
+    get_state = getattr(actor, "get_state", None) if names is None else None
     if get_state is not None:
         state = get_state()
         return _encode(actor, "state", state, [(f"{where}: {kind}.get_state()", state)])
-    names = actor.key_variables
     if names is None:
-        state = {name: value for name, value in vars(actor).items() if not name.startswith("_") and name != "ctx"}
+        state = {name: value for name, value in attributes(root) if not name.startswith("_") and name != "ctx"}
     else:
-        missing = [name for name in names if not hasattr(actor, name)]
-        if missing:
-            raise StateMismatch(where, f"{kind} has no key variable {missing[0]!r}")
-        state = {name: getattr(actor, name) for name in names}
+        state = {name: read_path(where, root, name) for name in names}
     return _encode(actor, "keys", state, [(f"{where}: {kind}.{name}", value) for name, value in state.items()])
 
 
@@ -70,5 +70,71 @@ def restore_state(actor: Actor, data: bytes) -> None:
             raise StateMismatch(where, f"{type_name(type(actor))} has no set_state")
         set_state(state)
         return
+    root = actor._state_root()
     for name, value in state.items():
-        setattr(actor, name, value)
+        write_path(where, root, name, value)
+
+
+def key_names(actor: Actor) -> tuple[str, ...] | None:
+    """The key variables that the recovery file names, or the class; None for all attributes."""
+    life = getattr(actor.ctx, "recorded", None)
+    named: tuple[str, ...] | None = None if life is None else life.method.key_variables
+    if named is not None:
+        return named
+    # A class with get_state means that, whatever else it says.
+    return None if getattr(actor, "get_state", None) is not None else actor.key_variables
+
+
+def attributes(root: object) -> list[tuple[str, Any]]:
+    """Names and values of the attributes of an object, also of one with slots."""
+    slots = [(name, getattr(root, name)) for name in slots_of(type(root)) if hasattr(root, name)]
+    return [*getattr(root, "__dict__", {}).items(), *slots]
+
+
+def read_path(where: str, root: object, path: str) -> Any:
+    """The variable at a dotted path, `robot.pose.x`, from an object down.
+
+    Raises:
+        StateMismatch: there is none.
+    """
+    value = root
+    for name in path.split("."):
+        try:
+            value = getattr(value, name)
+        except AttributeError:
+            inside = "" if value is root else f": a {type_name(type(value))} has no attribute {name!r}"
+            raise StateMismatch(where, f"{type_name(type(root))} has no key variable {path!r}{inside}") from None
+    return value
+
+
+def write_path(where: str, root: object, path: str, value: object) -> None:
+    """Set the variable at a dotted path.
+
+    Raises:
+        StateMismatch: there is nothing to set it on, or it cannot be set.
+    """
+    above, _, name = path.rpartition(".")
+    holder = read_path(where, root, above) if above else root
+    try:
+        setattr(holder, name, value)
+    except (AttributeError, TypeError) as error:
+        raise StateMismatch(where, f"{type_name(type(root))}.{path} cannot be set: {error}") from error
+
+
+def check_keys(actor: Actor, method: Method, *, first: bool) -> None:
+    """Check the variables that a recovery file names, when `__init__` has run; `first`: nothing is put back now.
+
+    Raises:
+        StateMismatch: naming file, class and variable, and its type if it cannot be saved.
+    """
+    root, where = actor._state_root(), actor.ctx.path
+    for name in method.key_variables or ():
+        try:
+            value = read_path(where, root, name)
+            write_path(where, root, name, value)  # Now, not when it is needed.
+            if first:
+                encode_value(value, where=f"{type_name(type(root))}.{name}")
+        except UnsavableValue as error:
+            raise StateMismatch(where, f"{method.origin}: key variable {name!r}: {error}") from error
+        except StateMismatch as error:
+            raise StateMismatch(where, f"{method.origin}: {error.problem}") from error

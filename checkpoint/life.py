@@ -18,7 +18,9 @@ from ..actors.exits import ExitReason
 from ..actors.mail import Item
 from ..actors.message import Message, message_name
 from .context import RecordedContext
-from .keys import restore_state, save_state
+from .keys import check_keys, restore_state, save_state
+from .method import Method
+from .readonly import check_readonly
 from .records import (
     FAILED,
     REPLY,
@@ -59,8 +61,9 @@ class HomePort(Protocol):
 class Life:
     """One recorded life: the turn in hand, its outputs, and when the next snapshot is due."""
 
-    def __init__(self, cell: Cell, port: HomePort, interval: float, page: memoryview | None) -> None:
-        self.cell, self.port, self.interval, self.page = cell, port, interval, page
+    def __init__(self, cell: Cell, port: HomePort, method: Method, page: memoryview | None) -> None:
+        self.cell, self.port, self.method, self.page = cell, port, method, page
+        self.interval = method.interval if method.snapshots else 0.0  # 0: no snapshot is ever taken
         self.turn = 0
         self.feed: Feed | None = None
         self.outs: list[Out] = []
@@ -99,6 +102,14 @@ class Life:
         actor = cell.actor
         assert actor is not None
         self.turn = turn
+        try:
+            check_keys(actor, self.method, first=not self._has_state)
+        except HoldfastError as error:
+            self._context_made.close()
+            cell.actor = cell.ctx = None
+            raise StartFailed(cell.path, str(error)) from error
+        if self.method.check_readonly:
+            check_readonly(actor, self)
         if self._has_state:
             begin = time.perf_counter()
             try:
@@ -300,7 +311,7 @@ class Life:
 
     def take_snapshot(self) -> None:
         """Save the state after the last turn; while background work is out, its turn must stay in the journal."""
-        if self.pipes or self.turn == self._snapshot_turn or not self.is_live:
+        if self.pipes or self.turn == self._snapshot_turn or not self.is_live or not self.method.snapshots:
             return
         actor = self.cell.actor
         assert actor is not None
@@ -321,11 +332,13 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
-        if self.turn != self._snapshot_turn:
+        if self.turn != self._snapshot_turn and self.method.snapshots:  # Else all of it is replayed there.
             self._send_snapshot(save_state(actor), begin)
 
     def may_replace(self) -> str:
         """Why the state cannot be replaced from outside now; "" if it can: a snapshot has to follow at once."""
+        if not self.method.snapshots:
+            return f"{self.method.name} takes no snapshots, and no replay leads to a state that was put in place"
         return "background work (pipe_to_self) is out; try again when it is back" if self.pipes else ""
 
     def replaced(self) -> None:

@@ -27,6 +27,11 @@ class Limit:
         """Whether the journal has no room."""
         return self._home.bytes >= self._home.method.journal_limit
 
+    def makes_room(self) -> bool:
+        """Whether there is room when what no replay needs is given up."""
+        self._home.skipping.compact()
+        return not self.is_reached
+
     def refuse(self, ask: Ask | None) -> None:
         """Have a snapshot taken, and refuse a message until the journal is cut.
 
@@ -36,7 +41,7 @@ class Limit:
         home = self._home
         if not self._is_told:
             self._is_told = True
-            home.node.emit(JournalFull(home.path, home.state_turn, home.bytes))
+            home.node.emit(JournalFull(home.path, home.state_turn, home.bytes, self._way_out()))
         self._want_snapshot()
         error = MailboxFull(home.path, len(home.open))
         if ask is None:
@@ -49,6 +54,14 @@ class Limit:
         future: asyncio.Future[None] = self._home.node.loop.create_future()
         self._waiters.append(future)
         return future
+
+    def _way_out(self) -> str:
+        if self._home.method.snapshots:
+            return "it goes on behind the next snapshot"
+        return (
+            f"{self._home.method.name} takes no snapshots, so nothing more is admitted: "
+            "raise journal_limit, use hybrid, or start the actor afresh"
+        )
 
     def _want_snapshot(self) -> None:
         if self._home.port is not None:

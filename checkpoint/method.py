@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
+
+import msgspec
 
 from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
@@ -20,23 +22,57 @@ from .recovery.settings import (
 
 Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]
+Pacing = Literal["fast", "original"] | float
+JOURNAL_LIMIT = 256_000_000
+OF_LIVES = ("name", "interval", "check_readonly", "key_variables", "origin")
+"""The settings that concern a life, not its home."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Method:
-    """How an actor is recovered; made by `fresh` or `hybrid`."""
+    """How an actor is recovered; made by `fresh`, `checkpoint_only`, `replay_only` or `hybrid`, or by a recovery file.
+
+    `key_variables` are those that a recovery file names, and `origin` is where it does; else the class says.
+    """
 
     name: str
     interval: float = 0.0
     max_deliveries: int = 5
-    journal_limit: int = 256_000_000
+    journal_limit: int = JOURNAL_LIMIT
     keep: int = 2
     on_escalate: OnEscalate | None = None
+    pacing: Pacing = "fast"
+    skip: bool = True
+    check_readonly: bool = False
+    key_variables: tuple[str, ...] | None = None
+    origin: str = ""
     safe_state: SafeState | None = None
     safe_state_timeout: float = SAFE_STATE_TIMEOUT
     held: Held | None = None
     held_topics: tuple[tuple[str, Held], ...] = ()
     hooks: RecoveryHooks | None = None
+
+    def __post_init__(self) -> None:
+        """Raises SpecError: naming the method, the setting, and what it may be."""
+        where = self.name
+        if self.snapshots and (not _number(self.interval) or not 0 < self.interval < float("inf")):
+            raise SpecError(where, f"interval must be seconds > 0, not {self.interval!r}")
+        if self.pacing not in ("fast", "original") and (
+            not _number(self.pacing) or not 0 < float(self.pacing) < float("inf")
+        ):
+            raise SpecError(where, f"pacing must be 'fast', 'original' or a factor > 0, not {self.pacing!r}")
+        if not _whole(self.max_deliveries) or self.max_deliveries < 1:
+            raise SpecError(where, f"max_deliveries must be a whole number >= 1, not {self.max_deliveries!r}")
+        if not _whole(self.journal_limit) or self.journal_limit < 1:
+            raise SpecError(where, f"journal_limit must be bytes > 0, not {self.journal_limit!r}")
+        if self.keep not in (1, 2) or not _whole(self.keep):
+            raise SpecError(where, f"keep must be 1 or 2, not {self.keep!r}")
+        if self.on_escalate is not None and self.on_escalate not in get_args(OnEscalate):
+            known = ", ".join(map(repr, get_args(OnEscalate)))
+            raise SpecError(where, f"on_escalate must be one of {known} or left out, not {self.on_escalate!r}")
+        for name in ("skip", "check_readonly"):
+            if not isinstance(getattr(self, name), bool):
+                raise SpecError(where, f"{name} must be True or False, not {getattr(self, name)!r}")
 
     def after_escalation(self, times: int) -> OnEscalate:
         """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
@@ -50,8 +86,34 @@ class Method:
 
     @property
     def records(self) -> bool:
-        """Whether inputs are journaled and state is saved."""
+        """Whether inputs are journaled, and something comes back."""
         return self.name != "fresh"
+
+    @property
+    def snapshots(self) -> bool:
+        """Whether the state is saved now and then."""
+        return self.name in ("hybrid", "checkpoint_only")
+
+    @property
+    def replays(self) -> bool:
+        """Whether what was handled since the last snapshot is handled again."""
+        return self.name in ("hybrid", "replay_only")
+
+    @property
+    def speed(self) -> float:
+        """How many times faster than they came replayed inputs are fed; 0: without waiting at all."""
+        if self.pacing == "fast":
+            return 0.0
+        return 1.0 if self.pacing == "original" else float(self.pacing)
+
+    def data(self) -> dict[str, Any]:
+        """What a life in another process has to know of it."""
+        return {name: msgspec.to_builtins(getattr(self, name)) for name in OF_LIVES}
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> Method:
+        """The method again, as far as a life has to know it."""
+        return msgspec.convert(data, cls)
 
     def check(self, where: str, kind: type[Actor]) -> None:
         """Refuse what cannot work for this class.
@@ -65,8 +127,12 @@ class Method:
                 raise SpecError(
                     where, f"safe_state: {type_name(kind)} has no binding {port!r}; addresses begin with '/'"
                 )
-        if self.records and not kind.deterministic:
-            raise SpecError(where, f"{type_name(kind)} is not deterministic, so {self.name} cannot replay its messages")
+        if self.replays and not kind.deterministic:
+            raise SpecError(
+                where,
+                f"{type_name(kind)} is not deterministic, so {self.name} cannot replay its messages; "
+                "use checkpoint_only or fresh",
+            )
 
 
 def fresh() -> Method:
@@ -74,14 +140,81 @@ def fresh() -> Method:
     return Method("fresh")
 
 
+def checkpoint_only(
+    interval: float = 2.0,
+    *,
+    max_deliveries: int = 5,
+    journal_limit: int = JOURNAL_LIMIT,
+    keep: int = 2,
+    on_escalate: OnEscalate | None = None,
+    safe_state: str | Sequence[str] | SafeState | None = None,
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT,
+    held: Held | Mapping[str, Held] | None = None,
+    hooks: RecoveryHooks | None = None,
+) -> Method:
+    """State comes back from the last snapshot alone; what was handled since is lost from it (`TurnsLost` counts it).
+
+    Nothing is replayed, so the class need not be deterministic. What was not handled stays queued. The turn that the
+    crash interrupted begins anew, unless it has let something out already: then it ends with that, and who asked gets
+    AskFailed. The arguments are those of `hybrid`.
+
+    Source:
+        Zou and Bai, the first of the two methods they compare theirs with.
+    """
+    return Method(
+        "checkpoint_only",
+        interval,
+        max_deliveries,
+        journal_limit,
+        keep,
+        on_escalate,
+        **_meanwhile("checkpoint_only", safe_state, safe_state_timeout, held, hooks),
+    )
+
+
+def replay_only(
+    *,
+    pacing: Pacing = "fast",
+    max_deliveries: int = 5,
+    journal_limit: int = JOURNAL_LIMIT,
+    on_escalate: OnEscalate | None = None,
+    skip: bool = True,
+    check_readonly: bool = False,
+    safe_state: str | Sequence[str] | SafeState | None = None,
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT,
+    held: Held | Mapping[str, Held] | None = None,
+    hooks: RecoveryHooks | None = None,
+) -> Method:
+    """State comes back by handling everything again since the very first start; no snapshot is ever taken.
+
+    So a recovery takes as long as the actor has worked, and the journal only grows: at `journal_limit` nothing is
+    admitted any more (`JournalFull` says so). The arguments are those of `hybrid`.
+
+    Source:
+        Zou and Bai, the second of the two methods they compare theirs with.
+    """
+    return Method(
+        "replay_only",
+        max_deliveries=max_deliveries,
+        journal_limit=journal_limit,
+        on_escalate=on_escalate,
+        pacing=pacing,
+        skip=skip,
+        check_readonly=check_readonly,
+        **_meanwhile("replay_only", safe_state, safe_state_timeout, held, hooks),
+    )
+
+
 def hybrid(
     interval: float = 2.0,
     *,
-    pacing: Literal["fast"] = "fast",
+    pacing: Pacing = "fast",
     max_deliveries: int = 5,
-    journal_limit: int = 256_000_000,
+    journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
+    skip: bool = True,
+    check_readonly: bool = False,
     safe_state: str | Sequence[str] | SafeState | None = None,
     safe_state_timeout: float = SAFE_STATE_TIMEOUT,
     held: Held | Mapping[str, Held] | None = None,
@@ -91,7 +224,9 @@ def hybrid(
 
     Args:
         interval: seconds between snapshots, > 0 and finite; only a changed actor is saved.
-        pacing: "fast" replays as quickly as the handlers run.
+        pacing: "fast" replays as quickly as the handlers run; "original" waits between messages as long as there was
+            between them when they came; a number is a speed-up, 2.0 waits half as long. New messages are held
+            meanwhile: at 1.0 or below, an actor that gets more than it can handle never catches up.
         max_deliveries: process deaths in the turn of one and the same message after which it is quarantined.
         journal_limit: bytes of messages kept since the last snapshot; when it is reached, sends wait or are refused.
         keep: snapshots that are kept: 2, or 1 to save the memory or disk of the older one.
@@ -99,6 +234,10 @@ def hybrid(
             is; go back to the "older_snapshot", without the turns since; begin "fresh". In all cases what has not been
             handled stays queued. Left out: an older snapshot the second time within the window of whoever restarted
             the supervisor, else restore.
+        skip: leave out of the replay what changes nothing: messages of `@on(readonly=True)`, and of
+            `@on(supersedes=...)` those that a later one has made useless.
+        check_readonly: end the life (NotReadonly) when a handler that is declared readonly changes the state. This
+            saves the state twice for each of its turns: for tests and for finding faults.
         safe_state: who is to be safe while it is recovered: an address, a list of them, the name of a binding of its
             class, or `safe_state(...)` with messages.
         safe_state_timeout: seconds after which a receiver that has not heard of the end raises SafeStateOverdue.
@@ -108,32 +247,43 @@ def hybrid(
     Source:
         Zou and Bai, checkpoint and replay combined.
     """
-    if not isinstance(interval, (int, float)) or isinstance(interval, bool) or not 0 < interval < float("inf"):
-        raise SpecError("hybrid", f"interval must be seconds > 0, not {interval!r}")
-    if pacing != "fast":
-        raise SpecError("hybrid", f"pacing must be 'fast', not {pacing!r}")
-    if not isinstance(max_deliveries, int) or isinstance(max_deliveries, bool) or max_deliveries < 1:
-        raise SpecError("hybrid", f"max_deliveries must be a whole number >= 1, not {max_deliveries!r}")
-    if not isinstance(journal_limit, int) or isinstance(journal_limit, bool) or journal_limit < 1:
-        raise SpecError("hybrid", f"journal_limit must be bytes > 0, not {journal_limit!r}")
-    if keep not in (1, 2) or isinstance(keep, bool):
-        raise SpecError("hybrid", f"keep must be 1 or 2, not {keep!r}")
-    if on_escalate is not None and on_escalate not in get_args(OnEscalate):
-        known = ", ".join(map(repr, get_args(OnEscalate)))
-        raise SpecError("hybrid", f"on_escalate must be one of {known} or left out, not {on_escalate!r}")
-    if hooks is not None and not isinstance(hooks, RecoveryHooks):
-        raise SpecError("hybrid", f"hooks must come from recovery_hooks(...), not be {hooks!r}")
-    for_all, by_topic = as_held("hybrid", held)
     return Method(
         "hybrid",
-        float(interval),
+        interval,
         max_deliveries,
         journal_limit,
-        int(keep),
+        keep,
         on_escalate,
-        safe_state=as_safe_state("hybrid", safe_state),
-        safe_state_timeout=check_seconds("hybrid", "safe_state_timeout", safe_state_timeout),
-        held=for_all,
-        held_topics=by_topic,
-        hooks=hooks,
+        pacing=pacing,
+        skip=skip,
+        check_readonly=check_readonly,
+        **_meanwhile("hybrid", safe_state, safe_state_timeout, held, hooks),
     )
+
+
+def _meanwhile(
+    where: str,
+    safe_state: str | Sequence[str] | SafeState | None,
+    safe_state_timeout: float,
+    held: Held | Mapping[str, Held] | None,
+    hooks: RecoveryHooks | None,
+) -> dict[str, Any]:
+    """What is done while an actor is recovered, checked."""
+    if hooks is not None and not isinstance(hooks, RecoveryHooks):
+        raise SpecError(where, f"hooks must come from recovery_hooks(...), not be {hooks!r}")
+    for_all, by_topic = as_held(where, held)
+    return {
+        "safe_state": as_safe_state(where, safe_state),
+        "safe_state_timeout": check_seconds(where, "safe_state_timeout", safe_state_timeout),
+        "held": for_all,
+        "held_topics": by_topic,
+        "hooks": hooks,
+    }
+
+
+def _number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)

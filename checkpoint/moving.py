@@ -93,7 +93,7 @@ class RecordedToProcess(ToProcess):
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
-        recorded = {"interval": self.host.method.interval, "turn": switch.state_turn, "stash": switch.stash}
+        recorded = {"method": self.host.method.data(), "turn": switch.state_turn, "stash": switch.stash}
         kept = {"suspended": more.suspended, "trap_exits": more.trap_exits}
         launched = worker.launch(cell, self.recipe, {"recorded": {**recorded, **kept}})
         await self.within(launched, self.timeout, lambda: "its new life was not up")
@@ -173,7 +173,7 @@ class RecordedToTask(FromProcess):
         switch, live, _ = host.open(cell)
         settled: asyncio.Future[None] = self.node.loop.create_future()
         home = ArrivingHome(host, cell, other, settled)
-        life = Life(other, home, host.method.interval, None)
+        life = Life(other, home, host.method, None)
         life.begins_suspended = self.suspended
         for record in switch.restore_records():
             life.from_home(record)

@@ -44,6 +44,8 @@ class SubtreeHost(ProcessHost):
         worker, recipe = await super().take(cell)
         kept = self._homes.notes(child_key(cell.path, ""))
         self._options = {"kept": kept, "known": self._homes.known(cell.path)}
+        if self._homes.file is not None:
+            self._options["recovery_file"] = self._homes.file.data()
         slots = Slots(len(worker.page))
 
         def taker(path: str) -> frames.TakeRecord:

@@ -66,7 +66,9 @@ from .records import (
     pieces,
 )
 from .recovery.held import Holding, Inlet, let_go
+from .replay import Replay
 from .saved import Meta, cut, load
+from .skipping import Skipping
 from .timers import Timers
 
 if TYPE_CHECKING:
@@ -105,6 +107,8 @@ class Switch:
         self.inlets: dict[str, Inlet] = {}
         self.recoveries: Recoveries | None = None
         self.waits_for_release = False  # somebody else says when the actor gets what is new
+        self.replay = Replay(self)
+        self.skipping = Skipping(self)
         self.pipes_done: dict[int, set[int]] = {}
         self.topics: dict[str, None] = {}
         self.newest: Meta | None = None  # the snapshot to begin with
@@ -144,7 +148,7 @@ class Switch:
             if type(message) not in cell.table:
                 cell.require(message)
             name, body = message_name(type(message)), self.node.codec.encode(message, self.path)
-        if self.bytes >= self.method.journal_limit:
+        if self.bytes >= self.method.journal_limit and not self.limit.makes_room():
             self.limit.refuse(ask)
             return
         origin = None if sender is None else sender.path
@@ -165,7 +169,7 @@ class Switch:
 
     def room(self) -> asyncio.Future[None] | None:
         """For `send`: None while the journal has room."""
-        if self.limit.is_reached:
+        if self.limit.is_reached and not self.limit.makes_room() and self.method.snapshots:
             return self.limit.wait()
         return None if self.bound is None else self.bound.room()
 
@@ -241,6 +245,7 @@ class Switch:
         self.replayed = 0
         self.diverged = None
         self.is_void = False
+        self.replay.cancel()
         self._incoming.clear()  # The last life may have died in the middle of a snapshot.
         self.timers.resume()
         if self.live is not None and not self.live.done():
@@ -263,10 +268,19 @@ class Switch:
         first = next((source for source in self.open.values() if source.kind == START), None)
         if self.is_new and first is None:  # Messages may have come before it.
             first = self.record(START, "", b"", None)
-        for number, turn in self.turns.items():
-            if turn.status in (OK, STASHED):
-                port.to_life(turn.input.feed(number, tuple(sorted(self.pipes_done.get(number, ())))))
-                self.replayed += 1
+        skipped = self.skipping.choose()
+        self.skipping.tell(skipped)
+        left_out = skipped.readonly | skipped.superseded
+        again = [
+            (number, turn)
+            for number, turn in self.turns.items()
+            if turn.status in (OK, STASHED) and number not in left_out
+        ]
+        self.replayed = len(again)
+        self.replay.begin(port, again, functools.partial(self._caught_up, port, first, recovered))
+
+    def _caught_up(self, port: LifePort, first: Input | None, recovered: bool) -> None:
+        """All that was handled before has been fed again."""
         if first is not None:
             port.to_life(first.feed())
         stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)
@@ -301,6 +315,7 @@ class Switch:
         """The life is over. `running` is the input whose turn it died in, -1 if none; `ordered`: we killed it."""
         self.port = None
         self.is_released = False
+        self.replay.cancel()
         if self.bound is not None:
             self.bound.restart()
         source = self.open.get(running)

@@ -78,8 +78,11 @@ class Timers:
         for timer in self._states.values():
             if timer.handle is not None:
                 timer.handle.cancel()
+        waiting = {source.origin for source in self._home.open.values() if source.kind == TICK}
         self._states = {
-            key: TimerState(name, body, max(0.0, left), interval) for key, (name, body, left, interval) in saved.items()
+            key: TimerState(name, body, max(0.0, left), interval)
+            for key, (name, body, left, interval) in saved.items()
+            if interval > 0 or key not in waiting  # Else it would come twice.
         }
 
     def saved(self) -> dict[str, Saved]:

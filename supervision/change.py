@@ -9,7 +9,7 @@ from ..actors.cell import GONE
 from ..actors.errors import HoldfastError, Ignore, SpecError, StartIgnored, remote_crash, type_name
 from ..actors.node import Node
 from .admin import ChangeSupervisor, opened
-from .children import Child
+from .children import Child, complete
 from .spec import ChildSpec, Flags, Plan, check_spec
 
 if TYPE_CHECKING:
@@ -73,7 +73,8 @@ def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> d
     Raises:
         SpecError: a spec changes what belongs to the address of a child that has one.
     """
-    for spec in plan.children:
+    specs = [complete(supervisor.ctx.cell, spec) for spec in plan.children]
+    for spec in specs:
         one = known.get(spec.id)
         if one is None or one.cell is None or one.cell.state is GONE:
             continue
@@ -83,7 +84,7 @@ def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> d
                     f"child {spec.id!r}", f"{name} belongs to its address: terminate the child before you change it"
                 )
     children: dict[str, Child] = {}
-    for spec in plan.children:
+    for spec in specs:
         one = children[spec.id] = known.get(spec.id) or Child(spec)
         one.spec = spec
         if one.cell is not None and one.cell.state is not GONE:

@@ -46,13 +46,20 @@ class Child:
         return ChildInfo(self.spec.id, self.state, f"{above}/{self.spec.id}", self.spec.is_supervisor)
 
 
-def new_cell(own: Cell, spec: ChildSpec) -> Cell:
+def complete(own: Cell, spec: ChildSpec) -> ChildSpec:
+    """A child's spec with what is said of it elsewhere. Raises SpecError: the two do not go together."""
+    completed: ChildSpec = own.node.complete(spec, f"{own.path}/{spec.id}")
+    return completed
+
+
+def new_cell(own: Cell, one: Child) -> Cell:
     """An address below a supervisor's, for the lives of a child.
 
     Raises:
         StartFailed: a binding points nowhere. NameTaken: somebody else lives there.
     """
-    node = own.node
+    node, spec = own.node, complete(own, one.spec)
+    one.spec = spec
     targets = {port: node.find(path) for port, path in spec.bindings.items()}
     for port, target in targets.items():  # Before there is a cell: a child that cannot start leaves no name taken.
         if target is None:

@@ -31,7 +31,7 @@ from .admin import (
     opened,
 )
 from .change import check_place, new_plan, succession
-from .children import RECOVERING, RESTARTING, STOPPED, UP, Asked, Child, Retry, Row, StartOver, new_cell
+from .children import RECOVERING, RESTARTING, STOPPED, UP, Asked, Child, Retry, Row, StartOver, complete, new_cell
 from .decisions import affected, decide, is_reported
 from .inquiries import Inquiries
 from .intensity import admit_restart
@@ -109,7 +109,7 @@ class Supervisor(Inquiries):
         """
         cell = one.cell
         if cell is None or cell.state is GONE:
-            cell = one.cell = new_cell(self.ctx.cell, one.spec)
+            cell = one.cell = new_cell(self.ctx.cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
         return cell.host.start(cell)
 
@@ -243,6 +243,7 @@ class Supervisor(Inquiries):
         """Forget what was recorded of a child that does not run. Raises HoldfastError if the store refuses."""
         if one.cell is not None:
             lives.retire(one.cell, "it begins afresh")
+        one.spec = complete(self.ctx.cell, one.spec)
         if one.spec.is_supervisor or one.spec.recovery is not None:
             self.ctx.cell.node.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
 

@@ -7,6 +7,7 @@ import socket
 
 from ..actors.cell import Cell
 from ..actors.process import frames, guest
+from ..checkpoint.file import RecoveryFile
 from ..checkpoint.guest import GuestKeeper, RecordedGuest
 from ..supervision.respec import respec
 
@@ -27,6 +28,8 @@ def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Futur
     """Begin the life that the root asks for."""
     options = frame.options
     host.node.keeper = GuestKeeper(host, options.get("kept", {}), options.get("known", []))
+    if "recovery_file" in options:
+        host.node.complete = RecoveryFile(**options["recovery_file"]).complete
     recorded = options.get("recorded")
     if recorded is None:
         return cell.host.start(cell)

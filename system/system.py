@@ -25,6 +25,7 @@ from ..actors.ref import ActorRef, current
 from ..actors.topics import NOT_TAKEN
 from ..actors.watch import LoopWatch, check_limits
 from ..checkpoint.controller import RecordedProcessHost, TaskHost
+from ..checkpoint.file import RecoveryFile, load_recovery
 from ..checkpoint.homes import Homes
 from ..checkpoint.recovery.settings import RecoveryHooks
 from ..checkpoint.stores import open_journal
@@ -68,6 +69,8 @@ class ActorSystem(Controls):
         watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
             For actors in processes see `Limits(hung_after=...)`.
         recovery_hooks: `recovery_hooks(...)`: what is called before and after the phases of every recovery.
+        recovery: a recovery file (its path, or from `load_recovery`): how actors are recovered whose child specs do
+            not say, and their key variables.
 
     Leaving the context stops all actors, newest first. If the root supervisor gives up, the body is cancelled and
     TreeFailed is raised.
@@ -87,6 +90,7 @@ class ActorSystem(Controls):
         watch_lag: float | None = None,
         watch_turns: float | None = None,
         recovery_hooks: RecoveryHooks | None = None,
+        recovery: str | os.PathLike[str] | RecoveryFile | None = None,
     ) -> None:
         if not name or "/" in name:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
@@ -102,6 +106,7 @@ class ActorSystem(Controls):
                 "ActorSystem", f"recovery_hooks must come from recovery_hooks(...), not be {recovery_hooks!r}"
             )
         self._recovery_hooks = recovery_hooks
+        self._recovery_file = recovery
         self._watch_limits = check_limits(watch_lag, watch_turns)
         self._node: Node | None = None
         self._root: Cell | None = None
@@ -116,11 +121,17 @@ class ActorSystem(Controls):
     async def __aenter__(self) -> ActorSystem:
         if self._node is not None:
             raise HoldfastError(f"system {self.name!r} was entered already; make a new one")
+        recovery = self._recovery_file
+        file = recovery if isinstance(recovery, RecoveryFile) or recovery is None else load_recovery(recovery)
+        if file is not None:
+            file.check_classes()
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
         self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
         self._homes.recoveries.hooks = self._recovery_hooks
         self._recovery = RecoveryTree(node, self._homes)
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
+        if file is not None:
+            self._homes.file, node.complete = file, file.complete
         node.host_for = self._host_for
         self._moves = Moves(node, self._workers)
         node.respec = respec

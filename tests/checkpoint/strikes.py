@@ -52,6 +52,21 @@ def let_through(gate: Path) -> None:
     Path(f"{gate}.open").touch()
 
 
+def host_of(ref: hf.ActorRef[Any]) -> Any:
+    """Where its lives are lived."""
+    return ref._cell.host
+
+
+def home(ref: hf.ActorRef[Any]) -> Any:
+    """Its home."""
+    return host_of(ref).switch
+
+
+def actor_of(ref: hf.ActorRef[Any]) -> Any:
+    """The object itself, of an actor in this process."""
+    return ref._cell.actor
+
+
 async def snapshot_after(system: hf.ActorSystem, ref: hf.ActorRef[Any], turn: int) -> None:
     """Wait until a snapshot covers this turn."""
     switch = ref._cell.host.switch  # type: ignore[attr-defined]

@@ -26,7 +26,7 @@ class Gambler(hf.Actor):
         ({"interval": float("inf")}, "interval must be seconds > 0"),
         ({"interval": True}, "interval must be seconds > 0"),
         ({"interval": "2"}, "interval must be seconds > 0, not '2'"),
-        ({"pacing": "slow"}, "pacing must be 'fast', not 'slow'"),
+        ({"pacing": "slow"}, "pacing must be 'fast', 'original' or a factor > 0, not 'slow'"),
         ({"max_deliveries": 0}, "max_deliveries must be a whole number >= 1, not 0"),
         ({"max_deliveries": True}, "max_deliveries must be a whole number >= 1"),
         ({"max_deliveries": 2.5}, "max_deliveries must be a whole number >= 1"),
