@@ -53,7 +53,7 @@ class RecordedGuest:
             StartFailed: `__init__` or the restoring raised.
         """
         port = self._port(cell.path)
-        life = Life(cell, port, float(options["interval"]), self._guest.page)
+        life = Life(cell, port, float(options["interval"]), self._guest.page, may_fork=True)
         cell.host = OwnHost(self._guest, life)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
@@ -234,7 +234,7 @@ class InnerLifeHost(LifeHost):
         assert port is not None
         cell.life = record.life - 1
         page = self._guest.page[record.slot : record.slot + 1]
-        self._life = life = Life(cell, port, self._method.interval, page)
+        self._life = life = Life(cell, port, self._method.interval, page, may_fork=True)
         try:
             port.begin(life, record.turn, record.stash)
         except StartFailed as error:

@@ -13,6 +13,7 @@ from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
 from .bound import HomeBound
+from .due import nobody
 from .journal import Journal
 from .method import Method
 from .rollback import roll_back
@@ -33,6 +34,7 @@ class Homes:
         self.node, self.journal = node, journal
         self._switches: dict[str, Switch] = {}
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
+        self.on_home: Callable[[Switch], None] = nobody  # a home has a life again, or for the first time
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         unfinished = journal.notes(ERASING).get(ERASING)
@@ -49,8 +51,9 @@ class Homes:
                 begin, self.on_first = self.on_first, None
                 begin()
         self.absolve(cell.path)
-        switch.method = method
+        switch.use(method)
         switch.cell = cell
+        self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
             switch.bound, more.bound = HomeBound(switch, more.bound), None
@@ -62,6 +65,10 @@ class Homes:
         """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
         switch = self._switches.get(path)
         return None if switch is None or switch.cell is None or switch.cell.state is GONE else switch.cell
+
+    def home(self, path: str) -> Switch | None:
+        """The home of an address, if there is one."""
+        return self._switches.get(path)
 
     def __iter__(self) -> Iterator[Switch]:
         return iter(self._switches.values())

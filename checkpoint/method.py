@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
+from .compression import check_compress
 
 Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]
@@ -22,6 +23,14 @@ class Method:
     journal_limit: int = 256_000_000
     keep: int = 2
     on_escalate: OnEscalate | None = None
+    every: int = 0
+    journal_bytes: int = 0
+    compress: bool | int = False
+
+    @property
+    def trigger(self) -> int:
+        """Bytes of journal at which something has to be done."""
+        return min(self.journal_limit, self.journal_bytes or self.journal_limit)
 
     def after_escalation(self, times: int) -> OnEscalate:
         """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
@@ -61,6 +70,9 @@ def hybrid(
     journal_limit: int = 256_000_000,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
+    every: int | None = None,
+    journal_bytes: int | None = None,
+    compress: bool | int = False,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -69,11 +81,15 @@ def hybrid(
         pacing: "fast" replays as quickly as the handlers run.
         max_deliveries: process deaths in the turn of one and the same message after which it is quarantined.
         journal_limit: bytes of messages kept since the last snapshot; when it is reached, sends wait or are refused.
-        keep: snapshots that are kept: 2, or 1 to save the memory or disk of the older one.
+        keep: snapshots that are kept in a store that lasts, newest first; 1 saves the memory or disk of the older one.
+            In memory two are kept at most.
         on_escalate: what happens when its supervisor has ended because of it and was restarted: "restore" what there
             is; go back to the "older_snapshot", without the turns since; begin "fresh". In all cases what has not been
             handled stays queued. Left out: an older snapshot the second time within the window of whoever restarted
             the supervisor, else restore.
+        every: a snapshot also after so many handled messages, whatever the time.
+        journal_bytes: a snapshot also when so many bytes of messages have been journaled since the last one.
+        compress: True, or a level from 1 to 22: what goes to a store is compressed, with the library zstandard.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -86,9 +102,16 @@ def hybrid(
         raise SpecError("hybrid", f"max_deliveries must be a whole number >= 1, not {max_deliveries!r}")
     if not isinstance(journal_limit, int) or isinstance(journal_limit, bool) or journal_limit < 1:
         raise SpecError("hybrid", f"journal_limit must be bytes > 0, not {journal_limit!r}")
-    if keep not in (1, 2) or isinstance(keep, bool):
-        raise SpecError("hybrid", f"keep must be 1 or 2, not {keep!r}")
+    if not isinstance(keep, int) or isinstance(keep, bool) or not 1 <= keep <= 100:
+        raise SpecError("hybrid", f"keep must be a whole number from 1 to 100, not {keep!r}")
+    for name, value in (("every", every), ("journal_bytes", journal_bytes)):
+        if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+            raise SpecError("hybrid", f"{name} must be a whole number >= 1 or left out, not {value!r}")
+    check_compress("hybrid", compress)
     if on_escalate is not None and on_escalate not in get_args(OnEscalate):
         known = ", ".join(map(repr, get_args(OnEscalate)))
         raise SpecError("hybrid", f"on_escalate must be one of {known} or left out, not {on_escalate!r}")
-    return Method("hybrid", float(interval), max_deliveries, journal_limit, int(keep), on_escalate)
+    return Method(
+        "hybrid", float(interval), max_deliveries, journal_limit, keep, on_escalate, every or 0, journal_bytes or 0,
+        compress,
+    )  # fmt: skip

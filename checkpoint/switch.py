@@ -23,15 +23,17 @@ from ..actors.errors import (
     ReplayDiverged,
     StartIgnored,
 )
-from ..actors.events import RecoveryFailed, SnapshotFailed, SnapshotTaken
+from ..actors.events import RecoveryFailed, SnapshotTaken
 from ..actors.exits import pack_exit
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
 from .asks import Calls, SwitchAsk, answer_ask
 from .bound import HomeBound
+from .due import Due
 from .ends import Ends
 from .inputs import OVERHEAD, Batch, Input, Turn
 from .journal import Journal
+from .keeping import Images
 from .limit import Limit
 from .method import Method
 from .outputs import Outputs
@@ -52,6 +54,7 @@ from .records import (
     Go,
     Ignored,
     Live,
+    Marked,
     Out,
     PipeDone,
     Released,
@@ -98,6 +101,8 @@ class Switch:
         self.outputs = Outputs(self)
         self.ends = Ends(self)
         self.limit = Limit(self)
+        self.images = Images(self)
+        self.due = Due(self)
         self.bound: HomeBound | None = None
         self.pipes_done: dict[int, set[int]] = {}
         self.topics: dict[str, None] = {}
@@ -120,6 +125,20 @@ class Switch:
         self._replay_turn = -1
         load(self)
 
+    def use(self, method: Method) -> None:
+        """Work as this method says, from now on."""
+        self.method = method
+        self.limit.at = method.trigger
+        if method.every:  # Whoever does not want it does not pay for it.
+            self.from_life = self._counting  # type: ignore[method-assign]
+        else:
+            self.__dict__.pop("from_life", None)
+
+    def _counting(self, record: ToHome) -> None:
+        type(self).from_life(self, record)
+        if type(record) is TurnEnd:
+            self.due.count(self.turn)
+
     # -- admission --------------------------------------------------------------------------------------------------
 
     def admit(self, cell: Cell, item: Any) -> None:
@@ -138,8 +157,7 @@ class Switch:
             if type(message) not in cell.table:
                 cell.require(message)
             name, body = message_name(type(message)), self.node.codec.encode(message, self.path)
-        if self.bytes >= self.method.journal_limit:
-            self.limit.refuse(ask)
+        if self.bytes >= self.limit.at and not self.limit.has_room(ask):
             return
         origin = None if sender is None else sender.path
         if self.bound is None or self.bound.makes_room(ask, name, body, origin):
@@ -215,9 +233,9 @@ class Switch:
     # -- recovery ---------------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> bytes | None:
-        """The state to begin with, if there is any."""
-        return self.newest.state or None if self.newest is not None else None
+    def has_state(self) -> bool:
+        """Whether there is a state to begin with."""
+        return self.newest is not None and self.newest.has_state
 
     @property
     def state_turn(self) -> int:
@@ -227,7 +245,7 @@ class Switch:
     @property
     def is_new(self) -> bool:
         """Whether nothing was ever handled here, or all of it was undone."""
-        return self.turn == self.state_turn and self.state is None
+        return self.turn == self.state_turn and not self.has_state
 
     def prepare(self) -> asyncio.Future[float]:
         """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
@@ -236,6 +254,8 @@ class Switch:
         self.diverged = None
         self.is_void = False
         self._incoming.clear()  # The last life may have died in the middle of a snapshot.
+        self.images.cancel()
+        self.due.restarted()
         self.timers.resume()
         if self.live is not None and not self.live.done():
             self.live.cancel()
@@ -244,7 +264,12 @@ class Switch:
 
     def restore_records(self) -> list[Restore]:
         """The state to begin with, in pieces; none if there is no snapshot."""
-        return [] if self.state is None else [Restore(part) for part in pieces(self.state)]
+        newest = self.newest
+        if newest is None or not newest.has_state:
+            return []
+        if newest.blocks:
+            return list(self.images.restore(newest.blocks))
+        return [Restore(part) for part in pieces(newest.state)]
 
     def attach(self, port: LifePort) -> None:
         """The life is constructed and restored: feed it what it has to handle again, then `Go`."""
@@ -281,6 +306,7 @@ class Switch:
                 port.to_life(source.feed(-1, pipes if index == 0 else (), has_begun=begun))
         if self.bound is not None:
             self.bound.refill()
+        self.due.on_want(self)
 
     def stashed(self) -> set[int]:
         """The inputs that the actor has put aside."""
@@ -336,7 +362,9 @@ class Switch:
                 case PipeDone():
                     self._pipe_done(record)
                 case Unsaved():
-                    self.node.emit(SnapshotFailed(self.path, record.problem))
+                    self.due.failed(record.problem)
+                case Marked():
+                    self.images.mark(record)
                 case Ignored():
                     if self.live is not None and not self.live.done():
                         self.live.set_exception(StartIgnored(self.path, record.why))
@@ -446,6 +474,12 @@ class Switch:
     # -- snapshots --------------------------------------------------------------------------------------------------
 
     def _snapshot(self, record: Snapshot) -> None:
+        if record.image is not None:
+            try:
+                self.images.take(record, record.image)
+            except HoldfastError as error:
+                self.images.refuse(record.image, str(error))
+            return
         self._incoming.append(record.data)
         if not record.is_last:
             return
@@ -454,7 +488,7 @@ class Switch:
         try:
             cut(self, state, record)
         except HoldfastError as error:
-            self.node.emit(SnapshotFailed(self.path, str(error)))
+            self.due.failed(str(error))
             if self.port is not None:
                 self.port.to_life(SnapshotNow(at_once=False))
             if record.is_replaced and self.cell is not None:
@@ -462,5 +496,6 @@ class Switch:
                 self.cell.kill()
             return
         self.limit.cut()
+        self.due.kept(record.turn)
         if self.node.watched:
-            self.node.emit(SnapshotTaken(self.path, record.turn, len(state), record.pause))
+            self.node.emit(SnapshotTaken(self.path, record.turn, len(state), record.pause, len(state)))

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from .checkpoints import CheckpointHandler
 from .controller import RecoveryController
 from .part import Part
 
-PARTS: tuple[tuple[str, type[Part]], ...] = (("controller", RecoveryController),)
+PARTS: tuple[tuple[str, type[Part]], ...] = (
+    ("controller", RecoveryController),
+    ("checkpoints", CheckpointHandler),
+)
