@@ -90,16 +90,12 @@ class Saved(NamedTuple):
         turn: the turn the snapshot was made after; 0 without one.
         entries: (position, entry) of everything the snapshot does not contain, oldest first.
         passed_over: why a newer snapshot was not used; empty when the newest was. Worth an event.
-        passed: how many newer ones were not used, besides those that the caller did not want.
-        kept: how many snapshots there are.
     """
 
     snapshot: bytes | None
     turn: int
     entries: list[tuple[int, Entry]]
     passed_over: str = ""
-    passed: int = 0
-    kept: int = 0
 
 
 class Journal(Protocol):

@@ -86,7 +86,7 @@ class Life:
         self._state: list[bytes] = []
         self._has_state = False
         self._restore_seconds = 0.0
-        self._snapshot_wanted = False
+        self._snapshot_wanted = self._snapshot_postponed = False
         self.images = Imaging(self, may_fork=may_fork)
 
     # -- beginning --------------------------------------------------------------------------------------------------
@@ -304,7 +304,10 @@ class Life:
 
     def take_snapshot(self, *, is_last: bool = False) -> None:
         """Save the state after the last turn; while background work is out, its turn must stay in the journal."""
-        if self.pipes or not self.is_live or (self.turn == self._snapshot_turn and not (is_last and self.images.is_busy)):
+        if self.pipes:
+            self._snapshot_postponed = True
+            return
+        if not self.is_live or (self.turn == self._snapshot_turn and not (is_last and self.images.is_busy)):
             return
         actor = self.cell.actor
         assert actor is not None
@@ -318,6 +321,13 @@ class Life:
             self.port.to_home(Unsaved(str(error)))
             return
         self._send_snapshot(data, begin)
+
+    def pipe_back(self) -> None:
+        """Background work has ended: a snapshot that had to wait for it can be taken."""
+        self.pipes -= 1
+        if self._snapshot_postponed and not self.pipes:
+            self._snapshot_postponed = False
+            self.want_snapshot()
 
     def image_taken(self, turn: int) -> None:
         """An image of the state after this turn is on its way."""

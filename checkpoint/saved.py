@@ -155,25 +155,26 @@ def load_newest(home: Switch) -> tuple[FromStore, Meta | None]:
     Raises:
         DamagedStore: none can.
     """
-    reason, passed = "", 0
-    while True:
-        saved = home.journal.load(home.path, older=passed)
+    reason, tried = "", set[bytes]()
+    for older in range(home.method.keep + 2):  # More may be there for a moment, and some were passed over already.
+        saved = home.journal.load(home.path, older=older)
         reason = reason or saved.passed_over
         if saved.snapshot is None:
             return saved, None
+        if saved.snapshot in tried:
+            continue
+        tried.add(saved.snapshot)
         try:
             meta = decode_meta(saved.snapshot)
             home.images.fetch(meta)
-            break
         except HoldfastError as error:
             reason = reason or str(error)
-            passed += saved.passed + 1
-            if passed >= saved.kept:
-                raise DamagedStore(home.path, home.path, None, f"no snapshot is left: {reason}") from error
-    if reason:
-        home.node.emit(SnapshotDamaged(home.path, saved.turn, reason))
-    home.images.loaded(meta)
-    return saved, meta
+            continue
+        if reason:
+            home.node.emit(SnapshotDamaged(home.path, saved.turn, reason))
+        home.images.loaded(meta)
+        return saved, meta
+    raise DamagedStore(home.path, home.path, None, f"no snapshot is left: {reason}")
 
 
 def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:

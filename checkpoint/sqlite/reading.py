@@ -29,7 +29,6 @@ class ChainReader:
         snapshot, turn = None, 0
         dropped: set[int] = set()
         candidates = kept[: max(1, len(kept) - older)]
-        passed = 0
         for number in reversed(candidates):
             try:
                 snapshot, turn = self._read_snapshot(chain, number)
@@ -37,11 +36,10 @@ class ChainReader:
                 break
             except DamagedStore as error:
                 reason = reason or error.reason
-                passed += 1
         if kept and snapshot is None:
             raise DamagedStore(self.path, chain.path, None, f"no snapshot is left: {reason}")
         entries = self._read_entries(chain, positions)
-        return Saved(snapshot, turn, [pair for pair in entries if pair[0] not in dropped], reason, passed, len(kept))
+        return Saved(snapshot, turn, [pair for pair in entries if pair[0] not in dropped], reason)
 
     def _read_snapshot(self, chain: Chain, number: int) -> tuple[bytes, int]:
         row = self._db.execute(
