@@ -59,6 +59,7 @@ from holdfast.actors.events import (
     RecoveryFailed,
     RolledBack,
     ShutdownError,
+    SnapshotDamaged,
     SnapshotFailed,
     SnapshotTaken,
     StoreRefused,
@@ -91,6 +92,7 @@ from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
+from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.method import Method, fresh, hybrid
 from holdfast.supervision.admin import (
     AlreadyPresent,
@@ -169,6 +171,7 @@ __all__ = [
     "CannotMove",
     "Change",
     "ChangeSupervisor",
+    "CheckpointFailed",
     "ChildBusy",
     "ChildCounts",
     "ChildInfo",
@@ -263,6 +266,7 @@ __all__ = [
     "Shutdown",
     "ShutdownError",
     "Signal",
+    "SnapshotDamaged",
     "SnapshotFailed",
     "SnapshotTaken",
     "SpecError",
