@@ -144,7 +144,9 @@ class Homes:
         return self.journal.notes(prefix)
 
     def close(self) -> None:
-        """Close the store."""
+        """Close the store, and let go of the states."""
+        for switch in self._switches.values():
+            switch.images.close()
         self.journal.close()
 
 
