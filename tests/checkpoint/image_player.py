@@ -31,6 +31,9 @@ class Write(hf.Message[int]):
 class Digest(hf.Message[str]): ...
 
 
+class Turns(hf.Message[int]): ...
+
+
 class Spoil(hf.Message[int]):
     is_spoiled: bool
 
@@ -65,6 +68,10 @@ class Canvas(hf.Actor):
     def spoil(self, message: Spoil) -> int:
         self.spoiled = object() if message.is_spoiled else None
         self.turns += 1
+        return self.turns
+
+    @hf.on(Turns, readonly=True)
+    def count(self, message: Turns) -> int:
         return self.turns
 
     @hf.on(Digest, readonly=True)

@@ -17,7 +17,7 @@ import pytest
 import holdfast
 import holdfast as hf
 from holdfast.checkpoint.sqlite import SqliteJournal
-from tests.checkpoint.image_player import CELLS, MANY, Canvas, Digest, Paint, digest_of
+from tests.checkpoint.image_player import CELLS, MANY, Canvas, Digest, Paint, Turns, digest_of
 from tests.checkpoint.players import start, until
 from tests.checkpoint.strikes import NEVER
 
@@ -124,9 +124,7 @@ async def count(store: Path, where: Any) -> int:
         ref = await system.start(
             hf.child("canvas", hf.start(Canvas, cells), isolation=where, recovery=hf.hybrid(interval=NEVER))
         )
-        await ref.ask(Digest(), timeout=60.0)
-        state = await system.get_state(ref, timeout=60.0)
-        return int(state["turns"])
+        return await ref.ask(Turns(), timeout=60.0)
 
 
 def begin(store: Path, where: str, first: int, last: int) -> subprocess.Popen[str]:
