@@ -150,7 +150,7 @@ class SnapshotTaken(Event, frozen=True, eq=False):
 
 
 class SnapshotDamaged(Event, frozen=True, eq=False):
-    """The newest snapshot could not be used: the actor goes on from the older one after `turn`, and the messages since."""
+    """The newest snapshot could not be used: the actor goes on from an older one, after `turn`, and what came since."""
 
     turn: int
     reason: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -29,10 +30,9 @@ def check_compress(where: str, value: object) -> bool | int:
 
 def _library(where: str) -> Any:
     try:
-        import zstandard
+        return importlib.import_module("zstandard")  # only now: few programs have it
     except ImportError as error:
         raise SpecError(where, "compress needs the library zstandard: pip install 'holdfast[compress]'") from error
-    return zstandard
 
 
 def compressor(level: bool | int) -> Compress:

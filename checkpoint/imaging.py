@@ -1,8 +1,8 @@
 """Images of a large state, taken by its life between two turns: what has changed is written into shared memory.
 
-Two ways, chosen by size and by where the actor lives. *Copy*: the state is compared with the last image and what differs
-is written, while the actor stands still. *Fork*: a copy of the process does that, while the actor goes on; the price is
-a page fault for each page it changes meanwhile. A process is forked only while no other thread runs in it.
+Two ways, chosen by size and by where the actor lives. *Copy*: the state is compared with the last image and what
+differs is written, while the actor stands still. *Fork*: a copy of the process does that, while the actor goes on; the
+price is a page fault for each page it changes meanwhile. A process is forked only while no other thread runs in it.
 """
 
 from __future__ import annotations

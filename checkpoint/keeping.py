@@ -1,7 +1,7 @@
 """Images at home: which blocks the snapshots of one actor consist of, and that they are safe before anything is cut.
 
-In a store that lasts, changed blocks become a pack (a file of their own) in a thread, while messages go on; only then is
-the journal cut. Until then the older snapshot and the whole journal stand, and what is half done does not count.
+In a store that lasts, changed blocks become a pack (a file of their own) in a thread, while messages go on; only then
+is the journal cut. Until then the older snapshot and the whole journal stand, and what is half done does not count.
 """
 
 from __future__ import annotations
@@ -45,24 +45,13 @@ class Images:
         self._marked = meta_now(self._home, record.turn, [])
 
     def take(self, record: Snapshot, shared: Shared) -> None:
-        """An image is complete: keep it.
-
-        Raises:
-            HoldfastError: it cannot be kept; what was there before is still there.
-        """
-        home, marked = self._home, self._marked
-        self._marked = None
-        if marked is None or marked.turn != record.turn:
-            marked = meta_now(home, record.turn, [])
-        segment = open_segment(shared.number, shared.pid, shared.file, shared.inode)
-        missing = {number for number, _, _ in shared.places} - {shared.number, *self._segments}
-        if missing or self._saving is not None:
-            segment.close()
-            raise HoldfastError("a snapshot refers to blocks that are not here" if missing else "one is on its way")
-        meta = msgspec.structs.replace(
-            marked, format=IMAGES, stash=record.stash, blocks=shared.places, earlier=self.earlier()
-        )
-        self._segments[shared.number] = segment
+        """An image is complete: keep it; if that cannot be, what was there before is still there."""
+        home = self._home
+        try:
+            meta = self._open(record, shared)
+        except HoldfastError as error:
+            self.refuse(shared, str(error))
+            return
         if not home.journal.durable:
             self._finish(meta, record, shared)
             return
@@ -71,15 +60,33 @@ class Images:
         home.node.remains[saving] = home.path
         saving.add_done_callback(lambda done: home.node.remains.pop(done, None))
 
+    def _open(self, record: Snapshot, shared: Shared) -> Meta:
+        """Have the new blocks here too.
+
+        Raises:
+            HoldfastError: they are gone, or those they belong to are.
+        """
+        marked, self._marked = self._marked, None
+        if marked is None or marked.turn != record.turn:
+            marked = meta_now(self._home, record.turn, [])
+        if self._saving is not None:
+            raise HoldfastError("the snapshot before it is still on its way")
+        segment = open_segment(shared.number, shared.pid, shared.file, shared.inode)
+        if {number for number, _, _ in shared.places} - {shared.number, *self._segments}:
+            segment.close()
+            raise HoldfastError("a snapshot refers to blocks that are not here")
+        self._segments[shared.number] = segment
+        return msgspec.structs.replace(
+            marked, format=IMAGES, stash=record.stash, blocks=shared.places, earlier=self.earlier()
+        )
+
     async def _save(self, meta: Meta, record: Snapshot, shared: Shared) -> None:
         home, own = self._home, [place for place in meta.blocks if place[0] == shared.number]
         segment, journal, me = self._segments[shared.number], home.journal, asyncio.current_task()
         try:
             if own:
                 blocks = [(offset, segment.block(offset, length)) for _, offset, length in own]
-                await asyncio.to_thread(
-                    journal.keep_blocks, home.path, shared.number, blocks, home.method.compress
-                )
+                await asyncio.to_thread(journal.keep_blocks, home.path, shared.number, blocks, home.method.compress)
             if self._saving is not me:
                 return
             self._saving = None

@@ -475,10 +475,7 @@ class Switch:
 
     def _snapshot(self, record: Snapshot) -> None:
         if record.image is not None:
-            try:
-                self.images.take(record, record.image)
-            except HoldfastError as error:
-                self.images.refuse(record.image, str(error))
+            self.images.take(record, record.image)
             return
         self._incoming.append(record.data)
         if not record.is_last:

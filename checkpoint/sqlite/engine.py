@@ -236,7 +236,7 @@ class SqliteJournal:
     def keep_blocks(
         self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
     ) -> None:
-        """Keep blocks of a large snapshot as a pack; see `Journal`. Takes as long as the disk does: call it in a thread."""
+        """Keep blocks of a large snapshot as a pack; see `Journal`. Call it in a thread: it waits for the disk."""
         self._store.refuse_failed()
         self._packs.write(address, number, blocks, compress)
 

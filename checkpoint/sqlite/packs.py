@@ -30,9 +30,7 @@ class Packs:
         self.path = path
         self.folder = f"{path}-packs"
 
-    def write(
-        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
-    ) -> None:
+    def write(self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int) -> None:
         """Write a new pack durably.
 
         Raises:
@@ -46,7 +44,9 @@ class Packs:
             parts += (head, struct.pack("<I", zlib.crc32(block, zlib.crc32(head))), data)
         folder = self._folder(address)
         try:
-            os.makedirs(folder, mode=0o700, exist_ok=True)
+            for one in (self.folder, folder):
+                with contextlib.suppress(FileExistsError):
+                    os.mkdir(one, mode=0o700)
             write_durably(self._file(address, number), parts)
         except OSError as error:
             raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error

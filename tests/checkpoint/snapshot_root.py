@@ -1,4 +1,4 @@
-"""A root with a SQLite store and a large state, run by `test_snapshots_kill.py`: snapshot_root.py STORE WHERE FIRST LAST.
+"""A root with a SQLite store and a large state, run by `test_snapshots_kill.py` with STORE WHERE FIRST LAST.
 
 It paints cell after cell and says on stdout which were accepted; it is killed in the middle of it. With FIRST > LAST it
 only says what is there.
