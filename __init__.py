@@ -68,6 +68,7 @@ from holdfast.actors.events import (
     SafeStateLeft,
     SafeStateOverdue,
     ShutdownError,
+    SnapshotDamaged,
     SnapshotFailed,
     SnapshotTaken,
     StoreRefused,
@@ -103,6 +104,7 @@ from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
+from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.file import RecoveryFile, load_recovery
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.readonly import NotReadonly
@@ -194,6 +196,7 @@ __all__ = [
     "CannotMove",
     "Change",
     "ChangeSupervisor",
+    "CheckpointFailed",
     "ChildBusy",
     "ChildCounts",
     "ChildInfo",
@@ -303,6 +306,7 @@ __all__ = [
     "Shutdown",
     "ShutdownError",
     "Signal",
+    "SnapshotDamaged",
     "SnapshotFailed",
     "SnapshotTaken",
     "SpecError",

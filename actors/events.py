@@ -225,11 +225,22 @@ class MessageQuarantined(Event, frozen=True, eq=False):
 
 
 class SnapshotTaken(Event, frozen=True, eq=False):
-    """A snapshot is safe: state after `turn`, in bytes; `pause` is how long the actor stood still, in seconds."""
+    """A snapshot is safe: state after `turn`, in bytes; `pause` is how long the actor stood still, in seconds.
+
+    `written_bytes` of it were written anew: what had not changed since the last one was not.
+    """
 
     turn: int
     size_bytes: int
     pause: float
+    written_bytes: int = 0
+
+
+class SnapshotDamaged(Event, frozen=True, eq=False):
+    """The newest snapshot could not be used: the actor goes on from an older one, after `turn`, and what came since."""
+
+    turn: int
+    reason: str
 
 
 class SnapshotFailed(Event, frozen=True, eq=False):

@@ -230,8 +230,8 @@ class RecordedContext(ActorContext):
 
     def _piped_back(self, record: PipeDone) -> None:
         if not self.closed:
-            self.recorded.pipes -= 1
             self.recorded.port.to_home(record)
+            self.recorded.pipe_back()
 
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 

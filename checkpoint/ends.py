@@ -91,6 +91,7 @@ class Ends:
             ask.fail(stopped)
         home.later.clear()
         home.limit.wake()
+        home.due.abandon(why)
 
     def erased(self, why: str) -> None:
         """All that was recorded is gone from the store; here it goes too, and nothing is written for it any more."""
@@ -99,6 +100,7 @@ class Ends:
         home.calls.abandon()
         self.drop_all(why)
         home.timers.replace({})
+        home.images.close()
         home.cell = None
 
     def lost(self, name: str, body: bytes, why: str) -> None:

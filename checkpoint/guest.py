@@ -54,7 +54,7 @@ class RecordedGuest:
             StartFailed: `__init__` or the restoring raised.
         """
         port = self._port(cell.path)
-        life = Life(cell, port, Method.of(options["method"]), self._guest.page)
+        life = Life(cell, port, Method.of(options["method"]), self._guest.page, may_fork=True)
         cell.host = OwnHost(self._guest, life)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
@@ -246,7 +246,7 @@ class InnerLifeHost(LifeHost):
         assert port is not None
         cell.life = record.life - 1
         page = self._guest.page[record.slot : record.slot + 1]
-        self._life = life = Life(cell, port, self._method, page)
+        self._life = life = Life(cell, port, self._method, page, may_fork=True)
         port.on_closed = None  # A start that fails is told of here, with its reason.
         try:
             port.begin(life, record.turn, record.stash)

@@ -13,6 +13,7 @@ from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
 from .bound import HomeBound
+from .due import nobody
 from .file import RecoveryFile
 from .forgotten import forget_turns
 from .journal import Journal
@@ -38,6 +39,7 @@ class Homes:
         self._switches: dict[str, Switch] = {}
         self.recoveries = Recoveries(node)
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
+        self.on_home: Callable[[Switch], None] = nobody  # a home has a life again, or for the first time
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self.file: RecoveryFile | None = None
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
@@ -56,8 +58,9 @@ class Homes:
                 begin, self.on_first = self.on_first, None
                 begin()
         self.absolve(cell.path)
-        switch.method = method
+        switch.use(method)
         switch.cell = cell
+        self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
             let_go(switch)
@@ -70,6 +73,10 @@ class Homes:
         """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
         switch = self._switches.get(path)
         return None if switch is None or switch.cell is None or switch.cell.state is GONE else switch.cell
+
+    def home(self, path: str) -> Switch | None:
+        """The home of an address, if there is one."""
+        return self._switches.get(path)
 
     def __iter__(self) -> Iterator[Switch]:
         return iter(self._switches.values())
@@ -145,8 +152,10 @@ class Homes:
         return self.journal.notes(prefix)
 
     def close(self) -> None:
-        """Close the store."""
+        """Close the store, and let go of the states."""
         self.recoveries.close()
+        for switch in self._switches.values():
+            switch.images.close()
         self.journal.close()
 
 

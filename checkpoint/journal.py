@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple, Protocol, TypeAlias
+from collections.abc import Collection, Sequence
+from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
 from ..actors.errors import HoldfastError
+
+if TYPE_CHECKING:
+    from .segments import Segment
 
 __all__ = [
     "DamagedStore",
@@ -115,18 +118,20 @@ class Journal(Protocol):
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep the snapshot, made after `turn`, then forget the positions it contains (T10: in this order).
 
-        With `keep=2` the one before it is kept too: then `drop` is only marked now and physically removed by the next
-        cut of the address, so that the older snapshot stays usable for as long as it is kept. With `keep=1` nothing
-        older remains. Positions in `drop` that the address does not have are ignored.
+        With `keep=2` the one before it is kept too, with `keep=3` two of them, and so on: then `drop` is only marked
+        now and physically removed by a later cut of the address, so that the older snapshots stay usable for as long as
+        they are kept. With `keep=1` nothing older remains. Positions in `drop` that the address does not have are
+        ignored.
         """
         ...
 
-    def load(self, address: str, *, older: bool = False) -> Saved:
+    def load(self, address: str, *, older: int = False) -> Saved:
         """The newest snapshot whose checksum is right, with the entries it does not contain.
 
         Args:
             address: unknown ones have an empty `Saved`.
-            older: start from the older of the two kept snapshots, if there are two, and all entries since.
+            older: pass over so many of the newest snapshots that are kept (but not over the last one there is); then
+                all entries since come too. True is one.
 
         Raises:
             DamagedStore: an entry is damaged or missing, or no snapshot is left whose later entries all exist. A
@@ -136,6 +141,28 @@ class Journal(Protocol):
 
     def erase(self, address: str) -> None:
         """Forget everything about the address; unknown ones are ignored."""
+        ...
+
+    def keep_blocks(
+        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
+    ) -> None:
+        """Keep blocks of a large snapshot durably, as pack `number`: (offset, bytes). A `cut` will refer to them.
+
+        Raises:
+            StoreFailed: nothing is kept.
+        """
+        ...
+
+    def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """Blocks of a pack at these (offset, length), verified.
+
+        Raises:
+            DamagedStore: one of them is missing or damaged.
+        """
+        ...
+
+    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+        """Remove all packs of the address but those that kept snapshots need."""
         ...
 
     def addresses(self) -> list[str]:
@@ -188,9 +215,21 @@ class MemoryJournal:
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Do nothing: the switch keeps the snapshot."""
 
-    def load(self, address: str, *, older: bool = False) -> Saved:
+    def load(self, address: str, *, older: int = False) -> Saved:
         """Return an empty `Saved`."""
         return Saved(None, 0, [])
+
+    def keep_blocks(
+        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
+    ) -> None:
+        """Do nothing: the switch keeps them."""
+
+    def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """Refuse: there are none."""
+        raise DamagedStore("memory", address, None, "nothing is stored in memory")
+
+    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+        """Do nothing."""
 
     def erase(self, address: str) -> None:
         """Do nothing."""

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..actors.actor import Actor
 from ..actors.errors import HoldfastError, type_name
 from ..actors.values import UnsavableValue, decode_value, encode_value
 from ..actors.values.classes import slots_of
+from .image import is_image, read_image
 from .method import Method
 
 
@@ -22,54 +23,78 @@ class StateMismatch(HoldfastError):
         return f"the state of {self.actor} does not fit: {self.problem}"
 
 
+class State(NamedTuple):
+    """An actor's state, still made of its own objects."""
+
+    version: int
+    form: str  # "state": from `get_state`; "keys": key variables
+    value: Any
+
+
+def state_of(actor: Actor) -> State:
+    """What is to be saved: the variables a recovery file names, else `get_state()` or the class's key variables.
+
+    Raises:
+        StateMismatch: a declared key variable is not there. What `get_state` raises.
+    """
+    get_state = getattr(actor, "get_state", None)
+    if get_state is not None and key_names(actor) is None:
+        return State(actor.schema_version, "state", get_state())
+    where, root = actor.ctx.path, actor._state_root()
+    return State(actor.schema_version, "keys", {name: read_path(where, root, name) for name in variables(actor)})
+
+
+def variables(actor: Actor) -> list[str]:
+    """The names of an actor's key variables, dotted paths among them."""
+    names = key_names(actor)
+    if names is not None:
+        return list(names)
+    return [name for name, _ in attributes(actor._state_root()) if not name.startswith("_") and name != "ctx"]
+
+
 def save_state(actor: Actor) -> bytes:
     """The actor's state as bytes: `get_state()` if the class has it, else its key variables.
 
     Raises:
         UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there.
     """
-    where, names = actor.ctx.path, key_names(actor)
-    root = actor._state_root()
-    kind = type_name(type(root))
-    get_state = getattr(actor, "get_state", None) if names is None else None
-    if get_state is not None:
-        state = get_state()
-        return _encode(actor, "state", state, [(f"{where}: {kind}.get_state()", state)])
-    if names is None:
-        state = {name: value for name, value in attributes(root) if not name.startswith("_") and name != "ctx"}
-    else:
-        state = {name: read_path(where, root, name) for name in names}
-    return _encode(actor, "keys", state, [(f"{where}: {kind}.{name}", value) for name, value in state.items()])
-
-
-def _encode(actor: Actor, form: str, state: object, parts: list[tuple[str, object]]) -> bytes:
+    state, where = state_of(actor), actor.ctx.path
     try:
-        return encode_value((actor.schema_version, form, state), where=actor.ctx.path)
+        return encode_value(tuple(state), where=where)
     except UnsavableValue:
-        for name, value in parts:  # Once more, variable by variable: the error shall name the one it is about.
+        for name, value in _parts(actor, state):  # Once more, one by one: the error shall name the one it is about.
             encode_value(value, where=name)
         raise
 
 
+def _parts(actor: Actor, state: State) -> list[tuple[str, object]]:
+    where = f"{actor.ctx.path}: {type_name(type(actor._state_root()))}"
+    if state.form == "state":
+        return [(f"{where}.get_state()", state.value)]
+    return [(f"{where}.{name}", value) for name, value in state.value.items()]
+
+
 def restore_state(actor: Actor, data: bytes) -> None:
-    """Put a saved state back.
+    """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
 
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
-    saved: Any = decode_value(data)
+    saved: Any = read_image(data) if is_image(data) else decode_value(data)
     where = actor.ctx.path
     if not (isinstance(saved, tuple) and len(saved) == 3):
         raise StateMismatch(where, "it was not written by save_state")
     version, form, state = saved
     if version != actor.schema_version:
-        raise StateMismatch(where, f"it has schema version {version}, {type_name(type(actor))} {actor.schema_version}")
+        state = migrated(type(actor), state, version, where)
     if form == "state":
         set_state = getattr(actor, "set_state", None)
         if set_state is None:
             raise StateMismatch(where, f"{type_name(type(actor))} has no set_state")
         set_state(state)
         return
+    if not isinstance(state, dict):
+        raise StateMismatch(where, f"its key variables came as {type_name(type(state))}, not as a dict")
     root = actor._state_root()
     for name, value in state.items():
         write_path(where, root, name, value)
@@ -138,3 +163,22 @@ def check_keys(actor: Actor, method: Method, *, first: bool) -> None:
             raise StateMismatch(where, f"{method.origin}: key variable {name!r}: {error}") from error
         except StateMismatch as error:
             raise StateMismatch(where, f"{method.origin}: {error.problem}") from error
+
+
+def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
+    """A state that an older version of the class has saved, as this one wants it.
+
+    Raises:
+        StateMismatch: the class does not know that version, or says that it cannot. Nothing is lost: what was saved
+            stays as it is.
+    """
+    known = f"it has schema version {version}, {type_name(kind)} {kind.schema_version}"
+    migrate = getattr(kind, "migrate", None)
+    if migrate is None:
+        raise StateMismatch(where, f"{known}, which has no classmethod migrate(state, from_version)")
+    if not isinstance(version, int) or version > kind.schema_version:
+        raise StateMismatch(where, f"{known}: an older class cannot read what a newer one has saved")
+    try:
+        return migrate(state, version)
+    except Exception as error:
+        raise StateMismatch(where, f"{known}, and its migrate failed: {type(error).__name__}: {error}") from error

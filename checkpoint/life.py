@@ -18,6 +18,7 @@ from ..actors.exits import ExitReason
 from ..actors.mail import Item
 from ..actors.message import Message, message_name
 from .context import RecordedContext
+from .imaging import Imaging
 from .keys import check_keys, restore_state, save_state
 from .method import Method
 from .readonly import check_readonly
@@ -29,6 +30,7 @@ from .records import (
     Feed,
     Go,
     Ignored,
+    Kept,
     Live,
     Out,
     Outcome,
@@ -61,7 +63,9 @@ class HomePort(Protocol):
 class Life:
     """One recorded life: the turn in hand, its outputs, and when the next snapshot is due."""
 
-    def __init__(self, cell: Cell, port: HomePort, method: Method, page: memoryview | None) -> None:
+    def __init__(
+        self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False
+    ) -> None:
         self.cell, self.port, self.method, self.page = cell, port, method, page
         self.interval = method.interval if method.snapshots else 0.0  # 0: no snapshot is ever taken
         self.turn = 0
@@ -85,8 +89,8 @@ class Life:
         self._state: list[bytes] = []
         self._has_state = False
         self._restore_seconds = 0.0
-        self._timer: asyncio.TimerHandle | None = None
-        self._snapshot_wanted = False
+        self._snapshot_wanted = self._snapshot_postponed = False
+        self.images = Imaging(self, may_fork=may_fork)
 
     # -- beginning --------------------------------------------------------------------------------------------------
 
@@ -113,7 +117,9 @@ class Life:
         if self._has_state:
             begin = time.perf_counter()
             try:
-                restore_state(actor, b"".join(self._state))
+                data = b"".join(self._state)
+                self.images.last_bytes = len(data)
+                restore_state(actor, data)
             except Exception as error:
                 self._context_made.close()
                 cell.actor = cell.ctx = None
@@ -144,9 +150,13 @@ class Life:
                 self._outcome(record)
             case Go():
                 self._queue(GoLive(self, record))
+            case SnapshotNow(urgent=True):
+                self.want_snapshot()
             case SnapshotNow(at_once=True):
                 self._snapshot_wanted = True
                 self._queue(TakeSnapshot(self))
+            case Kept():
+                self.images.kept(record)
             case SnapshotNow():
                 self._snapshot_turn = -2  # no turn: the next one that is due is taken
             case Restore():
@@ -293,35 +303,53 @@ class Life:
         self.port.to_home(Live(self._restore_seconds))
         if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
             self.cell.urge(TakeSnapshot(self))
-        self._arm()
         postponed, self.postponed = self.postponed, []
         for call in postponed:
             self.cell.urge(call)
         if self.stop_wanted is not None:
             self.cell.request_stop(self.stop_wanted)
 
-    def _arm(self) -> None:
-        if self.interval > 0:
-            self._timer = self.cell.node.loop.call_later(self.interval, self._due)
+    def want_snapshot(self) -> None:
+        """Save the state before anything else is handled."""
+        self.cell.urge(TakeSnapshot(self))
 
-    def _due(self) -> None:
-        if self.turn != self._snapshot_turn or self._snapshot_wanted:
-            self.cell.urge(TakeSnapshot(self))
-        self._arm()
-
-    def take_snapshot(self) -> None:
+    def take_snapshot(self, *, is_last: bool = False) -> None:
         """Save the state after the last turn; while background work is out, its turn must stay in the journal."""
-        if self.pipes or self.turn == self._snapshot_turn or not self.is_live or not self.method.snapshots:
+        if not self.method.snapshots:
+            return
+        if self.pipes:
+            self._snapshot_postponed = True
+            return
+        if not self.is_live or (self.turn == self._snapshot_turn and not (is_last and self.images.is_busy)):
             return
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
         try:
+            if not is_last and self.images.suits():
+                self.images.take()
+                return
             data = save_state(actor)
         except Exception as error:  # What the user's own `get_state` raises is no reason to lose what it has.
             self.port.to_home(Unsaved(str(error)))
             return
         self._send_snapshot(data, begin)
+
+    def pipe_back(self) -> None:
+        """Background work has ended: a snapshot that had to wait for it can be taken."""
+        self.pipes -= 1
+        if self._snapshot_postponed and not self.pipes:
+            self._snapshot_postponed = False
+            self.want_snapshot()
+
+    def image_taken(self, turn: int) -> None:
+        """An image of the state after this turn is on its way."""
+        self._snapshot_turn = turn
+        self._snapshot_wanted = False
+
+    def image_lost(self) -> None:
+        """Its home could not keep the last one."""
+        self._snapshot_turn = -2
 
     def last_snapshot(self) -> None:
         """Save the state for a life somewhere else.
@@ -332,7 +360,7 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
-        if self.turn != self._snapshot_turn and self.method.snapshots:  # Else all of it is replayed there.
+        if self.method.snapshots and (self.turn != self._snapshot_turn or self.images.is_busy):  # Else all is replayed.
             self._send_snapshot(save_state(actor), begin)
 
     def may_replace(self) -> str:
@@ -355,6 +383,9 @@ class Life:
             raise ControlFailed(self.cell.path, "replace_state", "the new state could not be saved")
 
     def _send_snapshot(self, data: bytes, begin: float, *, is_replaced: bool = False) -> None:
+        self.images.stop()
+        self.images.restart()
+        self.images.last_bytes = len(data)
         stash = [fed.feed.id for fed in self.stash]
         pause = time.perf_counter() - begin
         parts = pieces(data)
@@ -365,8 +396,7 @@ class Life:
 
     def close(self) -> None:
         """The life is over."""
-        if self._timer is not None:
-            self._timer.cancel()
+        self.images.close()
         for future, _ in self.asks.values():
             future.cancel()
         self.asks.clear()

@@ -21,6 +21,8 @@ class Limit:
         self._home = home
         self._waiters: list[asyncio.Future[None]] = []
         self._is_told = False
+        self.at = home.method.trigger
+        """Bytes from which on an admission has to ask here."""
 
     @property
     def is_reached(self) -> bool:
@@ -31,6 +33,20 @@ class Limit:
         """Whether there is room when what no replay needs is given up."""
         self._home.skipping.compact()
         return not self.is_reached
+
+    def has_room(self, ask: Ask | None) -> bool:
+        """Enough is journaled that a snapshot is due, or too much: then the message is refused.
+
+        Raises:
+            MailboxFull: to a tell; an ask fails with it.
+        """
+        home = self._home
+        if not self.is_reached or self.makes_room():
+            self.at = home.method.journal_limit
+            home.due.want()
+            return True
+        self.refuse(ask)
+        return False
 
     def refuse(self, ask: Ask | None) -> None:
         """Have a snapshot taken, and refuse a message until the journal is cut.
@@ -69,6 +85,7 @@ class Limit:
 
     def cut(self) -> None:
         """There is room again."""
+        self.at = self._home.method.trigger
         self._is_told = False
         self.wake()
 

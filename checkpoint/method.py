@@ -10,6 +10,7 @@ import msgspec
 
 from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
+from .compression import check_compress
 from .recovery.settings import (
     SAFE_STATE_TIMEOUT,
     Held,
@@ -51,6 +52,9 @@ class Method:
     held: Held | None = None
     held_topics: tuple[tuple[str, Held], ...] = ()
     hooks: RecoveryHooks | None = None
+    every: int | None = None
+    journal_bytes: int | None = None
+    compress: bool | int = False
 
     def __post_init__(self) -> None:
         """Raises SpecError: naming the method, the setting, and what it may be."""
@@ -65,14 +69,24 @@ class Method:
             raise SpecError(where, f"max_deliveries must be a whole number >= 1, not {self.max_deliveries!r}")
         if not _whole(self.journal_limit) or self.journal_limit < 1:
             raise SpecError(where, f"journal_limit must be bytes > 0, not {self.journal_limit!r}")
-        if self.keep not in (1, 2) or not _whole(self.keep):
-            raise SpecError(where, f"keep must be 1 or 2, not {self.keep!r}")
+        if not _whole(self.keep) or not 1 <= self.keep <= 100:
+            raise SpecError(where, f"keep must be a whole number from 1 to 100, not {self.keep!r}")
+        for name in ("every", "journal_bytes"):
+            value = getattr(self, name)
+            if value is not None and (not _whole(value) or value < 1):
+                raise SpecError(where, f"{name} must be a whole number >= 1 or left out, not {value!r}")
+        check_compress(where, self.compress)
         if self.on_escalate is not None and self.on_escalate not in get_args(OnEscalate):
             known = ", ".join(map(repr, get_args(OnEscalate)))
             raise SpecError(where, f"on_escalate must be one of {known} or left out, not {self.on_escalate!r}")
         for name in ("skip", "check_readonly"):
             if not isinstance(getattr(self, name), bool):
                 raise SpecError(where, f"{name} must be True or False, not {getattr(self, name)!r}")
+
+    @property
+    def trigger(self) -> int:
+        """Bytes of journal at which something has to be done."""
+        return min(self.journal_limit, self.journal_bytes or self.journal_limit)
 
     def after_escalation(self, times: int) -> OnEscalate:
         """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
@@ -147,6 +161,9 @@ def checkpoint_only(
     journal_limit: int = JOURNAL_LIMIT,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
+    every: int | None = None,
+    journal_bytes: int | None = None,
+    compress: bool | int = False,
     safe_state: str | Sequence[str] | SafeState | None = None,
     safe_state_timeout: float = SAFE_STATE_TIMEOUT,
     held: Held | Mapping[str, Held] | None = None,
@@ -168,6 +185,9 @@ def checkpoint_only(
         journal_limit,
         keep,
         on_escalate,
+        every=every,
+        journal_bytes=journal_bytes,
+        compress=compress,
         **_meanwhile("checkpoint_only", safe_state, safe_state_timeout, held, hooks),
     )
 
@@ -219,6 +239,9 @@ def hybrid(
     safe_state_timeout: float = SAFE_STATE_TIMEOUT,
     held: Held | Mapping[str, Held] | None = None,
     hooks: RecoveryHooks | None = None,
+    every: int | None = None,
+    journal_bytes: int | None = None,
+    compress: bool | int = False,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -229,7 +252,8 @@ def hybrid(
             meanwhile: at 1.0 or below, an actor that gets more than it can handle never catches up.
         max_deliveries: process deaths in the turn of one and the same message after which it is quarantined.
         journal_limit: bytes of messages kept since the last snapshot; when it is reached, sends wait or are refused.
-        keep: snapshots that are kept: 2, or 1 to save the memory or disk of the older one.
+        keep: snapshots that are kept in a store that lasts, newest first; 1 saves the memory or disk of the older one.
+            In memory two are kept at most.
         on_escalate: what happens when its supervisor has ended because of it and was restarted: "restore" what there
             is; go back to the "older_snapshot", without the turns since; begin "fresh". In all cases what has not been
             handled stays queued. Left out: an older snapshot the second time within the window of whoever restarted
@@ -243,6 +267,9 @@ def hybrid(
         safe_state_timeout: seconds after which a receiver that has not heard of the end raises SafeStateOverdue.
         held: `held(...)`, or a mapping of topics ("*": all else) to that: how many messages are held meanwhile.
         hooks: `recovery_hooks(...)`: what is called before and after the phases, besides those of the system.
+        every: a snapshot also after so many handled messages, whatever the time.
+        journal_bytes: a snapshot also when so many bytes of messages have been journaled since the last one.
+        compress: True, or a level from 1 to 22: what goes to a store is compressed, with the library zstandard.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -257,6 +284,9 @@ def hybrid(
         pacing=pacing,
         skip=skip,
         check_readonly=check_readonly,
+        every=every,
+        journal_bytes=journal_bytes,
+        compress=compress,
         **_meanwhile("hybrid", safe_state, safe_state_timeout, held, hooks),
     )
 

@@ -91,9 +91,13 @@ class Go(msgspec.Struct, array_like=True, tag=3):
 
 
 class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
-    """Take a snapshot after the turn in hand, or (the last one could not be kept) when the next one is due."""
+    """Take a snapshot after the inputs that have been fed, or (`urgent`) in front of them.
+
+    Not `at_once`: the last one could not be kept, and the next that is asked for is not superfluous.
+    """
 
     at_once: bool = True
+    urgent: bool = False
 
 
 class Restore(msgspec.Struct, array_like=True, tag=5):
@@ -122,7 +126,18 @@ class Started(msgspec.Struct, array_like=True, tag=7):
     problem: str = ""
 
 
-ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started
+class Kept(msgspec.Struct, array_like=True, tag=8):
+    """The home has the image that was written into this segment: what follows may refer to it. Or (not `is_safe`) not.
+
+    `is_full`: the next image should be written anew.
+    """
+
+    segment: int
+    is_safe: bool
+    is_full: bool = False
+
+
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------
@@ -152,10 +167,24 @@ class Live(msgspec.Struct, array_like=True, tag=13):
     restore_seconds: float
 
 
+class Shared(msgspec.Struct, array_like=True):
+    """An image in memory that its home can open: segment `number` is descriptor `file` of process `pid`.
+
+    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length).
+    """
+
+    number: int
+    pid: int
+    file: int
+    inode: int
+    size: int
+    places: list[tuple[int, int, int]]
+
+
 class Snapshot(msgspec.Struct, array_like=True, tag=14):
     """A piece of the state after `turn`; `is_last` completes it.
 
-    `is_replaced`: it was put in place from outside, so no replay leads to it.
+    `is_replaced`: it was put in place from outside, so no replay leads to it. `image`: where it is, if not in `data`.
     """
 
     turn: int
@@ -164,6 +193,13 @@ class Snapshot(msgspec.Struct, array_like=True, tag=14):
     stash: list[int]
     pause: float
     is_replaced: bool = False
+    image: Shared | None = None
+
+
+class Marked(msgspec.Struct, array_like=True, tag=20):
+    """An image of the state after `turn` is being written, while the actor goes on."""
+
+    turn: int
 
 
 class PipeDone(msgspec.Struct, array_like=True, tag=15):
@@ -205,7 +241,7 @@ class Ignored(msgspec.Struct, array_like=True, tag=19):
     why: str
 
 
-ToHome = Ignored | Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed
+ToHome = Ignored | Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked
 
 PIECE = 4 * 1024 * 1024
 """Bytes of state per record, so that a large state does not hold up everything else."""

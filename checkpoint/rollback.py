@@ -33,6 +33,8 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
     older = older_snapshot(home) if to == "older_snapshot" else None
     if to == "older_snapshot" and older is None:
         why = f"{why}; there is no older snapshot"
+    if older is not None:
+        home.images.fetch(older)
     home.ends.undo_begun(UNDONE)
     first = home.turn
     if older is None:
@@ -40,6 +42,7 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
     meta = msgspec.structs.replace(older, turn=first, next_id=home.next_id, epoch=home.journal.epoch)
     put(home, meta, 1)  # Nothing else stays: what was undone must not be what the next step back leads to.
     home.older = None
+    home.images.tidy()
     home.topics = dict.fromkeys(meta.topics)
     home.timers.replace(meta.timers)
     home.node.emit(RolledBack(home.path, first, meta.base, why))

@@ -7,19 +7,28 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..actors.errors import HoldfastError
+from ..actors.events import SnapshotDamaged
+from .compression import PLAIN, compressor, decompress
 from .inputs import OVERHEAD, Input, Turn
-from .journal import Entry
+from .journal import DamagedStore, Entry
+from .journal import Saved as FromStore
 from .records import PIPE, STASHED, TICK, Answer, Snapshot
+from .segments import Place
 from .timers import Saved
 
 if TYPE_CHECKING:
     from .switch import Switch
 
 FORMAT = 1
+IMAGES = 2
+"""The format of snapshots that an older holdfast would take for empty: in blocks, or compressed."""
 
 
 class Meta(msgspec.Struct, array_like=True, frozen=True):
     """A snapshot, with what the home knew when it came.
+
+    A large state is not in `state`, but in `blocks`: places in packs. `earlier` packs are needed by older snapshots.
+    `codec`: how `state` is compressed, and `length` what it was before.
 
     `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
     were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh.
@@ -34,11 +43,49 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     epoch: int
     state: bytes
     base: int = -1
+    blocks: list[Place] = []
+    earlier: list[int] = []
+    codec: int = PLAIN
+    length: int = 0
+
+    @property
+    def has_state(self) -> bool:
+        """Whether there is a state; else the actor begins afresh."""
+        return bool(self.state or self.blocks)
 
 
 def decode_meta(data: bytes) -> Meta:
-    """A snapshot as the store has it."""
-    return msgspec.msgpack.decode(data, type=Meta)
+    """A snapshot as the store has it.
+
+    Raises:
+        HoldfastError: it is of a format that this holdfast does not know, or damaged. It stays as it is.
+    """
+    try:
+        meta = msgspec.msgpack.decode(data, type=Meta)
+        if meta.format not in (FORMAT, IMAGES):
+            raise HoldfastError(f"a snapshot has format {meta.format}, which this holdfast does not know")
+        if meta.codec == PLAIN:
+            return meta
+        state = decompress(meta.codec, meta.state, meta.length)
+    except (msgspec.DecodeError, msgspec.ValidationError, ValueError) as error:
+        raise HoldfastError(f"a snapshot cannot be read: {error}") from error
+    return msgspec.structs.replace(meta, state=state, codec=PLAIN, length=0)
+
+
+def encode_meta(meta: Meta, compress: bool | int) -> bytes:
+    """A snapshot as the store will have it."""
+    if compress and meta.state:
+        codec, state = compressor(compress)(meta.state)
+        if codec != PLAIN:
+            meta = msgspec.structs.replace(meta, format=IMAGES, codec=codec, length=len(meta.state), state=bytes(state))
+    return msgspec.msgpack.encode(meta)
+
+
+def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> Meta:
+    """A snapshot of the state after `turn`, with what the home knows at this moment."""
+    return Meta(
+        FORMAT, turn, home.next_id, stash, home.timers.saved(), list(home.topics), home.journal.epoch, state, turn
+    )
 
 
 def cut(home: Switch, state: bytes, record: Snapshot) -> None:
@@ -47,14 +94,12 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     Raises:
         HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
     """
-    turn, older = record.turn, home.newest
-    meta = Meta(
-        FORMAT, turn, home.next_id, record.stash, home.timers.saved(), list(home.topics), home.journal.epoch, state,
-        turn,
-    )  # fmt: skip
+    older = home.newest
+    meta = msgspec.structs.replace(meta_now(home, record.turn, record.stash, state), earlier=home.images.earlier())
     put(home, meta, home.method.keep)
     # In a store that lasts it is read back when it is wanted.
     home.older = older if home.method.keep > 1 and not home.journal.durable else None
+    home.images.tidy()
 
 
 def put(home: Switch, meta: Meta, keep: int) -> None:
@@ -66,11 +111,14 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
     covered = [number for number in home.turns if number <= meta.turn]
     if home.journal.durable:
         drop = [*home.dropped, *(position for number in covered for position in home.positions.get(number, ()))]
+        # An image may be behind: what was stashed when it was begun may have been handled since.
+        later = {turn.input.id for number, turn in home.turns.items() if number > meta.turn}
         for number in covered:
             source = home.turns[number].input
-            if source.id not in home.open:  # Else it is stashed, and not handled yet.
+            if source.id not in home.open and source.id not in later:  # Else it is stashed, and not handled yet.
                 drop.extend(source.positions)
-        home.journal.cut(home.path, msgspec.msgpack.encode(meta), drop, turn=meta.turn, keep=keep)
+        home.journal.cut(home.path, encode_meta(meta, home.method.compress), drop, turn=meta.turn, keep=keep)
+    home.images.cancel()
     home.dropped.clear()
     home.newest, home.stash = meta, meta.stash
     done = (home.turns.pop(number) for number in covered)
@@ -84,10 +132,10 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
 
 def load(home: Switch) -> None:
     """Take up where the store left off."""
-    saved = home.journal.load(home.path)
+    saved, newest = load_newest(home)
     timers: dict[str, Saved] = {}
-    if saved.snapshot is not None:
-        meta = home.newest = decode_meta(saved.snapshot)
+    if newest is not None:
+        meta = home.newest = newest
         home.turn, home.next_id, home.stash, timers = meta.turn, meta.next_id, meta.stash, dict(meta.timers)
         home.topics = dict.fromkeys(meta.topics)
     for position, entry in saved.entries:
@@ -99,6 +147,34 @@ def load(home: Switch) -> None:
             home.bytes += len(turn.input.body) + OVERHEAD
     for key, (name, body, left, interval) in timers.items():
         home.timers.start(key, name, body, max(0.0, left), interval)
+
+
+def load_newest(home: Switch) -> tuple[FromStore, Meta | None]:
+    """The newest snapshot that can be used, with the journal since then; an event says if it is not the newest.
+
+    Raises:
+        DamagedStore: none can.
+    """
+    reason, tried = "", set[bytes]()
+    for older in range(home.method.keep + 2):  # More may be there for a moment, and some were passed over already.
+        saved = home.journal.load(home.path, older=older)
+        reason = reason or saved.passed_over
+        if saved.snapshot is None:
+            return saved, None
+        if saved.snapshot in tried:
+            continue
+        tried.add(saved.snapshot)
+        try:
+            meta = decode_meta(saved.snapshot)
+            home.images.fetch(meta)
+        except HoldfastError as error:
+            reason = reason or str(error)
+            continue
+        if reason:
+            home.node.emit(SnapshotDamaged(home.path, saved.turn, reason))
+        home.images.loaded(meta)
+        return saved, meta
+    raise DamagedStore(home.path, home.path, None, f"no snapshot is left: {reason}")
 
 
 def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:

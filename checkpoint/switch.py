@@ -23,15 +23,17 @@ from ..actors.errors import (
     ReplayDiverged,
     StartIgnored,
 )
-from ..actors.events import RecoveryFailed, SnapshotFailed, SnapshotTaken
+from ..actors.events import RecoveryFailed, SnapshotTaken
 from ..actors.exits import pack_exit
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
 from .asks import Calls, SwitchAsk, answer_ask
 from .bound import HomeBound
+from .due import Due
 from .ends import Ends
 from .inputs import OVERHEAD, Batch, Input, Turn
 from .journal import Journal
+from .keeping import Images
 from .limit import Limit
 from .method import Method
 from .outputs import Outputs
@@ -52,6 +54,7 @@ from .records import (
     Go,
     Ignored,
     Live,
+    Marked,
     Out,
     PipeDone,
     Released,
@@ -109,6 +112,8 @@ class Switch:
         self.waits_for_release = False  # somebody else says when the actor gets what is new
         self.replay = Replay(self)
         self.skipping = Skipping(self)
+        self.images = Images(self)
+        self.due = Due(self)
         self.pipes_done: dict[int, set[int]] = {}
         self.topics: dict[str, None] = {}
         self.newest: Meta | None = None  # the snapshot to begin with
@@ -130,6 +135,20 @@ class Switch:
         self._replay_turn = -1
         load(self)
 
+    def use(self, method: Method) -> None:
+        """Work as this method says, from now on."""
+        self.method = method
+        self.limit.at = method.trigger
+        if method.every:  # Whoever does not want it does not pay for it.
+            self.from_life = self._counting  # type: ignore[method-assign]
+        else:
+            self.__dict__.pop("from_life", None)
+
+    def _counting(self, record: ToHome) -> None:
+        type(self).from_life(self, record)
+        if type(record) is TurnEnd:
+            self.due.count(self.turn)
+
     # -- admission --------------------------------------------------------------------------------------------------
 
     def admit(self, cell: Cell, item: Any) -> None:
@@ -148,8 +167,7 @@ class Switch:
             if type(message) not in cell.table:
                 cell.require(message)
             name, body = message_name(type(message)), self.node.codec.encode(message, self.path)
-        if self.bytes >= self.method.journal_limit and not self.limit.makes_room():
-            self.limit.refuse(ask)
+        if self.bytes >= self.limit.at and not self.limit.has_room(ask):
             return
         origin = None if sender is None else sender.path
         if self.bound is None or self.bound.makes_room(ask, name, body, origin):
@@ -225,9 +243,9 @@ class Switch:
     # -- recovery ---------------------------------------------------------------------------------------------------
 
     @property
-    def state(self) -> bytes | None:
-        """The state to begin with, if there is any."""
-        return self.newest.state or None if self.newest is not None else None
+    def has_state(self) -> bool:
+        """Whether there is a state to begin with."""
+        return self.newest is not None and self.newest.has_state
 
     @property
     def state_turn(self) -> int:
@@ -237,7 +255,7 @@ class Switch:
     @property
     def is_new(self) -> bool:
         """Whether nothing was ever handled here, or all of it was undone."""
-        return self.turn == self.state_turn and self.state is None
+        return self.turn == self.state_turn and not self.has_state
 
     def prepare(self) -> asyncio.Future[float]:
         """A new life begins: hold what comes. The future ends when it is live, with the seconds its restore took."""
@@ -247,6 +265,8 @@ class Switch:
         self.is_void = False
         self.replay.cancel()
         self._incoming.clear()  # The last life may have died in the middle of a snapshot.
+        self.images.cancel()
+        self.due.restarted()
         self.timers.resume()
         if self.live is not None and not self.live.done():
             self.live.cancel()
@@ -255,7 +275,12 @@ class Switch:
 
     def restore_records(self) -> list[Restore]:
         """The state to begin with, in pieces; none if there is no snapshot."""
-        return [] if self.state is None else [Restore(part) for part in pieces(self.state)]
+        newest = self.newest
+        if newest is None or not newest.has_state:
+            return []
+        if newest.blocks:
+            return list(self.images.restore(newest.blocks))
+        return [Restore(part) for part in pieces(newest.state)]
 
     def attach(self, port: LifePort) -> None:
         """The life is constructed and restored: feed it what it has to handle again, then `Go`."""
@@ -304,6 +329,7 @@ class Switch:
                 port.to_life(source.feed(-1, pipes if index == 0 else (), has_begun=begun))
         if self.bound is not None:
             self.bound.refill()
+        self.due.on_want(self)
         if holding is not None:
             holding.let_in()
 
@@ -362,7 +388,9 @@ class Switch:
                 case PipeDone():
                     self._pipe_done(record)
                 case Unsaved():
-                    self.node.emit(SnapshotFailed(self.path, record.problem))
+                    self.due.failed(record.problem)
+                case Marked():
+                    self.images.mark(record)
                 case Ignored():
                     if self.live is not None and not self.live.done():
                         self.live.set_exception(StartIgnored(self.path, record.why))
@@ -473,6 +501,9 @@ class Switch:
     # -- snapshots --------------------------------------------------------------------------------------------------
 
     def _snapshot(self, record: Snapshot) -> None:
+        if record.image is not None:
+            self.images.take(record, record.image)
+            return
         self._incoming.append(record.data)
         if not record.is_last:
             return
@@ -481,7 +512,7 @@ class Switch:
         try:
             cut(self, state, record)
         except HoldfastError as error:
-            self.node.emit(SnapshotFailed(self.path, str(error)))
+            self.due.failed(str(error))
             if self.port is not None:
                 self.port.to_life(SnapshotNow(at_once=False))
             if record.is_replaced and self.cell is not None:
@@ -489,5 +520,6 @@ class Switch:
                 self.cell.kill()
             return
         self.limit.cut()
+        self.due.kept(record.turn)
         if self.node.watched:
-            self.node.emit(SnapshotTaken(self.path, record.turn, len(state), record.pause))
+            self.node.emit(SnapshotTaken(self.path, record.turn, len(state), record.pause, len(state)))

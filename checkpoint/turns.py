@@ -220,7 +220,7 @@ class StopRecorded(Item):
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         life: Life = item.life
-        life.take_snapshot()
+        life.take_snapshot(is_last=True)
         life.in_hook = True
         lives.finish(life.cell, item.reason)
         return LEAVE

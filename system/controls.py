@@ -238,6 +238,26 @@ class Controls:
             raise ActorStopped(ref.path, "nobody lives there")
         return living
 
+    async def checkpoint(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> None:
+        """Have a recorded actor's state saved; returns when all that it has handled up to now is in a snapshot.
+
+        With a store that lasts, the snapshot is in it then. While the actor is being recovered, its next life is
+        waited for; background work (`pipe_to_self`) that is out is waited for too.
+
+        Raises:
+            SpecError: its method keeps no snapshots. CheckpointFailed: it could not be saved, or has stopped.
+            AskTimeout: it was not within `timeout` seconds.
+        """
+        switch = switch_of(self._living(ref))
+        if switch is None:
+            raise SpecError(ref.path, "is not recorded, so there is nothing to save: give it recovery=hybrid(...)")
+        wish = switch.due.wish()
+        done, _ = await asyncio.wait([wish], timeout=timeout)
+        if not done:
+            wish.cancel()
+            raise AskTimeout(ref.path, timeout, None)
+        wish.result()
+
     async def _replace(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
         """Carry out an order that gives a recorded actor another state; raises ControlFailed if that is not kept."""
         switch = switch_of(ref._cell)

@@ -18,9 +18,9 @@ import hashlib
 from ..errors import DamagedValue, UnsavableValue
 from .forms import FORMAT, HEAD
 from .reading import Decoder, make_int, unpack
-from .writing import pieces
+from .writing import pieces, walked_pieces
 
-__all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest"]
+__all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest", "walked_pieces"]
 
 
 def encode_value(value: object, *, where: str = "value") -> bytes:

@@ -38,6 +38,11 @@ TUPLE: Final = KNOWN[tuple][0]
 
 def pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
     """The bytes of a value, in parts to be joined; `canonical` as in `_Encoder`."""
+    return walked_pieces(value, where, canonical=canonical)[0]
+
+
+def walked_pieces(value: object, where: str, *, canonical: bool = False) -> tuple[list[Any], dict[int, object]]:
+    """As `pieces`, and what can change and was reached, by id: two values that share none of it can be kept apart."""
     try:
         encoder = _Encoder(canonical, shared=set())
         tree = encoder.lowered(value)
@@ -51,8 +56,8 @@ def pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
     except (RecursionError, ValueError) as error:
         raise UnsavableValue(where, f"a value that is nested too deep or too large ({error})") from None
     if not encoder.has_marks:
-        return [HEAD_ALONE, packed]
-    return [HEAD.pack(FORMAT, 1, len(packed)), packed, *encoder.blobs]
+        return [HEAD_ALONE, packed], encoder.walked
+    return [HEAD.pack(FORMAT, 1, len(packed)), packed, *encoder.blobs], encoder.walked
 
 
 class _Encoder:

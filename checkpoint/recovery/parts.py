@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+from .checkpoints import CheckpointHandler
 from .controller import RecoveryController
 from .part import Part
 from .switch import MessageSwitch
 
-PARTS: tuple[tuple[str, type[Part]], ...] = (("controller", RecoveryController), ("switch", MessageSwitch))
+PARTS: tuple[tuple[str, type[Part]], ...] = (
+    ("controller", RecoveryController),
+    ("switch", MessageSwitch),
+    ("checkpoints", CheckpointHandler),
+)

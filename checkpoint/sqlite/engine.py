@@ -7,11 +7,13 @@ import sqlite3
 import zlib
 from array import array
 from bisect import bisect_left, bisect_right
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Final, Literal
 
 from ..journal import DamagedStore, Entry, Primitive, Saved, StaleEpoch, StoreFailed
+from ..segments import Segment
 from .chains import MODULUS, Chain
+from .packs import Packs
 from .reading import ChainReader
 from .rows import CHUNK, check_entry, crc_of, entry_packer, pack_positions, row_crc, snapshot_digest, unpack_positions
 from .store import Store
@@ -53,6 +55,7 @@ class SqliteJournal:
         with store.opening(takeover=takeover):
             self._finish()
             self.epoch = store.claim.epoch
+            self._packs = Packs(self.path)
             self._reader = ChainReader(store.reader, self.path, store.files)
 
     def _finish(self) -> None:
@@ -134,17 +137,32 @@ class SqliteJournal:
             # The snapshot is kept, which is what we promised; the next cut cleans up.
 
     def _clean(self, chain: Chain, keep: int) -> None:
-        """Remove what only outdated snapshots need. A crash in between is made good by the next cut."""
-        for number in chain.kept[: -1 if keep > 1 else None]:
-            self._remove_dropped(chain, number)
-        outdated = chain.kept[: -2 if keep > 1 else -1]
-        if not outdated:
-            return
-        with self._store.transaction(note=True) as db:
-            files = self._delete_snapshots(db, outdated)
-            del chain.kept[: len(outdated)]
-            chain.write(db)
-        self._store.files.remove(files)
+        """Remove what only outdated snapshots need. A crash in between is made good by the next cut.
+
+        First the outdated ones go, and the oldest that stays takes over what they had still to remove; only then are
+        entries removed: whatever is kept at any moment has all the entries behind it.
+        """
+        outdated = chain.kept[:-keep]
+        if outdated:
+            with self._store.transaction(note=True) as db:
+                self._hand_on_drops(chain, db, outdated, chain.kept[-keep])
+                files = self._delete_snapshots(db, outdated)
+                del chain.kept[: len(outdated)]
+                chain.write(db)
+            self._store.files.remove(files)
+        if len(chain.kept) >= keep:
+            self._remove_dropped(chain, chain.kept[0])
+
+    def _hand_on_drops(self, chain: Chain, db: sqlite3.Connection, outdated: Sequence[int], heir: int) -> None:
+        drops = array("q")
+        for number in (*outdated, heir):
+            row = db.execute("SELECT drops FROM snapshots WHERE id = ?", (number,)).fetchone()
+            try:
+                drops += unpack_positions(row[0])
+            except (TypeError, ValueError, zlib.error) as error:
+                reason = f"the drop list of snapshot {number} is damaged"
+                raise DamagedStore(self.path, chain.path, None, reason) from error
+        db.execute("UPDATE snapshots SET drops = ? WHERE id = ?", (pack_positions(drops) if drops else b"", heir))
 
     def _remove_dropped(self, chain: Chain, number: int) -> None:
         """Physically remove the entries that a snapshot made superfluous, then forget which they were."""
@@ -189,7 +207,7 @@ class SqliteJournal:
             db.execute("DELETE FROM snapshots WHERE id = ?", (number,))
         return files
 
-    def load(self, address: str, *, older: bool = False) -> Saved:
+    def load(self, address: str, *, older: int = False) -> Saved:
         """Read back one address; see `Journal`. Appends go on meanwhile."""
         with self._store.read_lock:
             try:
@@ -213,6 +231,28 @@ class SqliteJournal:
                 chain.path = None
                 chain.write(db)
         self._finish_erase(chain)
+        self._packs.erase(address)
+
+    def keep_blocks(
+        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
+    ) -> None:
+        """Keep blocks of a large snapshot as a pack; see `Journal`. Call it in a thread: it waits for the disk."""
+        self._store.refuse_failed()
+        self._packs.write(address, number, blocks, compress)
+
+    def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """Read blocks of a pack, and verify them; see `Journal`."""
+        return self._packs.read(address, number, places)
+
+    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+        """Remove packs that no kept snapshot needs; see `Journal`."""
+        unneeded = self._packs.names(address).difference(needed)
+        if not unneeded:
+            return
+        with self._store.transaction():
+            pass  # Somebody else may own the store by now: then the packs are theirs.
+        self._store.files.sync_rows()
+        self._packs.remove(address, unneeded)
 
     def _finish_erase(self, chain: Chain) -> None:
         while chain.positions:

@@ -27,7 +27,7 @@ class SnapshotFiles:
         """
         name = f"{epoch}-{next(self._numbers)}.snapshot"
         try:
-            write_durably(os.path.join(self.folder, name), snapshot)
+            write_durably(os.path.join(self.folder, name), [snapshot])
         except OSError as error:
             # The journal goes on: nothing is synced twice here, the next attempt writes a new file.
             raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error
@@ -43,23 +43,28 @@ class SnapshotFiles:
         First the WAL is synced: otherwise a power loss could bring back the rows, but not the files. (It has no locks,
         so that closing it drops none.)
         """
-        if names and os.path.exists(f"{self.path}-wal"):
-            sync(f"{self.path}-wal")
+        if names:
+            self.sync_rows()
         for name in names:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(os.path.join(self.folder, name))
+
+    def sync_rows(self) -> None:
+        """Bring what was committed to the disk."""
+        if os.path.exists(f"{self.path}-wal"):
+            sync(f"{self.path}-wal")
 
     def remove_all_but(self, known: Collection[str]) -> None:
         """Remove what an earlier owner has written or left half made, and never named in a row."""
         self.remove([name for name in os.listdir(self.folder) if name not in known])
 
 
-def write_durably(path: str, data: bytes) -> None:
+def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
     """Create the file so that it exists after a power loss completely or not at all."""
     temporary = f"{path}.tmp"
     try:
         with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(data)
+            file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
         os.rename(temporary, path)

@@ -19,7 +19,7 @@ class ChainReader:
     def __init__(self, db: sqlite3.Connection, path: str, files: SnapshotFiles) -> None:
         self._db, self.path, self._files = db, path, files
 
-    def load(self, chain: Chain, positions: array[int], kept: list[int], older: bool) -> Saved:
+    def load(self, chain: Chain, positions: array[int], kept: list[int], older: int) -> Saved:
         """Read snapshot and entries of the chain, as they were when `positions` and `kept` were.
 
         Raises:
@@ -28,9 +28,8 @@ class ChainReader:
         reason = ""
         snapshot, turn = None, 0
         dropped: set[int] = set()
-        candidates = kept[:-1] if older and len(kept) > 1 else kept
-        # During a clean-up there are more than two, but the entries of the oldest may already be gone.
-        for number in reversed(candidates[-1:] if older else kept[-2:]):
+        candidates = kept[: max(1, len(kept) - older)]
+        for number in reversed(candidates):
             try:
                 snapshot, turn = self._read_snapshot(chain, number)
                 dropped = self._read_drops(chain, kept[: kept.index(number) + 1])

@@ -1,0 +1,185 @@
+"""Snapshots of a large state: when they are taken, what is written, and that it comes back (T9, T10, T18)."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import numpy as np
+import pytest
+
+import holdfast as hf
+from holdfast.checkpoint.image import Imager, read_image
+from tests.checkpoint.image_player import MANY, Canvas, Digest, Paint, Spoil, Write
+from tests.checkpoint.players import start, until
+from tests.checkpoint.strikes import NEVER, event, strike
+
+HANDLER = "/app/recovery/checkpoints"
+
+
+async def canvas(system: hf.ActorSystem, isolation: str, *arguments: Any, **options: Any) -> hf.ActorRef[Canvas]:
+    options.setdefault("interval", NEVER)
+    return await start(
+        system, isolation, "canvas", hf.start(Canvas, *arguments), recovery=hf.hybrid(**options), shutdown=8.0
+    )
+
+
+async def taken(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.SnapshotTaken:
+    with system.events() as stream:
+        await system.checkpoint(ref, timeout=20.0)
+        return await event(stream, hf.SnapshotTaken)
+
+
+def running(store: str | None) -> hf.ActorSystem:
+    return hf.ActorSystem("app", store=store, log=False, intensity=1000)
+
+
+@pytest.mark.parametrize("cells", [600_000, MANY])
+async def test_what_has_not_changed_is_not_written_again_and_all_of_it_comes_back(
+    store: str | None, isolation: str, cells: int
+) -> None:
+    async with running(store) as system:
+        ref = await canvas(system, isolation, cells)
+        await ref.ask(Paint(0, cells))
+        whole = await taken(system, ref)
+        assert whole.written_bytes == whole.size_bytes > cells * 8
+        await ref.ask(Paint(cells // 2, cells // 10))
+        tenth = await taken(system, ref)
+        assert tenth.size_bytes == whole.size_bytes
+        assert cells * 8 // 10 <= tenth.written_bytes <= cells * 8 // 10 + 3 * 256 * 1024
+        await ref.ask(Write("x"))
+        small = await taken(system, ref)
+        assert small.written_bytes < 2000, "only the small variables have changed"
+        await ref.ask(Paint(7, 1))
+        before = await ref.ask(Digest())
+        with system.events() as stream:
+            strike(system, ref)
+            recovered = await event(stream, hf.Recovered)
+        assert await ref.ask(Digest(), timeout=20.0) == before
+        assert recovered.replayed == 2, "what no snapshot has: a change, and a look"
+
+
+async def test_a_snapshot_is_in_the_store_when_checkpoint_returns(store: str | None, isolation: str) -> None:
+    if store is None:
+        pytest.skip("nothing outlives the root in memory")
+    async with running(store) as system:
+        ref = await canvas(system, isolation)
+        await ref.ask(Paint(3, 5))
+        await system.checkpoint(ref, timeout=20.0)
+        switch: Any = ref._cell.host.switch  # type: ignore[attr-defined]
+        saved = system.homes.journal.load(ref.path)
+        assert saved.turn == switch.turn
+        assert not saved.entries
+        before = await ref.ask(Digest())
+    async with running(store) as system:
+        ref = await canvas(system, isolation)
+        assert await ref.ask(Digest(), timeout=20.0) == before
+
+
+async def test_a_snapshot_is_taken_every_so_many_messages(system: hf.ActorSystem, isolation: str) -> None:
+    ref = await canvas(system, isolation, 10, every=20)
+    with system.events() as stream:
+        for _ in range(19):
+            await ref.ask(Write("x"))
+        assert not [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+        await ref.ask(Write("x"))
+        first = await event(stream, hf.SnapshotTaken)
+        assert 19 <= first.turn <= 21
+
+
+async def test_a_snapshot_is_taken_after_so_many_bytes_of_journal(system: hf.ActorSystem, isolation: str) -> None:
+    ref = await canvas(system, isolation, 10, journal_bytes=50_000)
+    with system.events() as stream:
+        for _ in range(4):
+            await ref.ask(Write("x" * 10_000))
+        assert not [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+        for _ in range(3):
+            await ref.ask(Write("x" * 10_000))
+        await event(stream, hf.SnapshotTaken)
+
+
+async def test_a_snapshot_is_taken_when_the_interval_is_over_and_only_of_what_has_changed(
+    system: hf.ActorSystem, isolation: str
+) -> None:
+    ref = await canvas(system, isolation, 10, interval=0.05)
+    await ref.ask(Write("x"))
+    with system.events() as stream:
+        await event(stream, hf.SnapshotTaken)
+        await asyncio.sleep(0.3)  # There is nothing to wait for: nothing shall happen.
+        assert not [one for one in stream.take() if isinstance(one, hf.SnapshotTaken)]
+
+
+async def test_whoever_wants_a_snapshot_gets_it_however_often_the_handler_dies(
+    system: hf.ActorSystem, isolation: str
+) -> None:
+    ref = await canvas(system, isolation)
+    for number in range(12):
+        await ref.ask(Paint(number, 1))
+        wish = asyncio.ensure_future(system.checkpoint(ref, timeout=20.0))
+        for _ in range(number % 4):
+            await asyncio.sleep(0)
+        system.node.find(HANDLER).kill()
+        await wish
+    assert await ref.ask(Paint(0, 1)) == 13
+
+
+async def test_the_interval_goes_on_with_the_next_handler(system: hf.ActorSystem) -> None:
+    ref = await canvas(system, "task", 10, interval=0.05)
+    first = system.node.find(HANDLER)
+    first.kill()
+    await until(lambda: system.node.find(HANDLER).life > 1)
+    await ref.ask(Write("x"))
+    with system.events() as stream:
+        await event(stream, hf.SnapshotTaken)
+
+
+async def test_what_cannot_be_saved_is_told_tried_again_and_nothing_is_lost(
+    system: hf.ActorSystem, isolation: str
+) -> None:
+    ref = await canvas(system, isolation, 3_000_000, interval=0.05)
+    await system.checkpoint(ref, timeout=20.0)
+    await ref.ask(Spoil(True))
+    with system.events() as stream:
+        failed = await event(stream, hf.SnapshotFailed)
+        assert "spoiled" in failed.reason
+        again = await event(stream, hf.SnapshotFailed)
+        assert again.reason == failed.reason
+    with pytest.raises(hf.CheckpointFailed, match="spoiled"):
+        await system.checkpoint(ref, timeout=20.0)
+    await ref.ask(Spoil(False))
+    await system.checkpoint(ref, timeout=20.0)
+    assert (await taken_after(system, ref)).written_bytes < 300_000, "the images before it are still good"
+
+
+async def taken_after(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.SnapshotTaken:
+    await ref.ask(Write("x"))
+    return await taken(system, ref)
+
+
+async def test_an_unrecorded_actor_cannot_be_saved(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("plain", hf.start(Canvas, 10)))
+    with pytest.raises(hf.SpecError, match="not recorded"):
+        await system.checkpoint(ref)
+
+
+def test_variables_that_share_something_come_back_sharing_it() -> None:
+    inner = [1, 2]
+    array = np.arange(30_000)
+    state = {"a": inner, "b": {"x": inner}, "c": array, "d": [array], "e": 5, "f": [1, 2]}
+    pieces = Imager().image(3, "keys", state, "x")
+    version, form, back = read_image(b"".join(bytes(memoryview(piece).cast("B")) for _, piece in pieces))
+    assert (version, form) == (3, "keys")
+    assert isinstance(back, dict)
+    assert back["b"]["x"] is back["a"]
+    assert back["d"][0] is back["c"]
+    assert back["f"] is not back["a"]
+    assert {name: back[name] for name in "abef"} == {name: state[name] for name in "abef"}
+    assert (back["c"] == array).all()
+
+
+def test_an_image_with_any_byte_of_its_head_damaged_is_refused_or_reads_the_same_arrays() -> None:
+    pieces = Imager().image(1, "keys", {"n": 1, "grid": np.ones(20_000)}, "x")
+    data = b"".join(bytes(memoryview(piece).cast("B")) for _, piece in pieces)
+    for size in (0, 5, 9, 30, len(data) - 1):
+        with pytest.raises(hf.HoldfastError):
+            read_image(data[:size])
