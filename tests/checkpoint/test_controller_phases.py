@@ -144,7 +144,9 @@ async def test_a_part_is_killed_at_every_point(point: tuple[str, str], victim: s
             asked = robot.ask(Do(["tell two", "add two"], notes), timeout=8.0)
             assert await asked == "2"
             await until(lambda: not system.homes.recoveries.all())
-            await until(lambda: part(system, "controller")._cell.life > 0 and bool(part(system, "controller")._cell.actor))
+            await until(
+                lambda: part(system, "controller")._cell.life > 0 and bool(part(system, "controller")._cell.actor)
+            )
             await over(system)
             told = phases(stream.take(), robot.path)
         assert killed == 1
