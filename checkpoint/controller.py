@@ -202,7 +202,7 @@ class RecordedProcessHost(HomeHost, ProcessHost):
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         worker = self._workers.of(cell)
-        if worker is None or self.switch is None or not self.switch.is_released:
+        if worker is None or self.switch is None or not self.switch.is_live:
             self._stop_wanted = reason
             return
         self.send_stop(worker, cell, reason)

@@ -248,6 +248,12 @@ class Switch:
         return self.newest is not None and self.newest.has_state
 
     @property
+    def is_live(self) -> bool:
+        """Whether the life has caught up, even if somebody else says when it gets what is new."""
+        waits = self.waits_for_release and self.live is not None and self.live.done() and self.port is not None
+        return self.is_released or waits
+
+    @property
     def state_turn(self) -> int:
         """The turn that the next life begins after, apart from what is replayed to it; -1: none."""
         return self.newest.turn if self.newest is not None else -1

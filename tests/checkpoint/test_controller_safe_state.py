@@ -9,8 +9,21 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.checkpoint.guards import Faint, Halt, Resume, Wheels, over, part, phases, planner, running, wheels, words
-from tests.checkpoint.players import Do, Note, Seen, until
+from tests.checkpoint.guards import (
+    Faint,
+    Halt,
+    Planner,
+    Resume,
+    Wheels,
+    over,
+    part,
+    phases,
+    planner,
+    running,
+    wheels,
+    words,
+)
+from tests.checkpoint.players import Do, Note, Seen, start, until
 from tests.checkpoint.strikes import event, strike, struck
 
 
@@ -48,9 +61,6 @@ async def test_a_binding_is_followed_to_where_it_leads_now(isolation: str) -> No
     async with running() as system:
         first, second = await wheels(system), await wheels(system, "second")
         spec: dict[str, Any] = {"recovery": hf.hybrid(safe_state="wheels"), "bindings": {"wheels": "/app/wheels"}}
-        from tests.checkpoint.guards import Planner
-        from tests.checkpoint.players import start
-
         robot = await start(system, isolation, "planner", hf.start(Planner), **spec)
         await struck(system, robot)
         await over(system)
@@ -144,7 +154,7 @@ async def test_it_stays_when_the_recovery_fails_and_ends_when_the_actor_is_back(
         kind: Any = "process" if isolation != "task" else "task"
         child = hf.child(
             "planner",
-            hf.start(__import__("tests.checkpoint.guards", fromlist=["Planner"]).Planner),
+            hf.start(Planner),
             recovery=hf.hybrid(interval=3600.0, safe_state="/app/wheels"),
             isolation="process" if isolation == "process" else "task",
         )
