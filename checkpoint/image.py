@@ -172,7 +172,7 @@ def estimate(actor: Actor, names: Iterable[str]) -> int:
     numpy: Any = sys.modules.get("numpy")
     total = 0
     for name in names:
-        value = getattr(actor, name, None)
+        value: Any = getattr(actor, name, None)
         if isinstance(value, bytes | bytearray):
             total += len(value)
         elif numpy is not None and isinstance(value, numpy.ndarray):

@@ -113,10 +113,10 @@ class Imaging:
     def written(self, job: _Job, layout: Layout) -> None:
         """A forked writer is ready."""
         self._writer = None
-        if self._life.is_live and self._life.cell.actor is not None:
+        try:
             self._hand_over(job, layout)
-        else:
-            os.close(job.file)
+        except OSError as error:
+            self.failed(job, str(error))
 
     def failed(self, job: _Job, problem: str) -> None:
         """A forked writer is not."""
