@@ -173,7 +173,7 @@ def estimate(actor: Actor, names: Iterable[str]) -> int:
     root: Any = actor._state_root()
     total = 0
     for name in names:
-        value = root
+        value: Any = root
         for part in name.split("."):
             value = getattr(value, part, None)
         if isinstance(value, bytes | bytearray):

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 FORK_BYTES: Final = 16 * 1024 * 1024
 """States from this size on are written by a forked process, where that is possible: below, a copy is quicker."""
+MOST_COPIED: Final = 200 * 1024 * 1024
+"""Arrays up to this size that are rewritten between two snapshots are copied: a fault for each page takes longer."""
 MOST_SEGMENTS: Final = 32
 """Segments that one image may be spread over before it is written anew."""
 _PR_SET_PDEATHSIG: Final = 1
@@ -53,6 +55,7 @@ class Imaging:
         self._written: tuple[Segment, Layout] | None = None  # what the home has not acknowledged yet
         self._writer: Writer | None = None
         self._is_again = False
+        self._last_share = 1.0  # of the last image was new
         self.last_bytes = 0
 
     @property
@@ -83,10 +86,9 @@ class Imaging:
         state = state_of(actor)
         number = new_number()
         file = os.memfd_create(f"holdfast {number:x}", os.MFD_CLOEXEC)
-        size = max(self.last_bytes, estimate(actor, variables(actor)))
         job = _Job(life.turn, [fed.feed.id for fed in life.stash], number, file)
         try:
-            if self._may_fork and size >= FORK_BYTES and is_alone():
+            if self._may_fork and self._should_fork(estimate(actor, variables(actor))) and is_alone():
                 self._writer = Writer(self, job, state)
                 life.port.to_home(Marked(life.turn))
                 job.pause = time.perf_counter() - begin
@@ -98,6 +100,11 @@ class Imaging:
         job.pause = time.perf_counter() - begin
         self._hand_over(job, layout)
 
+    def _should_fork(self, arrays: int) -> bool:
+        size = max(self.last_bytes, arrays)
+        is_rewritten = self._last_share > 0.5 and arrays > 0.9 * size
+        return size >= FORK_BYTES and not (is_rewritten and size <= MOST_COPIED)
+
     def write(self, job: _Job, state: Any) -> Layout:
         """Write what differs from the last image that is kept."""
         pieces = self._imager.image(state.version, state.form, state.value, self._life.cell.path)
@@ -106,10 +113,10 @@ class Imaging:
     def written(self, job: _Job, layout: Layout) -> None:
         """A forked writer is ready."""
         self._writer = None
-        if self._life.is_live and self._life.cell.actor is not None:
+        try:
             self._hand_over(job, layout)
-        else:
-            os.close(job.file)
+        except OSError as error:
+            self.failed(job, str(error))
 
     def failed(self, job: _Job, problem: str) -> None:
         """A forked writer is not."""
@@ -123,6 +130,8 @@ class Imaging:
         self._written = segment, layout
         life, places = self._life, places_of(layout)
         self.last_bytes = sum(length for _, _, length in places)
+        new = sum(length for number, _, length in places if number == job.number)
+        self._last_share = new / max(1, self.last_bytes)
         shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places)
         life.image_taken(job.turn)
         life.port.to_home(Snapshot(job.turn, b"", True, job.stash, job.pause, False, shared))

@@ -93,7 +93,7 @@ class Images:
             self._finish(meta, record, shared)
             needed = {number for number, _, _ in meta.blocks}.union(meta.earlier)
             await asyncio.to_thread(journal.forget_blocks, home.path, needed)
-        except HoldfastError as error:
+        except Exception as error:  # Whatever it was: the next snapshot must be possible.
             if self._saving is me:
                 self._saving = None
                 self.refuse(shared, str(error))

@@ -153,9 +153,9 @@ def open_segment(number: int, pid: int, file: int, inode: int) -> Segment:
     """
     try:
         own = os.open(f"/proc/{pid}/fd/{file}", os.O_RDWR | os.O_CLOEXEC)
+        segment = Segment(number, own)
     except OSError as error:
         raise HoldfastError(f"the blocks of a snapshot are gone: {error}") from error
-    segment = Segment(number, own)
     if segment.inode != inode:
         segment.close()
         raise HoldfastError("the blocks of a snapshot are gone: its process has closed them")

@@ -200,7 +200,7 @@ def test_every_setting_of_a_method_can_stand_in_the_file() -> None:
         ('["/a"]\ninterval = true', r"line 2, \[/a\]: interval: Expected `float`, got `bool`"),
         ('["/a"]\ninterval = -1', r"line 2, \[/a\]: .*interval must be seconds > 0, not -1"),
         ('["/a"]\npacing = "slow"', r"line 2, \[/a\]: .*pacing"),
-        ('["/a"]\nkeep = 3', r"line 2, \[/a\]: .*keep must be 1 or 2"),
+        ('["/a"]\nkeep = 0', r"line 2, \[/a\]: .*keep must be a whole number from 1 to 100"),
         ('["/b"]\nkeep = 2\n["/a"]\n# keep\nkeep = 2.5', r"line 5, \[/a\]: keep: Expected `int`, got `float`"),
         ('["/a"]\nheld = 3', r"line 2, \[/a\]: held: Expected `object`, got `int`"),
         ('["/a"]\nheld = { capacity = 0 }', r"line 2, \[/a\]: held: capacity must be"),

@@ -24,6 +24,11 @@ async def canvas(system: hf.ActorSystem, isolation: str, *arguments: Any, **opti
     )
 
 
+def handler(system: hf.ActorSystem) -> Any:
+    """Whoever is the checkpoint handler now."""
+    return system.node.find(HANDLER)
+
+
 async def taken(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.SnapshotTaken:
     with system.events() as stream:
         await system.checkpoint(ref, timeout=20.0)
@@ -118,16 +123,16 @@ async def test_whoever_wants_a_snapshot_gets_it_however_often_the_handler_dies(
         wish = asyncio.ensure_future(system.checkpoint(ref, timeout=20.0))
         for _ in range(number % 4):
             await asyncio.sleep(0)
-        system.node.find(HANDLER).kill()
+        handler(system).kill()
         await wish
     assert await ref.ask(Paint(0, 1)) == 13
 
 
 async def test_the_interval_goes_on_with_the_next_handler(system: hf.ActorSystem) -> None:
     ref = await canvas(system, "task", 10, interval=0.05)
-    first = system.node.find(HANDLER)
+    first = handler(system)
     first.kill()
-    await until(lambda: system.node.find(HANDLER).life > 1)
+    await until(lambda: handler(system).life > 1)
     await ref.ask(Write("x"))
     with system.events() as stream:
         await event(stream, hf.SnapshotTaken)

@@ -19,6 +19,8 @@ CELLS = 200_000
 class Snapshots(RuleBasedStateMachine):
     """The model is the same class, in no system at all."""
 
+    ref: hf.ActorRef[Canvas] | None = None
+
     def __init__(self) -> None:
         super().__init__()
         self.runner = asyncio.Runner(debug=False)
@@ -32,12 +34,13 @@ class Snapshots(RuleBasedStateMachine):
         async def start() -> None:
             recovery = hf.hybrid(interval=3600.0, keep=keep)
             spec = hf.child("canvas", hf.start(Canvas, CELLS), recovery=recovery)
-            self.ref: hf.ActorRef[Canvas] = await self.system.start(spec)
+            self.ref = await self.system.start(spec)
 
         self.runner.run(start())
 
     def ask(self, message: hf.Message[Any]) -> Any:
         async def send() -> Any:
+            assert self.ref is not None
             return await self.ref.ask(message, timeout=20.0)
 
         return self.runner.run(send())
@@ -54,11 +57,13 @@ class Snapshots(RuleBasedStateMachine):
 
     @rule()
     def snapshot(self) -> None:
+        assert self.ref is not None
         self.runner.run(self.system.checkpoint(self.ref, timeout=20.0))
 
     @rule()
     def crash(self) -> None:
         async def strike() -> None:
+            assert self.ref is not None
             self.ref.kill()
             await self.system.node.settled()
 
@@ -69,6 +74,7 @@ class Snapshots(RuleBasedStateMachine):
         """A crash while a snapshot is wanted."""
 
         async def strike() -> None:
+            assert self.ref is not None
             wish = asyncio.ensure_future(self.system.checkpoint(self.ref, timeout=20.0))
             await asyncio.sleep(0)
             self.ref.kill()
@@ -79,7 +85,7 @@ class Snapshots(RuleBasedStateMachine):
 
     @invariant()
     def is_the_same(self) -> None:
-        if hasattr(self, "ref"):
+        if self.ref is not None:
             assert self.ask(Digest()) == digest_of(self.model)
 
     def teardown(self) -> None:
