@@ -415,6 +415,27 @@ async def test_a_move_loses_nothing(system: hf.ActorSystem) -> None:
     assert await ref.ask(Seen()) == ["0", "1", "2"]
 
 
+@pytest.mark.parametrize("there", ["task", "process"])
+async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
+    system: hf.ActorSystem, there: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The store refuses it: the old life goes on, with all it has."""
+    import holdfast.checkpoint.switch as of_switches
+
+    def full(*_: Any) -> None:
+        raise hf.HoldfastError("the disk is full")
+
+    ref = await doer(system, "process" if there == "task" else "task", "checkpoint_only")
+    await ref.ask(Note("kept"))
+    with monkeypatch.context() as broken:
+        broken.setattr(of_switches, "cut", full)
+        with pytest.raises(hf.CannotMove, match="could not be kept"):
+            await system.set_isolation(ref, there)
+    assert await ref.ask(Seen()) == ["kept"]
+    await system.set_isolation(ref, there)
+    assert await ref.ask(Seen()) == ["kept"]
+
+
 async def test_a_move_whose_snapshot_cannot_be_taken_is_given_up(system: hf.ActorSystem) -> None:
     ref = await doer(system, "task", "checkpoint_only")
     await ref.ask(Note("kept"))
