@@ -14,7 +14,7 @@ from ..actors.errors import AskFailed
 from ..actors.events import TurnsLost
 from .inputs import OVERHEAD
 from .records import OK, START, STASHED
-from .saved import FORMAT, Meta
+from .saved import FORMAT, Meta, go_back
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -49,7 +49,6 @@ def forget_turns(home: Switch) -> None:
     home.calls.outcomes.clear()
     meta = home.newest or Meta(FORMAT, home.turn, 0, [], {}, [], 0, b"")
     home.newest = msgspec.structs.replace(meta, turn=home.turn)
-    home.topics = dict.fromkeys(meta.topics)
-    home.timers.replace(meta.timers)
+    go_back(home, meta)
     if count and home.node.watched:
         home.node.emit(TurnsLost(home.path, count, meta.base))

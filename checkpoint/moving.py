@@ -24,7 +24,7 @@ from ..actors.control.moving import (
     sorted_out,
     twin,
 )
-from ..actors.errors import StartFailed
+from ..actors.errors import CannotMove, StartFailed
 from ..actors.process.limits import Limits
 from ..actors.process.to_process import ToProcess
 from ..actors.process.to_task import FromProcess, dispose
@@ -67,6 +67,16 @@ class Detached:
                 switch.forward(source)
 
 
+def refuse_unsaved(cell: Cell, home: Switch | None) -> None:
+    """What is not replayed moves by its last snapshot, or not at all.
+
+    Raises:
+        CannotMove: that could not be kept.
+    """
+    if home is not None and not home.method.replays and home.turns:
+        raise CannotMove(cell.path, "its last snapshot could not be kept, and it is not replayed")
+
+
 class RecordedToProcess(ToProcess):
     """A recorded actor, from a task to a process of its own."""
 
@@ -88,6 +98,7 @@ class RecordedToProcess(ToProcess):
         cell, worker, more = self.cell, self.worker, self.cell.extra()
         assert worker is not None
         self.remember()
+        refuse_unsaved(cell, self._old.switch)
         switch, live, _ = self.host.open(cell)
         worker.record_taker = lambda path: lambda frame: self._from_life(switch, worker, FROM_LIFE.decode(frame.body))
         port = RemoteLife(cell.path, worker)
@@ -170,6 +181,8 @@ class RecordedToTask(FromProcess):
         other.life -= 1  # Counted up by the life that begins; it is no other one.
         other.extra().bindings = cell.extra().bindings
         other.extra().trap_exits = self.trap_exits
+        old = self.transit.old if self.transit is not None else None
+        refuse_unsaved(cell, getattr(old, "switch", None))
         switch, live, _ = host.open(cell)
         settled: asyncio.Future[None] = self.node.loop.create_future()
         home = ArrivingHome(host, cell, other, settled)

@@ -12,7 +12,7 @@ import msgspec
 
 from ..actors.events import RolledBack
 from .method import OnEscalate
-from .saved import FORMAT, Meta, decode_meta, put
+from .saved import FORMAT, Meta, decode_meta, go_back, put
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -43,8 +43,7 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
     put(home, meta, 1)  # Nothing else stays: what was undone must not be what the next step back leads to.
     home.older = None
     home.images.tidy()
-    home.topics = dict.fromkeys(meta.topics)
-    home.timers.replace(meta.timers)
+    go_back(home, meta)
     home.node.emit(RolledBack(home.path, first, meta.base, why))
 
 

@@ -130,6 +130,16 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
         del home.calls.outcomes[key]
 
 
+def go_back(home: Switch, meta: Meta) -> None:
+    """Between two lives: timers and subscriptions are those of the snapshot again, as the state is."""
+    if home.cell is not None:
+        for topic in home.topics:
+            if topic not in meta.topics:  # Those of its class are subscribed anew with the next life.
+                home.node.topics.unsubscribe(topic, home.cell)
+    home.topics = dict.fromkeys(meta.topics)
+    home.timers.replace(meta.timers)
+
+
 def load(home: Switch) -> None:
     """Take up where the store left off."""
     saved, newest = load_newest(home)

@@ -43,9 +43,9 @@ class SubtreeHost(ProcessHost):
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
         worker, recipe = await super().take(cell)
         kept = self._homes.notes(child_key(cell.path, ""))
-        self._options = {"kept": kept, "known": self._homes.known(cell.path)}
-        if self._homes.file is not None:
-            self._options["recovery_file"] = self._homes.file.data()
+        file = self._homes.file
+        more = {} if file is None else {"recovery_file": file.data()}
+        self._options = {"kept": kept, "known": self._homes.known(cell.path), **more}
         slots = Slots(len(worker.page))
 
         def taker(path: str) -> frames.TakeRecord:

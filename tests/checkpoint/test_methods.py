@@ -365,3 +365,81 @@ def test_random_messages_snapshots_and_crashes(name: str, actions: list[tuple[st
             assert await ref.ask(Seen()) == [*model.state, *queued]
 
     asyncio.run(play())
+
+
+# -- what goes back with the state of a snapshot ----------------------------------------------------------------------
+
+
+async def test_timers_and_subscriptions_go_back_with_the_state(isolation: str, store: str | None) -> None:
+    """One that was cancelled since comes back, one that was started since does not."""
+    async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
+        ref = await doer(system, isolation, "checkpoint_only")
+        await ref.ask(Do(["after 0.3", "subscribe /kept"]))
+        await snapshot(system, ref)
+        await ref.ask(Do(["cancel", "every 0.6", "subscribe /lost"]))
+        await back(system, ref)
+        assert "tick" not in await ref.ask(Seen())
+        await system.publish("/lost", Note("lost"))
+        await system.publish("/kept", Note("kept"))
+        async with asyncio.timeout(8.0):
+            while "tick" not in await ref.ask(Seen()):
+                await asyncio.sleep(0.01)
+        await asyncio.sleep(0.7)
+        assert sorted(await ref.ask(Seen())) == ["kept", "tick"]
+
+
+async def test_a_tick_that_waits_does_not_come_twice(isolation: str, store: str | None, gate: Path) -> None:
+    """Its timer is still in the snapshot, and the tick is queued already."""
+    async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
+        ref = await doer(system, isolation, "checkpoint_only")
+        await ref.ask(Do(["after 0.2"]))
+        await snapshot(system, ref)
+        await ref.ask(Note("lost"))
+        ref.tell(Do([f"gate {gate}"]))
+        await until(gate.exists)
+        await until(lambda: any(source.kind == "tick" for source in home(ref).open.values()))
+        gate.unlink()
+        strike(system, ref)
+        await until(gate.exists)
+        let_through(gate)
+        await ref.ask(Seen(), timeout=8.0)
+        await asyncio.sleep(0.3)  # As long as a second one would take.
+        assert await ref.ask(Seen()) == ["tick"]
+
+
+async def test_a_move_loses_nothing(system: hf.ActorSystem) -> None:
+    ref = await doer(system, "task", "checkpoint_only")
+    for n, place in enumerate(("process", "task", "process")):
+        await ref.ask(Note(str(n)))
+        await system.set_isolation(ref, place)  # type: ignore[arg-type]
+    assert await ref.ask(Seen()) == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize("there", ["task", "process"])
+async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
+    system: hf.ActorSystem, there: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The store refuses it: the old life goes on, with all it has."""
+    import holdfast.checkpoint.switch as of_switches
+
+    def full(*_: Any) -> None:
+        raise hf.HoldfastError("the disk is full")
+
+    ref = await doer(system, "process" if there == "task" else "task", "checkpoint_only")
+    await ref.ask(Note("kept"))
+    with monkeypatch.context() as broken:
+        broken.setattr(of_switches, "cut", full)
+        with pytest.raises(hf.CannotMove, match="could not be kept"):
+            await system.set_isolation(ref, there)
+    assert await ref.ask(Seen()) == ["kept"]
+    await system.set_isolation(ref, there)
+    assert await ref.ask(Seen()) == ["kept"]
+
+
+async def test_a_move_whose_snapshot_cannot_be_taken_is_given_up(system: hf.ActorSystem) -> None:
+    ref = await doer(system, "task", "checkpoint_only")
+    await ref.ask(Note("kept"))
+    await ref.ask(Do(["spoil"]))
+    with pytest.raises(hf.CannotMove):
+        await system.set_isolation(ref, "process")
+    assert await ref.ask(Seen()) == ["kept"]

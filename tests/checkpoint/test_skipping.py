@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,8 +13,8 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.actors.values import state_digest
 from holdfast.checkpoint.keys import save_state
-from tests.checkpoint.players import Note, Notes, Sink, start
-from tests.checkpoint.strikes import NEVER, actor_of, event, home, strike, struck
+from tests.checkpoint.players import Note, Notes, Sink, gate, start, until
+from tests.checkpoint.strikes import NEVER, actor_of, event, home, let_through, strike, struck
 
 
 class Aim(hf.Message[int]):
@@ -70,6 +71,8 @@ class Spoil(hf.Message):
 
 class Background(hf.Message):
     """Changes nothing by itself, but begins work whose result will."""
+
+    gate: str
 
 
 class Pilot(hf.Actor):
@@ -130,7 +133,7 @@ class Pilot(hf.Actor):
 
     @hf.on(Background, readonly=True)
     def background(self, message: Background) -> None:
-        self.ctx.pipe_to_self(asyncio.sleep(0.0), lambda _: Step())
+        self.ctx.pipe_to_self(gate(message.gate), lambda _: Step())
 
     @hf.on(Spoil, readonly=True)
     async def spoil(self, message: Spoil) -> None:
@@ -204,15 +207,20 @@ async def test_what_has_sent_something_is_not_superseded(system: hf.ActorSystem)
     assert await notes.ask(Notes()) == ["0", "1", "2"]
 
 
-async def test_background_work_of_a_readonly_turn_is_begun_again(system: hf.ActorSystem) -> None:
-    ref = await pilot(system)
+async def test_background_work_of_a_readonly_turn_is_begun_again(
+    system: hf.ActorSystem, isolation: str, tmp_path: Path
+) -> None:
+    ref, waiting = await pilot(system, isolation), tmp_path / "gate"
     await ref.ask(Aim("a", 1))
-    ref.tell(Background())
-    ref.kill()
-    await ref.ask(Sum())
+    ref.tell(Background(str(waiting)))
+    await until(waiting.exists)
+    waiting.unlink()
+    strike(system, ref)
+    await until(waiting.exists)
+    let_through(waiting)
     async with asyncio.timeout(8.0):
         while await ref.ask(Sum()) != 2:
-            await asyncio.sleep(0.0)
+            await asyncio.sleep(0.001)
 
 
 async def test_a_key_that_cannot_be_had_leaves_nothing_out_and_is_told(system: hf.ActorSystem) -> None:
