@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.switch import Switch
 from tests.checkpoint.guards import over, running
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Tick, start, until
 from tests.checkpoint.strikes import doer, event, let_through, sink, strike, struck
@@ -67,6 +68,10 @@ async def test_tells_beyond_the_capacity(
                 except hf.MailboxFull:
                     failures += 1
             letters = [one.message.text for one in stream.take() if isinstance(one, hf.DeadLetter)]
+            if store is not None:  # What a root would find that is started now.
+                home: Any = ref._cell.host.switch  # type: ignore[attr-defined]
+                stored = Switch(system.node, ref.path, hf.hybrid(), system.homes.journal)
+                assert list(stored.open) == list(home.open), "drops are journaled"
             await held.let_go(system)
             told = await event(stream, hf.HeldMessages)
         expected = ["before", "waits", *kept]

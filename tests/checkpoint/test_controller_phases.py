@@ -177,6 +177,26 @@ async def test_a_part_that_is_down_for_good_is_not_waited_for(isolation: str, vi
             assert (called == []) == (victim == "controller")
 
 
+async def test_a_controller_that_ends_for_good_with_a_hook_in_hand(isolation: str) -> None:
+    """The recovery waits for that hook, which would take an hour; not for a controller that is no more."""
+    reached = asyncio.Event()
+
+    async def wait(step: hf.RecoveryStep) -> None:
+        reached.set()
+        await asyncio.sleep(3600.0)
+
+    async with running(recovery_hooks=hf.recovery_hooks(before={"restart": wait}, timeout=7200.0)) as system:
+        ref = await wheels(system)
+        robot = await planner(system, isolation)
+        with system.events() as stream:
+            robot.kill()
+            await reached.wait()
+            await system.stop(part(system, "controller"))
+            await event(stream, hf.Recovered)
+        await until(lambda: not system.homes.recoveries.all())
+        assert await words(ref) == ["safe", "free"]
+
+
 async def test_a_controller_that_does_not_come_to_it_is_not_waited_for(isolation: str) -> None:
     """Suspended, it lives and does nothing."""
     async with running() as system:
