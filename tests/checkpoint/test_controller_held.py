@@ -316,7 +316,7 @@ async def test_timers_go_on_and_what_they_publish_is_heard_once(isolation: str) 
         ref = await start(system, isolation, "parent", hf.start(Parent), recovery=hf.hybrid(0.03))
         await ref.ask(Talk())
         for n in (3, 6, 9):
-            await until(lambda n=n: len(listener._cell.actor.seen) >= n)  # type: ignore[misc,union-attr]
+            await until(lambda n=n: len(listener._cell.actor.seen) >= n)  # type: ignore[union-attr]
             await struck(system, ref)
         await until(lambda: len(listener._cell.actor.seen) >= 12)  # type: ignore[union-attr]
         heard = await listener.ask(Seen())

@@ -10,7 +10,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.guards import POINTS, over, part, phases, planner, running, wheels, words
-from tests.checkpoint.players import Do, Note, Notes, Seen, until
+from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, until
 from tests.checkpoint.strikes import doer, event, sink, strike, struck
 
 ORDER = ["isolate", "restart", "restore", "replay", "release"]
@@ -295,6 +295,36 @@ async def test_a_child_that_is_terminated_in_the_middle_stays_away(isolation: st
             await stopping
         assert kept.address == robot.path
         assert robot.path not in system.tree()
+
+
+@pytest.mark.parametrize("kind", ["task", "process"])
+async def test_a_sibling_has_it_started_anew_in_the_middle(kind: Any) -> None:
+    """one_for_all: the start that waits at a hook is given up; there is one new life, not two."""
+    reached, go_on = asyncio.Event(), asyncio.Event()
+
+    async def wait(step: hf.RecoveryStep) -> None:
+        reached.set()
+        await go_on.wait()
+
+    recovery = hf.hybrid(3600.0, hooks=hf.recovery_hooks(before={"restart": wait}, timeout=30.0))
+    async with running() as system:
+        children = [
+            hf.child("sibling", hf.start(Doer)),
+            hf.child("robot", hf.start(Doer), recovery=recovery, isolation=kind),
+        ]
+        await system.start(hf.supervisor("top", strategy="one_for_all", intensity=100, children=children))
+        robot, sibling = system.ref("/app/top/robot", Doer), system.ref("/app/top/sibling", Doer)
+        await robot.ask(Note("one"))
+        for _ in range(3):
+            reached.clear()
+            sibling.kill()
+            await reached.wait()
+            await asyncio.sleep(0.01)
+            assert (robot._cell.state, robot._cell.life) == ("down", 1)
+        go_on.set()
+        assert await robot.ask(Seen(), timeout=8.0) == ["one"]
+        await over(system)
+        assert robot._cell.life == 2
 
 
 async def test_a_system_ends_in_the_middle_of_a_recovery(isolation: str) -> None:
