@@ -61,7 +61,7 @@ async def test_what_has_not_changed_is_not_written_again_and_all_of_it_comes_bac
             strike(system, ref)
             recovered = await event(stream, hf.Recovered)
         assert await ref.ask(Digest(), timeout=20.0) == before
-        assert recovered.replayed == 2, "what no snapshot has: a change, and a look"
+        assert recovered.replayed == 1, "what no snapshot has: a change; the look is left out"
 
 
 async def test_a_snapshot_is_in_the_store_when_checkpoint_returns(store: str | None, isolation: str) -> None:
@@ -130,6 +130,7 @@ async def test_whoever_wants_a_snapshot_gets_it_however_often_the_handler_dies(
 
 async def test_the_interval_goes_on_with_the_next_handler(system: hf.ActorSystem) -> None:
     ref = await canvas(system, "task", 10, interval=0.05)
+    await until(lambda: handler(system) is not None)  # Recovery parts start beside the program.
     first = handler(system)
     first.kill()
     await until(lambda: handler(system).life > 1)
@@ -163,7 +164,7 @@ async def taken_after(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> hf.Snaps
 
 async def test_an_unrecorded_actor_cannot_be_saved(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("plain", hf.start(Canvas, 10)))
-    with pytest.raises(hf.SpecError, match="not recorded"):
+    with pytest.raises(hf.SpecError, match="keeps no snapshots"):
         await system.checkpoint(ref)
 
 
