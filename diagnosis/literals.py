@@ -1,8 +1,8 @@
 """Literals: what can be said about a system, and which words exist to say it.
 
-A literal is `ok(/odom)` or `not ok(/odom)`, in the spelling of the paper (Zaman et al. 2013). It is a typed value, not a
-string: a negation spelled in another way would silently be another proposition, so what cannot be read, and every name
-that the model does not declare, is an error (T53).
+A literal is `ok(/odom)` or `not ok(/odom)`, in the spelling of the paper (Zaman et al. 2013). It is a typed value, not
+a string: a negation spelled in another way would silently be another proposition. So what cannot be read, and every
+name that the model does not declare, is an error (T53).
 """
 
 from __future__ import annotations

@@ -175,7 +175,9 @@ class ObservationSet:
 
 def _check_times(observation: Observation) -> None:
     if not math.isfinite(observation.time) or math.isnan(observation.time_to_live) or observation.time_to_live < 0:
-        raise ValueError(f"{observation.literal} by {observation.source}: a time is finite, a time to live not negative")
+        raise ValueError(
+            f"{observation.literal} by {observation.source}: a time is finite, a time to live not negative"
+        )
 
 
 def _exclusive(positive: set[Literal]) -> set[frozenset[Literal]]:
