@@ -120,7 +120,7 @@ def _bad_words(where: str, words: Iterable[str]) -> Iterator[Problem]:
 
 def _software(name: str, known: dict[str, Component], where: str) -> Iterator[Problem]:
     if name not in known:
-        yield Problem(where, f"a value of {_unknown(name, known)} is related")
+        yield Problem(where, f"a value is related of {_unknown(name, known)}")
     elif known[name].kind.is_hardware:
         yield Problem(where, f"a value of {name} is related, but a device publishes none: name its driver")
 

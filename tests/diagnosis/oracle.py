@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pysat.examples.lbx import LBX
 from pysat.formula import WCNF
 
-from holdfast.diagnosis.literals import Literal, ok
+from holdfast.diagnosis.literals import Literal
 from holdfast.diagnosis.model import Model, System
 
 Sets = set[frozenset[str]]

@@ -61,7 +61,7 @@ def test_what_is_printed_is_read_as_the_same(literal: Literal) -> None:
     "text", ["", "ok", "ok()", "ok(a", "ok(a))", "ok(a b)", "not not ok(a)", "not(ok(a))", "!ok(a)", "ok(a,)", "-ok(a)"]
 )
 def test_other_texts_are_no_literals(text: str) -> None:
-    with pytest.raises(BadLiteral, match="spelled like|argument"):
+    with pytest.raises(BadLiteral, match=r"spelled like|argument"):
         parse(text)
 
 

@@ -1,0 +1,258 @@
+"""Limits, rank, memory between calls, and what the engine does when there is no diagnosis."""
+
+import asyncio
+import math
+import threading
+
+import pytest
+
+from holdfast.diagnosis.engine import Diagnoser, State, diagnoser
+from holdfast.diagnosis.engine.cone import Part
+from holdfast.diagnosis.engine.solve import Budget, Solved, solve
+from holdfast.diagnosis.literals import BadLiteral, Vocabulary, ok, running
+from holdfast.diagnosis.model import History, Model, Put, System
+from holdfast.diagnosis.observations import Observation, ObservationSet
+from tests.diagnosis.robot import paper_robot
+
+
+def pairs(count: int) -> tuple[System, list[str]]:
+    """So many silent pairs of driver and device: twice as many diagnoses with each."""
+    system = System()
+    for i in range(count):
+        system.hardware(f"h{i}")
+        system.driver(f"d{i}", on=[f"h{i}"], out=[f"/{i}"])
+    return system, [f"not ok(/{i})" for i in range(count)]
+
+
+def knot(count: int) -> tuple[System, list[str]]:
+    """As `pairs`, with one component that explains everything at once: a single part that cannot be divided."""
+    system = System()
+    system.hardware("supply")
+    for i in range(count):
+        system.hardware(f"h{i}")
+        system.driver(f"d{i}", on=["supply", f"h{i}"], out=[f"/{i}"])
+    return system, [f"not ok(/{i})" for i in range(count)]
+
+
+def test_of_too_many_diagnoses_the_best_are_listed_and_the_rest_counted() -> None:
+    """T55, O7: 2^14 diagnoses."""
+    system, symptoms = pairs(14)
+    said = Diagnoser(system, limit=100, seconds=60.0).diagnose_now(symptoms)
+    assert (len(said.candidates), said.found, said.truncated) == (100, 2**14, ("count",))
+    assert not said.is_complete
+    hardware = [sum(name.startswith("h") for name in one.bad) for one in said.candidates]
+    assert hardware == [0] + [1] * 14 + [2] * 85  # as if all had been made, and then sorted
+    assert said.certain == ()
+
+
+def test_all_are_found_below_the_limit() -> None:
+    system, symptoms = pairs(6)
+    said = Diagnoser(system, seconds=60.0).diagnose_now(symptoms)
+    assert said.is_complete
+    assert len({one.bad for one in said.candidates}) == said.found == 64
+
+
+def test_the_smallest_diagnosis_is_among_those_of_a_part_with_too_many() -> None:
+    """T55."""
+    system, symptoms = knot(18)
+    said = Diagnoser(system, limit=10, seconds=60.0).diagnose_now(symptoms)
+    assert said.truncated == ("count",)
+    assert len(said.candidates) == 10
+    assert said.candidates[0].bad == ("supply",)
+
+
+def test_a_long_search_finds_all() -> None:
+    """It passes what a search without a timer may take."""
+    system, symptoms = knot(13)
+    said = Diagnoser(system, limit=10_000, seconds=60.0).diagnose_now(symptoms)
+    assert said.is_complete
+    assert said.found == 2**13 + 1
+
+
+def test_the_search_ends_with_its_time() -> None:
+    """T55."""
+    system, symptoms = knot(24)
+    said = Diagnoser(system, limit=10**9, seconds=0.3).diagnose_now(symptoms)
+    assert said.truncated == ("time",)
+    assert 0 < said.found < 2**24
+    assert said.state is State.FAULTY
+
+
+def test_without_time_nothing_is_found_and_nothing_is_claimed() -> None:
+    system, symptoms = knot(3)
+    said = Diagnoser(system, seconds=1e-9).diagnose_now(symptoms)
+    assert (said.state, said.candidates, said.truncated) == (State.FAULTY, (), ("time",))
+    assert said.certain == ()
+
+
+async def test_the_loop_goes_on_while_a_diagnosis_is_made() -> None:
+    """T58."""
+    system, symptoms = knot(24)
+    work = asyncio.create_task(Diagnoser(system, limit=10**9, seconds=0.3).diagnose(symptoms))
+    turns = 0
+    while not work.done():
+        await asyncio.sleep(0)
+        turns += 1
+    assert (await work).truncated == ("time",)
+    assert turns > 100
+
+
+async def test_a_cancelled_diagnosis_ends_its_search() -> None:
+    system, symptoms = knot(24)
+    engine = Diagnoser(system, limit=10**9, seconds=600.0)
+    before = threading.active_count()
+    async with asyncio.timeout(60):
+        work = asyncio.create_task(engine.diagnose(symptoms))
+        while threading.active_count() == before:
+            await asyncio.sleep(0)
+        work.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await work
+        said = await engine.diagnose(["not on(supply)"])  # it waits for no lock
+    assert [one.bad for one in said.candidates] == [("supply",)]
+
+
+def test_what_interrupts_before_a_search_begins_is_not_lost() -> None:
+    system, symptoms = knot(24)
+    engine = Diagnoser(system)
+    budget = Budget(600.0)
+    budget.cancel()
+    (part,) = parts_of(engine, symptoms)
+    assert solve(part, 10**9, budget) == Solved([], by_time=True)
+
+
+def parts_of(engine: Diagnoser, symptoms: list[str]) -> list[Part]:
+    found: list[Part] = []
+    kept = engine._part  # the parts are the engine's own business; here they are looked at
+
+    def look(part: Part, budget: Budget) -> Solved:
+        found.append(part)
+        return kept(part, Budget(0.0))
+
+    engine._part = look  # type: ignore[method-assign] # put in its place to look at what passes
+    engine.diagnose_now(symptoms)
+    return found
+
+
+def test_only_parts_that_changed_are_solved_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    solved: list[Part] = []
+
+    def spy(part: Part, limit: int, budget: Budget) -> Solved:
+        solved.append(part)
+        return solve(part, limit, budget)
+
+    monkeypatch.setattr(diagnoser, "solve", spy)
+    engine = Diagnoser(paper_robot())
+    engine.diagnose_now(["not ok(/odom)"])
+    engine.diagnose_now(["not ok(/odom)", "running(rviz)"])
+    assert len(solved) == 1
+    said = engine.diagnose_now(["not ok(/odom)", "not ok(/map)"])
+    assert len(solved) == 2
+    assert said.found == 6
+    said = engine.diagnose_now(["not ok(/odom)", "not ok(/map)", "ok(/scan)"])
+    assert said.found == 2  # the map's own fault, which needs no search
+    assert len(solved) == 2
+    said = engine.diagnose_now(["not ok(/map)", "ok(/odom)"])
+    assert said.found == 3
+    assert len(solved) == 2
+
+
+def test_what_was_truncated_is_not_remembered() -> None:
+    system, symptoms = knot(3)
+    engine = Diagnoser(system)
+    assert engine.diagnose_now(symptoms, seconds=1e-9).truncated
+    assert engine.diagnose_now(symptoms, seconds=60.0).found == 9
+
+
+def test_another_version_of_the_model_counts_at_once() -> None:
+    """D31."""
+    system = System()
+    system.node("a", out=["/a"])
+    history = History(system)
+    engine = Diagnoser(history.model)
+    assert engine.diagnose_now(["not ok(/a)"]).found == 1
+    lamp = System()
+    lamp.hardware("lamp")
+    lamp.driver("a", on=["lamp"], out=["/a"])
+    engine.use(history.change([Put(component) for component in lamp.declaration().components]))
+    said = engine.diagnose_now(["not ok(/a)"])
+    assert {one.bad for one in said.candidates} == {("a",), ("lamp",)}
+    assert said.version == 2
+
+
+def test_the_likelier_fault_comes_first_among_equals_and_probabilities_add_up() -> None:
+    """T54."""
+    system = System()
+    system.hardware("cable", prior=0.2)
+    system.driver("driver", on=["cable"], out=["/x"], prior=0.001)
+    said = Diagnoser(system).diagnose_now(["not ok(/x)"])
+    assert [one.bad for one in said.candidates] == [("cable",), ("driver",)]
+    odds = 0.2 / 0.8 / (0.001 / 0.999)
+    assert said.candidates[0].probability == pytest.approx(odds / (1 + odds))
+    assert math.fsum(one.probability for one in said.candidates) == pytest.approx(1.0)
+    again = Diagnoser(system).diagnose_now(["not ok(/x)"], repaired=["cable"])
+    assert [one.bad for one in again.candidates] == [("driver",), ("cable",)]
+
+
+def test_fewer_faults_come_before_likelier_ones() -> None:
+    system, symptoms = knot(2)
+    declared = System()
+    declared.hardware("supply", prior=1e-6)
+    for i in range(2):
+        declared.driver(f"d{i}", on=["supply"], out=[f"/{i}"], prior=0.4)
+    said = Diagnoser(declared).diagnose_now(symptoms)
+    assert [one.bad for one in said.candidates] == [("supply",), ("d0", "d1")]
+    assert system.declaration() != declared.declaration()
+
+
+def test_sources_that_contradict_each_other_leave_no_diagnosis() -> None:
+    """O5, T49."""
+    seen = ObservationSet(Vocabulary(Model(paper_robot()).vocabulary))
+    seen.add(Observation(running("hm"), 1.0, "node"))
+    seen.add(Observation(~running("hm"), 1.5, "process"))
+    seen.add(Observation(~ok("/odom"), 1.5, "rate"))
+    said = Diagnoser(paper_robot()).diagnose_now(seen.current(2.0))
+    assert said.state is State.CONTRADICTORY
+    assert said.candidates == ()
+    assert "node says running(hm)" in str(said.contradictions[0])
+
+
+def test_observations_that_the_model_excludes_are_reported_with_their_sources() -> None:
+    """T49: no component could be faulty in a way that makes this possible."""
+    system = System()
+    system.node("a")
+    system.proposition("ok(x)", "ok(y)", "ok(z)")
+    system.clause("ok(x) -> ok(y)")
+    model = Model(system)
+    seen = ObservationSet(model.vocabulary)
+    for literal in (ok("x"), ~ok("y"), ok("z")):
+        seen.add(Observation(literal, 1.0, f"from {literal.args[0]}"))
+    said = Diagnoser(model).diagnose_now(seen.current(1.0))
+    assert said.state is State.CONTRADICTORY
+    (torn,) = said.contradictions
+    assert set(torn.literals) == {ok("x"), ~ok("y")}
+    assert {one.source for one in torn.observations} == {"from x", "from y"}
+
+
+def test_who_sees_nothing_diagnoses_nothing() -> None:
+    """T50."""
+    said = Diagnoser(paper_robot()).diagnose_now([])
+    assert (said.state, said.candidates) == (State.BLIND, ())
+    assert not said.is_complete
+
+
+def test_names_the_model_does_not_know_are_refused() -> None:
+    """T53."""
+    with pytest.raises(BadLiteral, match="did you mean"):
+        Diagnoser(paper_robot()).diagnose_now(["not ok(/odm)"])
+
+
+async def test_names_the_model_does_not_know_are_refused_before_a_thread_begins() -> None:
+    with pytest.raises(BadLiteral):
+        await Diagnoser(paper_robot()).diagnose([ok("/odm")])
+
+
+@pytest.mark.parametrize(("limit", "seconds"), [(0, 1.0), (1, 0.0), (1, float("nan"))])
+def test_limits_that_allow_nothing_are_refused(limit: int, seconds: float) -> None:
+    with pytest.raises(ValueError, match="greater than 0"):
+        Diagnoser(paper_robot(), limit=limit, seconds=seconds)
