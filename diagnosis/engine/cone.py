@@ -102,7 +102,7 @@ def cone_of(index: Index, positive: frozenset[int], negative: frozenset[int]) ->
                 convicted.setdefault(step.needs[0], step)
     reached = _backwards(index, positive, negative, convicted)
     kept = _reaching(_grounded(reached), failures)
-    return Cone(tuple(convicted.values()), tuple(_parts(kept, failures)))
+    return Cone(tuple(convicted.values()), tuple(parts_of(kept, failures)))
 
 
 def _backwards(index: Index, positive: frozenset[int], negative: frozenset[int], faulty: dict[int, Step]) -> list[Step]:
@@ -168,7 +168,7 @@ def _reaching(steps: list[Step], failures: frozenset[int]) -> list[Step]:
     return kept
 
 
-def _parts(steps: list[Step], failures: frozenset[int]) -> Iterator[Part]:
+def parts_of(steps: list[Step], failures: frozenset[int]) -> Iterator[Part]:
     """Group what hangs together by a component or by an atom that nobody observed (union-find)."""
     parent = list(range(len(steps)))
 

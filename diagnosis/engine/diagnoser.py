@@ -19,7 +19,7 @@ from ..observations import Contradiction, Observed
 from .cone import Cone, Index, Part, cone_of, contradiction
 from .explain import Explanation, explain
 from .probe import Probe, probes
-from .rank import Ranked, Ranking, combine
+from .rank import Ranked, Ranking, merged, products
 from .result import Candidate, Diagnosis, State
 from .solve import Budget, Solved, solve
 
@@ -51,7 +51,7 @@ class Diagnoser:
             raise ValueError(f"limit {limit} and seconds {seconds} must be greater than 0")
         self.limit, self.seconds = limit, seconds
         self._lock = threading.Lock()
-        self._parts: OrderedDict[Part, list[tuple[int, ...]]] = OrderedDict()
+        self._parts: OrderedDict[Part, list[Solved]] = OrderedDict()
         self._model = model if isinstance(model, Model) else Model(model)
         self._index = Index(self._model)
 
@@ -172,10 +172,11 @@ class Diagnoser:
         if not cone.convicted and not cone.parts:
             return Diagnosis(State.HEALTHY, candidates=(Candidate(()),), found=1)
         ranking = Ranking(tuple(self._model.components.values()), repaired)
-        parts = [self._part(part, budget) for part in cone.parts]
-        faulty = tuple(sorted(cone.faulty))
-        ranked = combine([ranking.rank([faulty]), *(ranking.rank(part.sets) for part in parts)], self.limit)
-        found = math.prod(len(part.sets) for part in parts)
+        parts = [solved for part in cone.parts for solved in self._part(part, budget)]
+        rows = [self._ranked(solved, ranking) for solved in parts]
+        certain = [ranking.set(sorted(cone.faulty))] if cone.faulty else []
+        ranked = merged([products([certain, *rows] if certain else rows)], self.limit)
+        found = math.prod(part.found for part in parts)
         by_count = found > self.limit or any(part.by_count for part in parts)
         by_time = any(part.by_time for part in parts)
         return Diagnosis(
@@ -186,14 +187,19 @@ class Diagnoser:
             truncated=(*["count"] * by_count, *["time"] * by_time),
         )
 
-    def _part(self, part: Part, budget: Budget) -> Solved:
+    def _ranked(self, solved: Solved, ranking: Ranking) -> list[Ranked]:
+        """The best sets of a part, with classes written out."""
+        singles = {first: ranking.singles(members) for first, members in solved.classes.items()}
+        return merged([products([singles[member] for member in members]) for members in solved.sets], self.limit)
+
+    def _part(self, part: Part, budget: Budget) -> list[Solved]:
         known = self._parts.get(part)
         if known is not None:
             self._parts.move_to_end(part)
-            return Solved(known)
+            return known
         solved = solve(part, self.limit, budget)
-        if not (solved.by_count or solved.by_time):
-            self._parts[part] = solved.sets
+        if not any(one.by_count or one.by_time for one in solved):
+            self._parts[part] = solved
             if len(self._parts) > PARTS_KEPT:
                 self._parts.popitem(last=False)
         return solved

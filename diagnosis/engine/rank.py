@@ -8,29 +8,21 @@ driver than to switch a robot's base off (T54).
 from __future__ import annotations
 
 import heapq
+import itertools
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from ..model import Component
 
 
 class Key(NamedTuple):
-    """Compared from left to right; less comes first. Keys of sets without common members add up."""
+    """Compared from left to right; less comes first. Keys of sets without common members add up (`total`)."""
 
     size: int = 0
     repaired: int = 0
     unlikeliness: float = 0.0
     hardware: int = 0
-
-    def plus(self, other: Key) -> Key:
-        """The key of both sets together."""
-        return Key(
-            self.size + other.size,
-            self.repaired + other.repaired,
-            self.unlikeliness + other.unlikeliness,
-            self.hardware + other.hardware,
-        )
 
 
 Ranked = tuple[Key, tuple[int, ...]]
@@ -45,19 +37,22 @@ class Ranking:
             for component in components
         ]
 
-    def rank(self, sets: Sequence[tuple[int, ...]]) -> list[Ranked]:
-        """The sets with their keys, best first."""
-        return sorted((self.key(members), members) for members in sets)
+    def singles(self, members: Sequence[int]) -> list[Ranked]:
+        """Each member as a set of its own, best first."""
+        return sorted((self._keys[member], (member,)) for member in members)
 
-    def key(self, members: tuple[int, ...]) -> Key:
-        """The key of one set."""
-        keys = self._keys
-        if len(members) == 1:
-            return keys[members[0]]
-        parts = [keys[member] for member in members]
-        # Rounded, so that the order of the sum makes no difference between equals.
-        odds = round(math.fsum(part.unlikeliness for part in parts), 9)
-        return Key(len(parts), sum(part.repaired for part in parts), odds, sum(part.hardware for part in parts))
+    def set(self, members: Sequence[int]) -> Ranked:
+        """The members as one set."""
+        return total([self._keys[member] for member in members]), tuple(members)
+
+
+def total(keys: Sequence[Key]) -> Key:
+    """The key of a set from those of its parts."""
+    if len(keys) == 1:
+        return keys[0]
+    sizes, repaired, odds, hardware = zip(*keys, strict=True) if keys else ((), (), (), ())
+    # Rounded, so that the order of the sum makes no difference between equals.
+    return Key(sum(sizes), sum(repaired), round(math.fsum(odds), 9), sum(hardware))
 
 
 def unlikeliness(prior: float) -> float:
@@ -65,32 +60,30 @@ def unlikeliness(prior: float) -> float:
     return round(math.log((1 - prior) / prior), 9)
 
 
-def combine(parts: Sequence[list[Ranked]], limit: int) -> list[Ranked]:
-    """The best `limit` unions of one set of each part; each part is sorted already."""
-    combined: list[Ranked] = [(Key(), ())]
-    for part in parts:
-        combined = _pairs(combined, part, limit)
-    return combined
+def products(lists: Sequence[list[Ranked]]) -> Iterator[Ranked]:
+    """All unions of one set of each list, best first, made one by one; the lists are sorted already."""
+    fixed = [choices[0] for choices in lists if len(choices) == 1]
+    open_ = [choices for choices in lists if len(choices) != 1]
+    if not all(open_):
+        return
+    base = [total([key for key, _ in fixed])] if fixed else []
+    members = tuple(member for _, some in fixed for member in some)
+
+    def at(places: tuple[int, ...]) -> tuple[Key, tuple[int, ...]]:
+        return total([*base, *(choices[place][0] for choices, place in zip(open_, places, strict=True))]), places
+
+    heap = [at((0,) * len(open_))]
+    while heap:
+        key, places = heapq.heappop(heap)
+        chosen = (choices[place][1] for choices, place in zip(open_, places, strict=True))
+        yield key, (*members, *(member for some in chosen for member in some))
+        # Only from the last place that has moved onwards, so that each combination is reached in one way.
+        moved = max((number for number, place in enumerate(places) if place), default=0)
+        for number in range(moved, len(places)):
+            if places[number] + 1 < len(open_[number]):
+                heapq.heappush(heap, at((*places[:number], places[number] + 1, *places[number + 1 :])))
 
 
-def _pairs(left: list[Ranked], right: list[Ranked], limit: int) -> list[Ranked]:
-    """Best first, without making all pairs: a pair is looked at only after those that are better for sure."""
-    if len(left) == 1:
-        (key, members) = left[0]
-        return [(key.plus(other), (*members, *more)) for other, more in right[:limit]]
-    if not left or not right:
-        return []
-
-    def pair(i: int, j: int) -> tuple[Key, tuple[int, ...], tuple[int, ...], int, int]:
-        return left[i][0].plus(right[j][0]), left[i][1], right[j][1], i, j
-
-    best: list[Ranked] = []
-    heap = [pair(0, 0)]
-    while heap and len(best) < limit:
-        key, members, more, i, j = heapq.heappop(heap)
-        best.append((key, (*members, *more)))
-        if j + 1 < len(right):
-            heapq.heappush(heap, pair(i, j + 1))
-        if j == 0 and i + 1 < len(left):
-            heapq.heappush(heap, pair(i + 1, 0))
-    return best
+def merged(rows: Iterable[Iterator[Ranked]], limit: int) -> list[Ranked]:
+    """The best `limit` of all rows, each of which is sorted."""
+    return list(itertools.islice(heapq.merge(*rows, key=lambda ranked: ranked[0]), limit))

@@ -6,6 +6,7 @@ the subset-minimal sets and no other, in no particular order.
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -15,6 +16,7 @@ import clingo
 from clingo.backend import HeuristicType
 
 from .cone import Part
+from .reduce import reduce
 
 _MINIMAL: Final = ("--heuristic=Domain", "--enum-mode=domRec", "--warn=none", "0")
 _OPTIMISING: Final = "--opt-mode=optN"
@@ -88,29 +90,46 @@ class Budget:
 
 
 class Solved(NamedTuple):
-    """Sets of components, each sorted, and what kept further ones from being found."""
+    """Sets of components, each sorted, and what kept further ones from being found.
+
+    Each component of a set may be exchanged for any other of its class.
+    """
 
     sets: list[tuple[int, ...]]
+    classes: dict[int, tuple[int, ...]]
     by_count: bool = False
     by_time: bool = False
 
+    @property
+    def found(self) -> int:
+        """How many sets there are when classes are written out."""
+        return sum(math.prod(len(self.classes[member]) for member in members) for members in self.sets)
 
-def solve(part: Part, limit: int, budget: Budget) -> Solved:
+
+def solve(part: Part, limit: int, budget: Budget) -> list[Solved]:
+    """The minimal diagnoses of a part: the unions of one set of each of what it falls into.
+
+    Of each at most `limit` are searched for, before classes are written out.
+    """
+    return [_solve(left, limit, budget)._replace(classes=classes) for left, classes in reduce(part)]
+
+
+def _solve(part: Part, limit: int, budget: Budget) -> Solved:
     """The minimal diagnoses of a part, at most `limit` of them.
 
     If there are more, the smallest of all are among those returned, as far as time and `limit` allow.
     """
     single = _only_conflict(part)
     if single is not None:
-        return Solved([(component,) for component in single[:limit]], by_count=len(single) > limit)
+        return Solved([(component,) for component in single[:limit]], {}, by_count=len(single) > limit)
     if not budget.left:
-        return Solved([], by_time=True)
+        return Solved([], {}, by_time=True)
     found = _search(part, _MINIMAL, limit, budget)
     if not found.by_count:
         return found
     smallest = _search(part, _SMALLEST, limit, budget)
     sets = list(dict.fromkeys((*smallest.sets, *found.sets)))[:limit]
-    return Solved(sets, by_count=True, by_time=smallest.by_time)
+    return Solved(sets, {}, by_count=True, by_time=smallest.by_time)
 
 
 def _only_conflict(part: Part) -> list[int] | None:
@@ -147,7 +166,7 @@ def _searched(part: Part, options: Sequence[str], limit: int, budget: Budget, *,
         return True
 
     is_done = budget.run(control, take, is_short=is_short)
-    return Solved(sets, by_count=is_more, by_time=not is_done), is_done
+    return Solved(sets, {}, by_count=is_more, by_time=not is_done), is_done
 
 
 def _build(control: clingo.Control, part: Part, *, is_optimising: bool) -> dict[clingo.Symbol, int]:
