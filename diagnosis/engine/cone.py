@@ -8,7 +8,7 @@ are the combinations of theirs. Sound because the model is Horn and says nothing
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterator
 from typing import Final, NamedTuple
 
 from ..literals import Literal
@@ -58,6 +58,7 @@ class Index:
     def __init__(self, model: Model) -> None:
         self.model = model
         self.names = tuple(model.components)
+        self.components = tuple(model.components.values())
         self.number = {name: number for number, name in enumerate(self.names)}
         self.atoms: tuple[Literal | None, ...] = (None, *model.vocabulary)
         self.atom = {atom: number for number, atom in enumerate(self.atoms)}
@@ -84,9 +85,17 @@ class Index:
         self.unconditional = tuple(step for step in self.steps if not step.needs)
         """Rules that hold whoever is faulty: they can make observations contradict the model."""
 
-    def numbers(self, atoms: Iterable[Literal]) -> frozenset[int]:
-        """The numbers of atoms."""
-        return frozenset(self.atom[atom] for atom in atoms)
+    def numbers(self, atoms: Collection[Literal]) -> frozenset[int]:
+        """The numbers of atoms.
+
+        Raises:
+            BadLiteral: the model has no such atom.
+        """
+        try:
+            return frozenset(map(self.atom.__getitem__, atoms))
+        except KeyError:  # spelled in the other order, or unknown
+            check = self.model.vocabulary.check
+            return frozenset(self.atom[check(atom)] for atom in atoms)
 
 
 def cone_of(index: Index, positive: frozenset[int], negative: frozenset[int]) -> Cone:

@@ -74,9 +74,10 @@ class Diagnoser:
         Raises:
             BadLiteral: an observation has a name that the model does not declare.
         """
-        observed = self.observed(observations)
+        if not isinstance(observations, Observed):
+            observations = tuple(observations)  # it may be read only here
         budget = Budget(self.seconds if seconds is None else seconds)
-        work = asyncio.ensure_future(asyncio.to_thread(self._diagnose, observed, frozenset(repaired), budget))
+        work = asyncio.ensure_future(asyncio.to_thread(self._diagnose, observations, frozenset(repaired), budget))
         try:
             return await asyncio.shield(work)
         except asyncio.CancelledError:
@@ -97,23 +98,20 @@ class Diagnoser:
         Raises:
             BadLiteral: an observation has a name that the model does not declare.
         """
-        observed = self.observed(observations)
         budget = Budget(self.seconds if seconds is None else seconds)
-        return self._diagnose(observed, frozenset(repaired), budget)
+        return self._diagnose(observations, frozenset(repaired), budget)
 
     def observed(self, observations: Observations) -> Observed:
-        """Observations of any form, looked up in the model's vocabulary.
+        """Observations of any form as one; texts are looked up in the model's vocabulary.
 
         Raises:
-            BadLiteral: an observation has a name that the model does not declare.
+            BadLiteral: a literal has a name that the model does not declare.
         """
-        words = self._model.vocabulary
         if not isinstance(observations, Observed):
+            words = self._model.vocabulary
             given = (words.parse(one) if isinstance(one, str) else words.check(one) for one in observations)
             return Observed.of(given)
-        positive = frozenset(map(words.check, observations.positive))
-        negative = frozenset(map(words.check, observations.negative))
-        return msgspec.structs.replace(observations, positive=positive, negative=negative)
+        return observations
 
     def explain(self, observations: Observations) -> Explanation:
         """Why there is something to repair: minimal conflicts, and failures that follow from others."""
@@ -139,13 +137,16 @@ class Diagnoser:
         """
         index, observed = self._index, self.observed(observations)
         positive, negative = index.numbers(observed.positive), index.numbers(observed.negative)
-        seen = index.numbers(map(self._model.vocabulary.check, can_be_seen)) if can_be_seen is not None else None
+        seen = index.numbers(tuple(can_be_seen)) if can_be_seen is not None else None
         return probes(index, positive, negative, diagnosis.candidates, seen, costs or {})
 
-    def _diagnose(self, observed: Observed, repaired: frozenset[str], budget: Budget) -> Diagnosis:
+    def _diagnose(self, observations: Observations, repaired: frozenset[str], budget: Budget) -> Diagnosis:
         began = time.perf_counter()
         with self._lock, contextlib.closing(budget):
-            made = self._state_of(observed) or self._solved(observed, repaired, budget)
+            observed = self.observed(observations)
+            positive, negative = self._index.numbers(observed.positive), self._index.numbers(observed.negative)
+            excluded = self._state_of(observed, positive, negative)
+            made = excluded or self._solved(positive, negative, repaired, budget)
             return msgspec.structs.replace(
                 made,
                 components=self._index.names,
@@ -153,25 +154,25 @@ class Diagnoser:
                 seconds=time.perf_counter() - began,
             )
 
-    def _state_of(self, observed: Observed) -> Diagnosis | None:
+    def _state_of(self, observed: Observed, positive: frozenset[int], negative: frozenset[int]) -> Diagnosis | None:
         """The answer where there can be no diagnosis."""
         if observed.is_blind:
             return Diagnosis(State.BLIND)
         torn = list(observed.contradictions)
         if not torn:
-            index = self._index
-            literals = contradiction(index, index.numbers(observed.positive), index.numbers(observed.negative))
+            literals = contradiction(self._index, positive, negative)
             if literals:
                 said = [seen for literal in literals for seen in observed.sources.get(literal.atom, ())]
                 torn.append(Contradiction(literals, tuple(said), "the model excludes this whatever is faulty"))
         return Diagnosis(State.CONTRADICTORY, contradictions=tuple(torn)) if torn else None
 
-    def _solved(self, observed: Observed, repaired: frozenset[str], budget: Budget) -> Diagnosis:
-        index = self._index
-        cone = cone_of(index, index.numbers(observed.positive), index.numbers(observed.negative))
+    def _solved(
+        self, positive: frozenset[int], negative: frozenset[int], repaired: frozenset[str], budget: Budget
+    ) -> Diagnosis:
+        cone = cone_of(self._index, positive, negative)
         if not cone.convicted and not cone.parts:
             return Diagnosis(State.HEALTHY, candidates=(Candidate(()),), found=1)
-        ranking = Ranking(tuple(self._model.components.values()), repaired)
+        ranking = Ranking(self._index.components, repaired)
         parts = [solved for part in cone.parts for solved in self._part(part, budget)]
         rows = [self._ranked(solved, ranking) for solved in parts]
         certain = [ranking.set(sorted(cone.faulty))] if cone.faulty else []

@@ -32,18 +32,24 @@ class Ranking:
     """The keys of a model's components."""
 
     def __init__(self, components: Sequence[Component], repaired: Collection[str]) -> None:
-        self._keys = [
-            Key(1, int(component.name in repaired), unlikeliness(component.prior), int(component.kind.is_hardware))
-            for component in components
-        ]
+        self._components, self._repaired = components, repaired
+        self._keys: dict[int, Key] = {}
 
     def singles(self, members: Sequence[int]) -> list[Ranked]:
         """Each member as a set of its own, best first."""
-        return sorted((self._keys[member], (member,)) for member in members)
+        return sorted((self._key(member), (member,)) for member in members)
 
     def set(self, members: Sequence[int]) -> Ranked:
         """The members as one set."""
-        return total([self._keys[member] for member in members]), tuple(members)
+        return total([self._key(member) for member in members]), tuple(members)
+
+    def _key(self, member: int) -> Key:
+        key = self._keys.get(member)
+        if key is None:
+            component = self._components[member]
+            is_hardware, is_repaired = component.kind.is_hardware, component.name in self._repaired
+            key = self._keys[member] = Key(1, int(is_repaired), unlikeliness(component.prior), int(is_hardware))
+        return key
 
 
 def total(keys: Sequence[Key]) -> Key:

@@ -133,7 +133,7 @@ async def test_a_cancelled_diagnosis_ends_its_search() -> None:
 def test_what_interrupts_before_a_search_begins_is_not_lost() -> None:
     system, symptoms = ladder(90)
     index = Index(Model(system))
-    (part,) = cone_of(index, frozenset(), index.numbers(map(parse, symptoms_of(symptoms)))).parts
+    (part,) = cone_of(index, frozenset(), index.numbers([*map(parse, symptoms_of(symptoms))])).parts
     budget = Budget(600.0)
     budget.cancel()
     (solved,) = solve(part, 10**9, budget)
@@ -256,7 +256,7 @@ def test_names_the_model_does_not_know_are_refused() -> None:
         Diagnoser(paper_robot()).diagnose_now(["not ok(/odm)"])
 
 
-async def test_names_the_model_does_not_know_are_refused_before_a_thread_begins() -> None:
+async def test_names_the_model_does_not_know_are_refused_across_the_thread() -> None:
     with pytest.raises(BadLiteral):
         await Diagnoser(paper_robot()).diagnose([ok("/odm")])
 
