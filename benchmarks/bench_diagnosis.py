@@ -146,9 +146,7 @@ def robot() -> System:
 async def engine_example(run: Run) -> None:
     """The median over all pairs of silent faults of the paper's robot: nothing is remembered between them."""
     engine = Diagnoser(robot(), seconds=60.0)
-    topics = {topic for component in engine.model.components.values() for topic in component.out}
     seen = [observe_example(engine.model, {a, b}) for a in engine.model.components for b in engine.model.components]
-    assert topics
     times: list[float] = []
     for observed in seen * (1 if run.quick else 5):
         engine._parts.clear()

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 from ..literals import Literal
 from ..model import Model
+from .breath import breathe, breathing
 
 FALSE: Final = 0
 """The atom that never holds: the head of rules without one."""
@@ -91,8 +92,9 @@ class Index:
         Raises:
             BadLiteral: the model has no such atom.
         """
+        breathe()
         try:
-            return frozenset(map(self.atom.__getitem__, atoms))
+            return frozenset(map(self.atom.__getitem__, breathing(atoms, 1024)))
         except KeyError:  # spelled in the other order, or unknown
             check = self.model.vocabulary.check
             return frozenset(self.atom[check(atom)] for atom in atoms)
@@ -119,7 +121,7 @@ def _backwards(index: Index, positive: frozenset[int], negative: frozenset[int],
     todo = [FALSE, *negative]
     met = set(todo)
     found: list[Step] = []
-    for atom in todo:  # it grows
+    for atom in breathing(todo):  # it grows
         for step in index.makers[atom]:
             if faulty and any(component in faulty for component in step.needs):
                 continue
@@ -141,14 +143,14 @@ def _grounded(steps: list[Step]) -> list[Step]:
     """Without rules that wait for an atom which nothing can make hold."""
     waiting: dict[int, list[int]] = {}
     missing = [len(step.body) for step in steps]
-    for number, step in enumerate(steps):
+    for number, step in enumerate(breathing(steps)):
         for atom in step.body:
             waiting.setdefault(atom, []).append(number)
     if not waiting:
         return steps
     holds: set[int] = set()
     todo = [step.head for step, count in zip(steps, missing, strict=True) if not count]
-    for atom in todo:  # it grows
+    for atom in breathing(todo):  # it grows
         if atom in holds:
             continue
         holds.add(atom)
@@ -167,7 +169,7 @@ def _reaching(steps: list[Step], failures: frozenset[int]) -> list[Step]:
     todo = sorted(failures)
     met = set(todo)
     kept: list[Step] = []
-    for atom in todo:  # it grows
+    for atom in breathing(todo):  # it grows
         for step in makers.get(atom, ()):
             kept.append(step)
             for needed in step.body:
@@ -188,13 +190,13 @@ def parts_of(steps: list[Step], failures: frozenset[int]) -> Iterator[Part]:
 
     by_component: dict[int, int] = {}
     by_atom: dict[int, int] = {}
-    for number, step in enumerate(steps):
+    for number, step in enumerate(breathing(steps)):
         for component in step.needs:
             parent[root(number)] = root(by_component.setdefault(component, number))
         for atom in step.body if step.head in failures else (*step.body, step.head):
             parent[root(number)] = root(by_atom.setdefault(atom, number))
     groups: dict[int, list[Step]] = {}
-    for number, step in enumerate(steps):
+    for number, step in enumerate(breathing(steps)):
         groups.setdefault(root(number), []).append(step)
     for group in groups.values():
         denials = tuple(step for step in group if step.head in failures)

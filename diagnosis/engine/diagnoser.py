@@ -16,6 +16,7 @@ import msgspec
 from ..literals import Literal
 from ..model import Declaration, Model, System
 from ..observations import Contradiction, Observed
+from .breath import beside_a_loop, breathe, breathing
 from .cone import Cone, Index, Part, cone_of, contradiction
 from .explain import Explanation, explain
 from .probe import Probe, probes
@@ -77,7 +78,7 @@ class Diagnoser:
         if not isinstance(observations, Observed):
             observations = tuple(observations)  # it may be read only here
         budget = Budget(self.seconds if seconds is None else seconds)
-        work = asyncio.ensure_future(asyncio.to_thread(self._diagnose, observations, frozenset(repaired), budget))
+        work = asyncio.ensure_future(asyncio.to_thread(self._beside, observations, frozenset(repaired), budget))
         try:
             return await asyncio.shield(work)
         except asyncio.CancelledError:
@@ -140,6 +141,10 @@ class Diagnoser:
         seen = index.numbers(tuple(can_be_seen)) if can_be_seen is not None else None
         return probes(index, positive, negative, diagnosis.candidates, seen, costs or {})
 
+    def _beside(self, observations: Observations, repaired: frozenset[str], budget: Budget) -> Diagnosis:
+        with beside_a_loop():
+            return self._diagnose(observations, repaired, budget)
+
     def _diagnose(self, observations: Observations, repaired: frozenset[str], budget: Budget) -> Diagnosis:
         began = time.perf_counter()
         with self._lock, contextlib.closing(budget):
@@ -174,6 +179,7 @@ class Diagnoser:
             return Diagnosis(State.HEALTHY, candidates=(Candidate(()),), found=1)
         ranking = Ranking(self._index.components, repaired)
         parts = [solved for part in cone.parts for solved in self._part(part, budget)]
+        breathe()
         rows = [self._ranked(solved, ranking) for solved in parts]
         certain = [ranking.set(sorted(cone.faulty))] if cone.faulty else []
         ranked = merged([products([certain, *rows] if certain else rows)], self.limit)
@@ -191,7 +197,8 @@ class Diagnoser:
     def _ranked(self, solved: Solved, ranking: Ranking) -> list[Ranked]:
         """The best sets of a part, with classes written out."""
         singles = {first: ranking.singles(members) for first, members in solved.classes.items()}
-        return merged([products([singles[member] for member in members]) for members in solved.sets], self.limit)
+        rows = (products([singles[member] for member in members]) for members in solved.sets)
+        return merged(rows, self.limit)
 
     def _part(self, part: Part, budget: Budget) -> list[Solved]:
         known = self._parts.get(part)
@@ -215,7 +222,7 @@ class Diagnoser:
         total = math.fsum(weights)
         return tuple(
             Candidate(tuple(names[member] for member in sorted(members)), weight / total)
-            for (_, members), weight in zip(ranked, weights, strict=True)
+            for (_, members), weight in breathing(zip(ranked, weights, strict=True), 128)
         )
 
     def _symptoms(self, cone: Cone) -> tuple[Literal, ...]:

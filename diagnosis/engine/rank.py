@@ -8,12 +8,12 @@ driver than to switch a robot's base off (T54).
 from __future__ import annotations
 
 import heapq
-import itertools
 import math
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 from ..model import Component
+from .breath import breathing
 
 
 class Key(NamedTuple):
@@ -92,4 +92,21 @@ def products(lists: Sequence[list[Ranked]]) -> Iterator[Ranked]:
 
 def merged(rows: Iterable[Iterator[Ranked]], limit: int) -> list[Ranked]:
     """The best `limit` of all rows, each of which is sorted."""
-    return list(itertools.islice(heapq.merge(*rows, key=lambda ranked: ranked[0]), limit))
+    heap: list[tuple[Key, int, Ranked, Iterator[Ranked]]] = []
+    for number, row in enumerate(breathing(rows, 32)):
+        first = next(row, None)
+        if first is not None:
+            heap.append((first[0], number, first, row))
+    heapq.heapify(heap)
+    best: list[Ranked] = []
+    for _ in breathing(range(limit), 64):
+        if not heap:
+            break
+        _, number, chosen, row = heap[0]
+        best.append(chosen)
+        following = next(row, None)
+        if following is None:
+            heapq.heappop(heap)
+        else:
+            heapq.heapreplace(heap, (following[0], number, following, row))
+    return best

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
+from .breath import breathe, breathing
 from .cone import Part, Step, parts_of
 
 
@@ -57,6 +58,8 @@ def _unfold(part: Part, sources: dict[int, Step]) -> dict[Step, Need]:
                 frozenset(kept).union(*(needs[source][1] for source in made_by)),
             )
             stack.pop()
+            if len(needs) % 32 == 0:
+                breathe()
     return needs
 
 
@@ -68,7 +71,7 @@ def _without_supersets(steps: list[Step], failures: frozenset[int]) -> list[Step
     """Without conflicts that contain another one."""
     kept: list[Step] = []
     by_member: dict[int, list[frozenset[int]]] = {}
-    for step in sorted(steps, key=lambda step: len(step.needs)):
+    for step in breathing(sorted(steps, key=lambda step: len(step.needs)), 64):
         if step.head in failures and not step.body:
             needs = frozenset(step.needs)
             if any(known <= needs for member in step.needs for known in by_member.get(member, ())):
@@ -82,11 +85,11 @@ def _classed(part: Part) -> Reduced:
     """Components that are needed by the same rules become one."""
     rules = (*part.denials, *part.steps)
     occurs: dict[int, list[int]] = {}
-    for number, step in enumerate(rules):
+    for number, step in enumerate(breathing(rules, 4)):
         for component in step.needs:
             occurs.setdefault(component, []).append(number)
     classes: dict[tuple[int, ...], list[int]] = {}
-    for component, numbers in sorted(occurs.items()):
+    for component, numbers in breathing(sorted(occurs.items())):
         classes.setdefault(tuple(numbers), []).append(component)
     members = {group[0]: tuple(group) for group in classes.values()}
     denials, steps = (
