@@ -96,16 +96,16 @@ def horn_models(draw: st.DrawFn) -> Model:
     """Models of any Horn form: several rules for an atom, rules without components, rules without a head."""
     system = System()
     names = [f"c{i}" for i in range(draw(st.integers(1, 6)))]
-    count = draw(st.integers(1, 7))
+    count = draw(st.integers(1, 5))
     system.proposition(*(f"ok(t{i})" for i in range(count)))
     for name in names:
         if draw(st.booleans()):
             system.node(name)
         else:
             system.hardware(name, switchable=draw(st.booleans()))
-    for _ in range(draw(st.integers(0, 10))):
+    for _ in range(draw(st.integers(0, 14))):
         head = draw(st.integers(0, count))
-        body = draw(st.lists(st.integers(0, max(head - 1, 0)), max_size=2)) if head else []
+        body = draw(st.lists(st.integers(0, max(head - 1, 0)), max_size=3)) if head else []
         needs = draw(st.lists(st.sampled_from(names), max_size=3))
         left = [*(f"NAB({name})" for name in needs), *(f"ok(t{i})" for i in body)]
         if left and head < count:
@@ -147,7 +147,7 @@ def dataflow_models(draw: st.DrawFn) -> Model:
 def cases(draw: st.DrawFn) -> tuple[Model, frozenset[Literal], frozenset[Literal]]:
     """A model with any observations, not only such as could be made."""
     model = draw(st.one_of(horn_models(), dataflow_models()))
-    signs = {atom: draw(st.sampled_from((None, None, True, False, False))) for atom in sorted(model.vocabulary)}
+    signs = {atom: draw(st.sampled_from((None, None, None, True, False, False))) for atom in sorted(model.vocabulary)}
     positive = frozenset(
         atom for atom, sign in signs.items() if sign is True and atom.name not in ("inc", "dec", "const")
     )
