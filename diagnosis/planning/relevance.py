@@ -1,0 +1,215 @@
+"""What a problem is really about: what can be reached at all, what matters to the goals, what hangs together.
+
+Source: the relaxed planning graph of Hoffmann and Nebel 2001 (FF), here with negative literals as facts of their own.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from typing import TypeAlias
+
+from .answers import Budget, OutOfTime
+from .grounding import GroundAction, holds
+from .language import Atom, Literal
+
+State: TypeAlias = frozenset[Atom]
+
+MOST_STATES = 20_000
+"""States looked at, for the proof that there is no plan."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """A ground problem, cut down to what matters.
+
+    Attributes:
+        actions: those that can become possible and can matter.
+        hopeless: goals out of reach of any sequence of actions.
+        least: stages that any plan has at least.
+    """
+
+    actions: tuple[GroundAction, ...]
+    init: State
+    goals: tuple[Literal, ...]
+    hopeless: tuple[Literal, ...]
+    least: int
+
+
+def cut_down(actions: Sequence[GroundAction], init: State, goals: tuple[Literal, ...], budget: Budget) -> Task:
+    """Keep the actions that can be reached and that matter. Raises OutOfTime."""
+    possible, levels = _reached(actions, init, budget)
+
+    def level(goal: Literal) -> int | None:
+        return 0 if (goal.atom in init) is goal.value else levels.get(goal)
+
+    hopeless = tuple(goal for goal in goals if level(goal) is None)
+    least = max((level(goal) or 0 for goal in goals), default=0)
+    return Task(_relevant(possible, init, goals, budget), init, goals, hopeless, least)
+
+
+def _reached(
+    actions: Sequence[GroundAction], init: State, budget: Budget
+) -> tuple[list[GroundAction], dict[Literal, int]]:
+    """The actions whose needs can be met if nothing were ever undone, and when each literal first can be true.
+
+    Each effect waits at one literal that it lacks; when that comes, it looks for the next one.
+    """
+    levels: dict[Literal, int] = {}
+    possible: list[GroundAction] = []
+
+    def lacks(term: Iterable[Literal]) -> Literal | None:
+        for literal in term:
+            if (literal.atom in init) is not literal.value and literal not in levels:
+                return literal
+        return None
+
+    # An action's effects wait like actions do, for its needs and their own condition.
+    ready = [(action, effect.literal, action.needs | effect.condition) for action in actions for effect in action.effects]
+    level = 0
+    pending: dict[Literal, list[tuple[GroundAction, Literal, frozenset[Literal]]]] = {}
+    seen: set[int] = set()
+    while ready:
+        budget.check()
+        level += 1
+        reached: dict[Literal, None] = {}
+        for entry in ready:
+            action, literal, term = entry
+            missing = lacks(term)
+            if missing is not None:
+                pending.setdefault(missing, []).append(entry)
+                continue
+            if id(action) not in seen:
+                seen.add(id(action))
+                possible.append(action)
+            if (literal.atom in init) is not literal.value and literal not in levels:
+                reached[literal] = None
+        ready = []
+        for literal in reached:
+            levels[literal] = level
+        for literal in reached:
+            ready.extend(pending.pop(literal, ()))
+    return possible, levels
+
+
+def _relevant(
+    actions: Sequence[GroundAction], init: State, goals: Iterable[Literal], budget: Budget
+) -> tuple[GroundAction, ...]:
+    """The actions that bring about what is needed, or bring back what another of them may take away."""
+    makers: dict[Literal, list[GroundAction]] = {}
+    for action in actions:
+        for effect in action.effects:
+            makers.setdefault(effect.literal, []).append(action)
+    needed: set[Literal] = set()
+    broken: set[Literal] = set()
+    sought: set[Literal] = set()
+    chosen: dict[int, GroundAction] = {}
+    queue: list[Literal] = []
+
+    def seek(literal: Literal) -> None:
+        """Literals that are needed and not simply there from the beginning to the end."""
+        if literal in needed and literal not in sought:
+            if (literal.atom in init) is not literal.value or literal in broken:
+                sought.add(literal)
+                queue.append(literal)
+
+    def need(literal: Literal) -> None:
+        needed.add(literal)
+        seek(literal)
+
+    for goal in goals:
+        need(goal)
+    while queue:
+        budget.check()
+        for action in makers.get(queue.pop(), ()):
+            if id(action) in chosen:
+                continue
+            chosen[id(action)] = action
+            for literal in action.needs:
+                need(literal)
+            for effect in action.effects:
+                for atom, value in effect.condition:
+                    # Also the opposite: that an effect fails to come may be what is wanted of it.
+                    need(Literal(atom, value))
+                    need(Literal(atom, not value))
+                opposite = Literal(effect.literal.atom, not effect.literal.value)
+                broken.add(opposite)
+                seek(opposite)
+    return tuple(action for action in actions if id(action) in chosen)
+
+
+@dataclasses.dataclass(frozen=True)
+class Proof:
+    """Goals that no sequence of actions reaches: none of them, if `is_each`; else not all of them together."""
+
+    goals: tuple[Literal, ...]
+    is_each: bool
+
+
+def prove_unsolvable(task: Task, budget: Budget) -> Proof | None:
+    """Look at every state that can be reached, in each part that is independent of the others.
+
+    None: a state was found in which the part's goals are met, in every part, or there are too many states to tell.
+    """
+    for actions, goals in parts(task):
+        proof = _prove_part(actions, task.init, goals, budget)
+        if proof is not None:
+            return proof
+    return None
+
+
+def parts(task: Task) -> list[tuple[list[GroundAction], tuple[Literal, ...]]]:
+    """The actions and goals that share no atom with the others."""
+    parent: dict[Atom, Atom] = {}
+
+    def root(atom: Atom) -> Atom:
+        parent.setdefault(atom, atom)
+        while parent[atom] != atom:
+            parent[atom] = parent[parent[atom]]
+            atom = parent[atom]
+        return atom
+
+    for action in task.actions:
+        first, *rest = atoms(action)
+        for atom in rest:
+            parent[root(atom)] = root(first)
+    groups: dict[Atom, tuple[list[GroundAction], list[Literal]]] = {}
+    for action in task.actions:
+        groups.setdefault(root(atoms(action)[0]), ([], []))[0].append(action)
+    for goal in task.goals:
+        groups.setdefault(root(goal.atom), ([], []))[1].append(goal)
+    return [(members, tuple(goals)) for members, goals in groups.values() if goals]
+
+
+def atoms(action: GroundAction) -> list[Atom]:
+    """The atoms that an action reads or writes; there is at least one, for it has an effect."""
+    found = dict.fromkeys(effect.literal.atom for effect in action.effects)
+    found.update(dict.fromkeys(literal.atom for effect in action.effects for literal in effect.condition))
+    found.update(dict.fromkeys(literal.atom for literal in action.needs))
+    return list(found)
+
+
+def _prove_part(
+    actions: Sequence[GroundAction], init: State, goals: tuple[Literal, ...], budget: Budget
+) -> Proof | None:
+    mine = frozenset(atom for action in actions for atom in atoms(action)) | {goal.atom for goal in goals}
+    start = init & mine
+    seen, queue = {start}, [start]
+    met: set[Literal] = set()
+    try:
+        for state in queue:  # It grows meanwhile.
+            budget.check()
+            now = [goal for goal in goals if (goal.atom in state) is goal.value]
+            if len(now) == len(goals):
+                return None
+            met.update(now)
+            for action in actions:
+                if holds(action.needs, state) and (after := action.after(state)) not in seen:
+                    seen.add(after)
+                    queue.append(after)
+            if len(seen) > MOST_STATES:
+                return None
+    except OutOfTime:
+        return None
+    never = tuple(goal for goal in goals if goal not in met)
+    return Proof(never, True) if never else Proof(goals, False)

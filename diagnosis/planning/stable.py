@@ -1,0 +1,163 @@
+"""The planner that comes with holdfast: ground actions as an answer set program, solved by clingo.
+
+A plan has as few stages as possible, and among those the least cost. The steps of a stage do not disturb each other, so
+they can be done at the same time (the forall-steps of SATPLAN, the mutexes of GraphPlan).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Any, Final
+
+from .answers import Budget, Outcome, OutOfTime, Plan, TimedOut, Unsolvable
+from .grounding import GroundAction, Grounder, changing_part
+from .language import Atom, Literal, Problem
+from .ordering import stages
+from .relevance import Proof, Task, cut_down, prove_unsolvable
+
+PROGRAM: Final = """
+time(1..horizon).
+{ does(A,T) } :- act(A,_), time(T).
+true(F,0) :- init(F).
+:- does(A,T), needs(A,F), not true(F,T-1).
+:- does(A,T), excludes(A,F), true(F,T-1).
+fails(A,E,T) :- if(A,E,F), time(T), not true(F,T-1).
+fails(A,E,T) :- unless(A,E,F), time(T), true(F,T-1).
+makes(F,T) :- does(A,T), adds(A,E,F), not fails(A,E,T).
+ends(F,T) :- does(A,T), deletes(A,E,F), not fails(A,E,T).
+true(F,T) :- makes(F,T).
+true(F,T) :- true(F,T-1), time(T), not ends(F,T).
+:- goal(F), not true(F,horizon).
+:- avoid(F), true(F,horizon).
+disturbs(A,B) :- deletes(A,_,F), needs(B,F), A != B.
+disturbs(A,B) :- adds(A,_,F), excludes(B,F), A != B.
+disturbs(A,B) :- adds(A,_,F), deletes(B,_,F), A != B.
+disturbs(A,B) :- adds(A,_,F), asks(B,F), A != B.
+disturbs(A,B) :- deletes(A,_,F), asks(B,F), A != B.
+:- disturbs(A,B), does(A,T), does(B,T).
+#minimize { C,A,T : does(A,T), act(A,C) }.
+#show does/2.
+"""
+
+OPTIONS: Final = ("--opt-strategy=usc", "--heuristic=Domain", "--dom-mod=5,16", "--warn=none")
+"""Plain branch and bound takes seconds where this takes milliseconds: preferring to do nothing is nearly always right."""
+SLICE: Final = 0.05
+"""Seconds after which a cancelled budget is noticed."""
+
+
+class ClingoPlanner:
+    """Finds shortest parallel plans. Groundings are kept between calls; it may be used from several threads.
+
+    Args:
+        late: actions done in the last stage that allows it: by default starts, so that all hardware is up before the
+            first node is started, without a condition that one dead device would make impossible.
+        longest: stages a plan may have.
+    """
+
+    def __init__(self, *, late: Collection[str] = ("start_node",), longest: int = 200) -> None:
+        self._late, self._longest = frozenset(late), longest
+        self._grounder = Grounder()
+
+    def solve(self, problem: Problem, budget: Budget) -> Outcome:
+        """See `Planner.solve`."""
+        try:
+            actions = self._grounder.ground(problem, budget)
+            task = cut_down(actions, changing_part(problem.domain, problem.init), _changing_goals(problem), budget)
+            hopeless = (*_false_for_ever(problem), *task.hopeless)
+            if hopeless:
+                return Unsolvable(hopeless, True, "no action brings them about, whatever is done before")
+            return self._search(task, budget)
+        except OutOfTime:
+            return TimedOut(budget.seconds)
+
+    def _search(self, task: Task, budget: Budget) -> Outcome:
+        if not task.least:
+            return Plan(())
+        facts = "".join(_facts(task))
+        for horizon in range(task.least, self._longest + 1):
+            budget.check()
+            found = _solve(facts, horizon, budget)
+            if found is not None:
+                sequence, is_optimal = [task.actions[index] for index in found[0]], found[1]
+                return self._plan(sequence, is_optimal)
+            if horizon == task.least:
+                # The bound says that so many stages suffice if nothing is in the way: now it is time to doubt.
+                proof = prove_unsolvable(task, budget)
+                if proof is not None:
+                    return _unsolvable(proof)
+        return TimedOut(budget.seconds, f"there is no plan of up to {self._longest} stages")
+
+    def _plan(self, sequence: Sequence[GroundAction], is_optimal: bool) -> Plan:
+        made = tuple(tuple(action.step for action in stage) for stage in stages(sequence, self._late))
+        return Plan(made, sum(action.cost for action in sequence), is_optimal)
+
+
+def _unsolvable(proof: Proof) -> Unsolvable:
+    if proof.is_each:
+        return Unsolvable(proof.goals, True, "they are met in no state that can be reached")
+    return Unsolvable(proof.goals, False, "they are met together in no state that can be reached")
+
+
+def _changing_goals(problem: Problem) -> tuple[Literal, ...]:
+    changing = problem.domain.changing()
+    return tuple(goal for goal in problem.goals if goal.atom[0] in changing)
+
+
+def _false_for_ever(problem: Problem) -> Iterator[Literal]:
+    """Goals about what no action changes, that are not so."""
+    changing = problem.domain.changing()
+    for goal in problem.goals:
+        if goal.atom[0] not in changing and (goal.atom in problem.init) is not goal.value:
+            yield goal
+
+
+def _facts(task: Task) -> Iterator[str]:
+    """The task as facts of the program, with numbers for actions, effects and atoms."""
+    number: dict[Atom, int] = {}
+
+    def of(atom: Atom) -> int:
+        return number.setdefault(atom, len(number))
+
+    for index, action in enumerate(task.actions):
+        yield f"act({index},{action.cost})."
+        for atom, value in action.needs:
+            yield f"{'needs' if value else 'excludes'}({index},{of(atom)})."
+        for place, effect in enumerate(action.effects):
+            atom, value = effect.literal
+            yield f"{'adds' if value else 'deletes'}({index},{place},{of(atom)})."
+            for asked, wanted in effect.condition:
+                yield f"{'if' if wanted else 'unless'}({index},{place},{of(asked)}).asks({index},{of(asked)})."
+    for goal in task.goals:
+        yield f"{'goal' if goal.value else 'avoid'}({of(goal.atom)})."
+    for atom in sorted(task.init & number.keys()):
+        yield f"init({number[atom]})."
+
+
+def _solve(facts: str, horizon: int, budget: Budget) -> tuple[list[int], bool] | None:
+    """The actions of the best plan of so many stages, in order, and whether there is surely no better one.
+
+    None: there is no plan of that length. Raises OutOfTime.
+    """
+    import clingo
+
+    control = clingo.Control([*OPTIONS, "-c", f"horizon={horizon}"])
+    control.add("base", [], PROGRAM + facts)
+    control.ground([("base", [])])
+    best: list[tuple[int, int]] = []
+
+    def keep(model: Any) -> None:
+        best[:] = sorted((does.arguments[1].number, does.arguments[0].number) for does in model.symbols(shown=True))
+
+    is_found = False
+    with control.solve(on_model=lambda model: keep(model), async_=True) as handle:
+        while not handle.wait(min(SLICE, budget.left)):
+            if not budget.left:
+                handle.cancel()
+                break
+        result = handle.get()
+        is_found = bool(result.satisfiable)
+    if is_found:
+        return [action for _, action in best], bool(result.exhausted)
+    if result.unsatisfiable:
+        return None
+    raise OutOfTime
