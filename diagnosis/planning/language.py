@@ -132,13 +132,6 @@ class Domain:
     actions: tuple[Action, ...]
     constants: tuple[tuple[str, str], ...] = ()
 
-    def action(self, name: str) -> Action:
-        """The action of this name. Raises PlanningError."""
-        for action in self.actions:
-            if action.name == name:
-                return action
-        raise PlanningError(self.name, f"there is no action {name}")
-
     def changing(self) -> frozenset[str]:
         """Predicates that some action changes; what is so of the others stays so."""
         return frozenset(effect.literal.atom[0] for action in self.actions for effect in action.effects)

@@ -36,6 +36,33 @@ def predecessors(sequence: Sequence[GroundAction]) -> list[set[int]]:
     return found
 
 
+def disturbances(actions: Sequence[GroundAction]) -> set[tuple[int, int]]:
+    """Pairs that must not share a stage, because it would matter which comes first; the smaller number first.
+
+    Pairs are left out whose needs contradict each other: they never come together anyway.
+    """
+    needing: dict[Literal, list[int]] = {}
+    making: dict[Literal, list[int]] = {}
+    asking: dict[Atom, list[int]] = {}
+    for index, action in enumerate(actions):
+        for literal in action.needs:
+            needing.setdefault(literal, []).append(index)
+        for effect in action.effects:
+            making.setdefault(effect.literal, []).append(index)
+            for literal in effect.condition:
+                asking.setdefault(literal.atom, []).append(index)
+    found: set[tuple[int, int]] = set()
+    for (atom, value), makers in making.items():
+        opposite = Literal(atom, not value)
+        others = {*needing.get(opposite, ()), *making.get(opposite, ()), *asking.get(atom, ())}
+        found.update((min(a, b), max(a, b)) for a in makers for b in others if a != b)
+    return {(a, b) for a, b in found if not _contradict(actions[a], actions[b])}
+
+
+def _contradict(a: GroundAction, b: GroundAction) -> bool:
+    return any(Literal(atom, not value) in b.needs for atom, value in a.needs)
+
+
 def stages(sequence: Sequence[GroundAction], late: Collection[str] = ()) -> list[list[GroundAction]]:
     """Stages, as few as the order allows; each action as early as it can be, those named `late` as late as they can.
 

@@ -19,17 +19,31 @@ MOST_STATES = 20_000
 """States looked at, for the proof that there is no plan."""
 
 
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class Useful:
+    """An action that matters.
+
+    Attributes:
+        earliest: no plan has it in an earlier stage; the first is 1.
+        after: stages that must follow it if it is to be of use.
+    """
+
+    action: GroundAction
+    earliest: int
+    after: int
+
+
 @dataclasses.dataclass(frozen=True)
 class Task:
     """A ground problem, cut down to what matters.
 
     Attributes:
-        actions: those that can become possible and can matter.
+        useful: the actions that can become possible and can matter.
         hopeless: goals out of reach of any sequence of actions.
         least: stages that any plan has at least.
     """
 
-    actions: tuple[GroundAction, ...]
+    useful: tuple[Useful, ...]
     init: State
     goals: tuple[Literal, ...]
     hopeless: tuple[Literal, ...]
@@ -38,58 +52,85 @@ class Task:
 
 def cut_down(actions: Sequence[GroundAction], init: State, goals: tuple[Literal, ...], budget: Budget) -> Task:
     """Keep the actions that can be reached and that matter. Raises OutOfTime."""
-    possible, levels = _reached(actions, init, budget)
+    earliest, levels = _reached(actions, init, budget)
 
     def level(goal: Literal) -> int | None:
         return 0 if (goal.atom in init) is goal.value else levels.get(goal)
 
     hopeless = tuple(goal for goal in goals if level(goal) is None)
     least = max((level(goal) or 0 for goal in goals), default=0)
-    return Task(_relevant(possible, init, goals, budget), init, goals, hopeless, least)
+    relevant = _relevant([action for action in actions if action in earliest], init, goals, budget)
+    after = _lags(relevant, goals)
+    useful = tuple(Useful(action, earliest[action], after[action]) for action in relevant if action in after)
+    return Task(useful, init, goals, hopeless, least)
 
 
 def _reached(
     actions: Sequence[GroundAction], init: State, budget: Budget
-) -> tuple[list[GroundAction], dict[Literal, int]]:
-    """The actions whose needs can be met if nothing were ever undone, and when each literal first can be true.
+) -> tuple[dict[GroundAction, int], dict[Literal, int]]:
+    """When each action, and each literal, could be had first if nothing were ever undone.
 
-    Each effect waits at one literal that it lacks; when that comes, it looks for the next one.
+    An action's effects wait at one literal that they lack; when that comes, they look for the next one.
     """
+    earliest: dict[GroundAction, int] = {}
     levels: dict[Literal, int] = {}
-    possible: list[GroundAction] = []
-
-    def lacks(term: Iterable[Literal]) -> Literal | None:
-        for literal in term:
-            if (literal.atom in init) is not literal.value and literal not in levels:
-                return literal
-        return None
-
-    # An action's effects wait like actions do, for its needs and their own condition.
-    ready = [(action, effect.literal, action.needs | effect.condition) for action in actions for effect in action.effects]
+    waiting: dict[Literal, list[tuple[GroundAction, frozenset[Literal], list[Literal]]]] = {}
+    ready = [(action, action.needs | condition, made) for action in actions for condition, made in _by_condition(action)]
     level = 0
-    pending: dict[Literal, list[tuple[GroundAction, Literal, frozenset[Literal]]]] = {}
-    seen: set[int] = set()
     while ready:
         budget.check()
         level += 1
         reached: dict[Literal, None] = {}
         for entry in ready:
-            action, literal, term = entry
-            missing = lacks(term)
-            if missing is not None:
-                pending.setdefault(missing, []).append(entry)
-                continue
-            if id(action) not in seen:
-                seen.add(id(action))
-                possible.append(action)
-            if (literal.atom in init) is not literal.value and literal not in levels:
-                reached[literal] = None
+            action, term, made = entry
+            for literal in term:
+                if (literal[0] in init) is not literal[1] and literal not in levels:
+                    waiting.setdefault(literal, []).append(entry)
+                    break
+            else:
+                earliest.setdefault(action, level)
+                for literal in made:
+                    if (literal[0] in init) is not literal[1] and literal not in levels:
+                        reached[literal] = None
         ready = []
         for literal in reached:
             levels[literal] = level
         for literal in reached:
-            ready.extend(pending.pop(literal, ()))
-    return possible, levels
+            ready.extend(waiting.pop(literal, ()))
+    return earliest, levels
+
+
+def _by_condition(action: GroundAction) -> Iterable[tuple[frozenset[Literal], list[Literal]]]:
+    """An action's effects, those of one condition together."""
+    made: dict[frozenset[Literal], list[Literal]] = {}
+    for effect in action.effects:
+        made.setdefault(effect.condition, []).append(effect.literal)
+    return made.items()
+
+
+def _lags(actions: Sequence[GroundAction], goals: Iterable[Literal]) -> dict[GroundAction, int]:
+    """How many stages must follow each action at least: whoever makes no goal must be followed by who needs it."""
+    makers: dict[Literal, list[GroundAction]] = {}
+    for action in actions:
+        for effect in action.effects:
+            makers.setdefault(effect.literal, []).append(action)
+    lags: dict[GroundAction, int] = {}
+    wanted = dict.fromkeys(goals)
+    seen = set(wanted)
+    lag = 0
+    while wanted:
+        fresh = [action for literal in wanted for action in makers.get(literal, ()) if action not in lags]
+        lags.update((action, lag) for action in fresh)
+        wanted = {}
+        for action in fresh:
+            wanted.update(dict.fromkeys(literal for literal in action.needs if literal not in seen))
+            for effect in action.effects:
+                for atom, _ in effect.condition:
+                    both = (Literal(atom, True), Literal(atom, False))
+                    wanted.update(dict.fromkeys(literal for literal in both if literal not in seen))
+        seen |= wanted.keys()
+        lag += 1
+    return lags
 
 
 def _relevant(
@@ -103,7 +144,7 @@ def _relevant(
     needed: set[Literal] = set()
     broken: set[Literal] = set()
     sought: set[Literal] = set()
-    chosen: dict[int, GroundAction] = {}
+    chosen: set[GroundAction] = set()
     queue: list[Literal] = []
 
     def seek(literal: Literal) -> None:
@@ -122,9 +163,9 @@ def _relevant(
     while queue:
         budget.check()
         for action in makers.get(queue.pop(), ()):
-            if id(action) in chosen:
+            if action in chosen:
                 continue
-            chosen[id(action)] = action
+            chosen.add(action)
             for literal in action.needs:
                 need(literal)
             for effect in action.effects:
@@ -135,7 +176,7 @@ def _relevant(
                 opposite = Literal(effect.literal.atom, not effect.literal.value)
                 broken.add(opposite)
                 seek(opposite)
-    return tuple(action for action in actions if id(action) in chosen)
+    return tuple(action for action in actions if action in chosen)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,12 +210,13 @@ def parts(task: Task) -> list[tuple[list[GroundAction], tuple[Literal, ...]]]:
             atom = parent[atom]
         return atom
 
-    for action in task.actions:
+    actions = [one.action for one in task.useful]
+    for action in actions:
         first, *rest = atoms(action)
         for atom in rest:
             parent[root(atom)] = root(first)
     groups: dict[Atom, tuple[list[GroundAction], list[Literal]]] = {}
-    for action in task.actions:
+    for action in actions:
         groups.setdefault(root(atoms(action)[0]), ([], []))[0].append(action)
     for goal in task.goals:
         groups.setdefault(root(goal.atom), ([], []))[1].append(goal)

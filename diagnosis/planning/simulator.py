@@ -38,6 +38,7 @@ class Simulator:
         self.problem = problem
         self.state = set(problem.init)
         self._world = World.of(problem)
+        self._actions = {action.name: action for action in problem.domain.actions}
 
     def missing(self, step: Step) -> str:
         """Why the step cannot be done now; empty if it can be. Raises InvalidPlan: there is no such step."""
@@ -53,11 +54,15 @@ class Simulator:
         missing = self.missing(step)
         if missing:
             raise InvalidPlan(str(step), missing)
-        fired = list(self.effects(step))
-        before = set(self.state)
-        self.state -= {literal.atom for literal in fired if not literal.value}
-        self.state |= {literal.atom for literal in fired if literal.value}
-        return frozenset(Literal(atom, atom in self.state) for atom in before ^ self.state)
+        return self.put(self.effects(step))
+
+    def put(self, literals: Iterable[Literal]) -> frozenset[Literal]:
+        """Make these so (what is made both true and false becomes true), and say what that has changed."""
+        made = list(literals)
+        before = {atom for atom, _ in made if atom in self.state}
+        self.state -= {atom for atom, value in made if not value}
+        self.state |= {atom for atom, value in made if value}
+        return frozenset(Literal(atom, atom in self.state) for atom, _ in made if (atom in before) is not (atom in self.state))
 
     def effects(self, step: Step) -> list[Literal]:
         """What would be so if the step were done now."""
@@ -133,10 +138,9 @@ class Simulator:
                 return "" if self.holds(formula, bound) else "its precondition is not met"
 
     def _bind(self, step: Step) -> tuple[Action, Binding]:
-        try:
-            action = self.problem.domain.action(step.action)
-        except PlanningError as error:
-            raise InvalidPlan(str(step), error.problem) from error
+        action = self._actions.get(step.action)
+        if action is None:
+            raise InvalidPlan(str(step), f"there is no action {step.action}")
         if len(step.args) != len(action.parameters):
             raise InvalidPlan(str(step), f"{step.action} takes {len(action.parameters)} objects")
         for variable, name in zip(action.parameters, step.args, strict=True):
@@ -154,17 +158,18 @@ def check_plan(problem: Problem, plan: Plan) -> Simulator:
     """
     simulator = Simulator(problem)
     for stage in plan.stages:
-        _check_stage(simulator, stage)
-        for step in stage:
-            simulator.do(step)
+        simulator.put(_check_stage(simulator, stage))
     unmet = [goal for goal in simulator.unmet() if goal not in plan.unmet]
     if unmet:
         raise InvalidPlan("plan", f"it ends without {', '.join(map(str, unmet))}")
     return simulator
 
 
-def _check_stage(simulator: Simulator, stage: Iterable[Step]) -> None:
-    """All can be done now, and none writes what another reads or writes otherwise: then any order is as good."""
+def _check_stage(simulator: Simulator, stage: Iterable[Step]) -> list[Literal]:
+    """What the stage makes so. All of it can be done now, and no step writes what another reads or writes otherwise.
+
+    Then any order is as good, and leads to the same.
+    """
     steps = list(stage)
     written: dict[Literal, list[Step]] = {}
     for step in steps:
@@ -183,3 +188,4 @@ def _check_stage(simulator: Simulator, stage: Iterable[Step]) -> None:
             for other in written.get(Literal(atom, atom not in simulator.state), ()):
                 if other != step:
                     raise InvalidPlan(str(step), f"{other} changes {Literal(atom)} in the same stage")
+    return list(written)

@@ -12,30 +12,26 @@ from typing import Any, Final
 from .answers import Budget, Outcome, OutOfTime, Plan, TimedOut, Unsolvable
 from .grounding import GroundAction, Grounder, changing_part
 from .language import Atom, Literal, Problem
-from .ordering import stages
-from .relevance import Proof, Task, cut_down, prove_unsolvable
+from .ordering import disturbances, stages
+from .relevance import Proof, Task, Useful, cut_down, prove_unsolvable
 
 PROGRAM: Final = """
-time(1..horizon).
-{ does(A,T) } :- act(A,_), time(T).
+{ does(A,First..horizon-After) } :- act(A,_,First,After).
 true(F,0) :- init(F).
 :- does(A,T), needs(A,F), not true(F,T-1).
 :- does(A,T), excludes(A,F), true(F,T-1).
-fails(A,E,T) :- if(A,E,F), time(T), not true(F,T-1).
-fails(A,E,T) :- unless(A,E,F), time(T), true(F,T-1).
-makes(F,T) :- does(A,T), adds(A,E,F), not fails(A,E,T).
-ends(F,T) :- does(A,T), deletes(A,E,F), not fails(A,E,T).
+makes(F,T) :- does(A,T), adds(A,F).
+ends(F,T) :- does(A,T), deletes(A,F).
+fails(A,E,T) :- does(A,T), if(A,E,F), not true(F,T-1).
+fails(A,E,T) :- does(A,T), unless(A,E,F), true(F,T-1).
+makes(F,T) :- does(A,T), may_add(A,E,F), not fails(A,E,T).
+ends(F,T) :- does(A,T), may_delete(A,E,F), not fails(A,E,T).
 true(F,T) :- makes(F,T).
-true(F,T) :- true(F,T-1), time(T), not ends(F,T).
+true(F,T) :- true(F,T-1), T <= horizon, not ends(F,T).
 :- goal(F), not true(F,horizon).
 :- avoid(F), true(F,horizon).
-disturbs(A,B) :- deletes(A,_,F), needs(B,F), A != B.
-disturbs(A,B) :- adds(A,_,F), excludes(B,F), A != B.
-disturbs(A,B) :- adds(A,_,F), deletes(B,_,F), A != B.
-disturbs(A,B) :- adds(A,_,F), asks(B,F), A != B.
-disturbs(A,B) :- deletes(A,_,F), asks(B,F), A != B.
 :- disturbs(A,B), does(A,T), does(B,T).
-#minimize { C,A,T : does(A,T), act(A,C) }.
+#minimize { C,A,T : does(A,T), act(A,C,_,_) }.
 #show does/2.
 """
 
@@ -73,13 +69,13 @@ class ClingoPlanner:
     def _search(self, task: Task, budget: Budget) -> Outcome:
         if not task.least:
             return Plan(())
-        facts = "".join(_facts(task))
         for horizon in range(task.least, self._longest + 1):
             budget.check()
-            found = _solve(facts, horizon, budget)
+            actions = [one for one in task.useful if one.earliest + one.after <= horizon]
+            found = _solve("".join(_facts(task, actions)), horizon, budget)
             if found is not None:
-                sequence, is_optimal = [task.actions[index] for index in found[0]], found[1]
-                return self._plan(sequence, is_optimal)
+                sequence, is_optimal = found
+                return self._plan([actions[index].action for index in sequence], is_optimal)
             if horizon == task.least:
                 # The bound says that so many stages suffice if nothing is in the way: now it is time to doubt.
                 proof = prove_unsolvable(task, budget)
@@ -111,26 +107,31 @@ def _false_for_ever(problem: Problem) -> Iterator[Literal]:
             yield goal
 
 
-def _facts(task: Task) -> Iterator[str]:
+def _facts(task: Task, useful: Sequence[Useful]) -> Iterator[str]:
     """The task as facts of the program, with numbers for actions, effects and atoms."""
     number: dict[Atom, int] = {}
 
     def of(atom: Atom) -> int:
         return number.setdefault(atom, len(number))
 
-    for index, action in enumerate(task.actions):
-        yield f"act({index},{action.cost})."
-        for atom, value in action.needs:
+    for index, one in enumerate(useful):
+        yield f"act({index},{one.action.cost},{one.earliest},{one.after})."
+        for atom, value in one.action.needs:
             yield f"{'needs' if value else 'excludes'}({index},{of(atom)})."
-        for place, effect in enumerate(action.effects):
+        for place, effect in enumerate(one.action.effects):
             atom, value = effect.literal
-            yield f"{'adds' if value else 'deletes'}({index},{place},{of(atom)})."
+            if not effect.condition:
+                yield f"{'adds' if value else 'deletes'}({index},{of(atom)})."
+                continue
+            yield f"{'may_add' if value else 'may_delete'}({index},{place},{of(atom)})."
             for asked, wanted in effect.condition:
-                yield f"{'if' if wanted else 'unless'}({index},{place},{of(asked)}).asks({index},{of(asked)})."
+                yield f"{'if' if wanted else 'unless'}({index},{place},{of(asked)})."
     for goal in task.goals:
         yield f"{'goal' if goal.value else 'avoid'}({of(goal.atom)})."
     for atom in sorted(task.init & number.keys()):
         yield f"init({number[atom]})."
+    for a, b in disturbances([one.action for one in useful]):
+        yield f"disturbs({a},{b})."
 
 
 def _solve(facts: str, horizon: int, budget: Budget) -> tuple[list[int], bool] | None:
