@@ -6,11 +6,11 @@ diagnosis by `repair_problem`, or read from PDDL. `find_plan` asks a `Planner` i
 
 from .answers import Budget, Outcome, Plan, Planner, Step, TimedOut, Unsolvable
 from .finding import find_plan
-from .stable import ClingoPlanner
 from .language import Domain, PlanningError, Problem
 from .reading import read_domain, read_problem, with_actions
 from .repair import repair_domain, repair_problem
 from .simulator import InvalidPlan, Simulator, check_plan
+from .stable import ClingoPlanner
 
 __all__ = [
     "Budget",

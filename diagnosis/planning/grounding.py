@@ -120,9 +120,7 @@ def _ground_action(world: World, action: Action, budget: Budget) -> Iterator[Gro
                 yield GroundAction(step, needs, effects, action.cost)
 
 
-def _effects(
-    world: World, conditions: Conditions, effects: Iterable[Effect], bound: Binding
-) -> Iterator[GroundEffect]:
+def _effects(world: World, conditions: Conditions, effects: Iterable[Effect], bound: Binding) -> Iterator[GroundEffect]:
     made: dict[tuple[Term, Literal], None] = {}
     for effect in effects:
         for inner in world.instances(ForAll(effect.variables, Or((Not(effect.condition),))), bound):

@@ -77,8 +77,8 @@ def stages(sequence: Sequence[GroundAction], late: Collection[str] = ()) -> list
     for index in reversed(range(len(sequence))):
         if sequence[index].step.action in late:
             level[index] = limit[index]
-        for earlier in before[index]:
-            limit[earlier] = min(limit[earlier], level[index] - 1)
+        for one in before[index]:
+            limit[one] = min(limit[one], level[index] - 1)
     made: list[list[GroundAction]] = [[] for _ in range(last + 1)]
     for index, action in enumerate(sequence):
         made[level[index]].append(action)

@@ -153,6 +153,11 @@ def _parse(parser: Any, text: str, what: str) -> Any:
         return parser()(text)
     except RecursionError as error:
         raise PlanningError(what, "its forms are nested too deeply") from error
+    except (TypeError, AttributeError) as error:
+        # The library trips over an action that leaves out a part, which PDDL allows.
+        raise PlanningError(
+            what, "it cannot be read: an action needs :parameters, :precondition and :effect"
+        ) from error
     except Exception as error:  # The library raises what its parser and its checks happen to raise: all mean the text.
         raise PlanningError(what, " ".join(str(error).split())[:500] or type(error).__name__) from error
 

@@ -9,9 +9,9 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
-from .answers import Budget, OutOfTime
-from .grounding import GroundAction, holds
-from .language import Atom, Literal
+from .answers import Budget, OutOfTime, Unsolvable
+from .grounding import GroundAction, changing_part, holds
+from .language import Atom, Literal, Problem
 
 State: TypeAlias = frozenset[Atom]
 
@@ -50,6 +50,21 @@ class Task:
     least: int
 
 
+def task_of(problem: Problem, actions: Sequence[GroundAction], budget: Budget) -> Task:
+    """The task of a problem, whose ground actions these are. Raises OutOfTime."""
+    changing = problem.domain.changing()
+    fixed = [goal for goal in problem.goals if goal.atom[0] not in changing]
+    hopeless = tuple(goal for goal in fixed if (goal.atom in problem.init) is not goal.value)
+    goals = tuple(goal for goal in problem.goals if goal.atom[0] in changing)
+    task = cut_down(actions, changing_part(problem.domain, problem.init), goals, budget)
+    return dataclasses.replace(task, hopeless=(*hopeless, *task.hopeless))
+
+
+def hopeless(task: Task) -> Unsolvable:
+    """The answer to a task with hopeless goals."""
+    return Unsolvable(task.hopeless, True, "no action brings them about, whatever is done before")
+
+
 def cut_down(actions: Sequence[GroundAction], init: State, goals: tuple[Literal, ...], budget: Budget) -> Task:
     """Keep the actions that can be reached and that matter. Raises OutOfTime."""
     earliest, levels = _reached(actions, init, budget)
@@ -75,7 +90,9 @@ def _reached(
     earliest: dict[GroundAction, int] = {}
     levels: dict[Literal, int] = {}
     waiting: dict[Literal, list[tuple[GroundAction, frozenset[Literal], list[Literal]]]] = {}
-    ready = [(action, action.needs | condition, made) for action in actions for condition, made in _by_condition(action)]
+    ready = [
+        (action, action.needs | condition, made) for action in actions for condition, made in _by_condition(action)
+    ]
     level = 0
     while ready:
         budget.check()

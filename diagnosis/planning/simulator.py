@@ -62,7 +62,9 @@ class Simulator:
         before = {atom for atom, _ in made if atom in self.state}
         self.state -= {atom for atom, value in made if not value}
         self.state |= {atom for atom, value in made if value}
-        return frozenset(Literal(atom, atom in self.state) for atom, _ in made if (atom in before) is not (atom in self.state))
+        return frozenset(
+            Literal(atom, atom in self.state) for atom, _ in made if (atom in before) is not (atom in self.state)
+        )
 
     def effects(self, step: Step) -> list[Literal]:
         """What would be so if the step were done now."""

@@ -10,10 +10,10 @@ from collections.abc import Collection, Iterator, Sequence
 from typing import Any, Final
 
 from .answers import Budget, Outcome, OutOfTime, Plan, TimedOut, Unsolvable
-from .grounding import GroundAction, Grounder, changing_part
-from .language import Atom, Literal, Problem
+from .grounding import GroundAction, Grounder
+from .language import Atom, Problem
 from .ordering import disturbances, stages
-from .relevance import Proof, Task, Useful, cut_down, prove_unsolvable
+from .relevance import Proof, Task, Useful, hopeless, prove_unsolvable, task_of
 
 PROGRAM: Final = """
 { does(A,First..horizon-After) } :- act(A,_,First,After).
@@ -58,10 +58,9 @@ class ClingoPlanner:
         """See `Planner.solve`."""
         try:
             actions = self._grounder.ground(problem, budget)
-            task = cut_down(actions, changing_part(problem.domain, problem.init), _changing_goals(problem), budget)
-            hopeless = (*_false_for_ever(problem), *task.hopeless)
-            if hopeless:
-                return Unsolvable(hopeless, True, "no action brings them about, whatever is done before")
+            task = task_of(problem, actions, budget)
+            if task.hopeless:
+                return hopeless(task)
             return self._search(task, budget)
         except OutOfTime:
             return TimedOut(budget.seconds)
@@ -92,19 +91,6 @@ def _unsolvable(proof: Proof) -> Unsolvable:
     if proof.is_each:
         return Unsolvable(proof.goals, True, "they are met in no state that can be reached")
     return Unsolvable(proof.goals, False, "they are met together in no state that can be reached")
-
-
-def _changing_goals(problem: Problem) -> tuple[Literal, ...]:
-    changing = problem.domain.changing()
-    return tuple(goal for goal in problem.goals if goal.atom[0] in changing)
-
-
-def _false_for_ever(problem: Problem) -> Iterator[Literal]:
-    """Goals about what no action changes, that are not so."""
-    changing = problem.domain.changing()
-    for goal in problem.goals:
-        if goal.atom[0] not in changing and (goal.atom in problem.init) is not goal.value:
-            yield goal
 
 
 def _facts(task: Task, useful: Sequence[Useful]) -> Iterator[str]:
