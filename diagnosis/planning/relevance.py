@@ -166,10 +166,11 @@ def _relevant(
 
     def seek(literal: Literal) -> None:
         """Literals that are needed and not simply there from the beginning to the end."""
-        if literal in needed and literal not in sought:
-            if (literal.atom in init) is not literal.value or literal in broken:
-                sought.add(literal)
-                queue.append(literal)
+        if literal not in needed or literal in sought:
+            return
+        if (literal.atom in init) is not literal.value or literal in broken:
+            sought.add(literal)
+            queue.append(literal)
 
     def need(literal: Literal) -> None:
         needed.add(literal)

@@ -28,7 +28,8 @@ def repair_domain(*actions: str) -> Domain:
     Raises:
         PlanningError: an action's text is not valid, or there is such an action already.
 
-    >>> reset = "(:action reset_usb :parameters (?d - device) :precondition (bad ?d) :effect (and (good ?d) (not (bad ?d))))"
+    >>> effect = ":effect (and (good ?d) (not (bad ?d)))"
+    >>> reset = f"(:action reset_usb :parameters (?d - device) :precondition (bad ?d) {effect})"
     >>> [action.name for action in repair_domain(reset).actions]
     ['power_up', 'reset_usb', 'shutdown', 'start_node', 'stop_node']
     """

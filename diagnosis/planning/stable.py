@@ -36,7 +36,7 @@ true(F,T) :- true(F,T-1), T <= horizon, not ends(F,T).
 """
 
 OPTIONS: Final = ("--opt-strategy=usc", "--heuristic=Domain", "--dom-mod=5,16", "--warn=none")
-"""Plain branch and bound takes seconds where this takes milliseconds: preferring to do nothing is nearly always right."""
+"""Plain branch and bound takes seconds where this takes milliseconds: to do nothing is nearly always right."""
 SLICE: Final = 0.05
 """Seconds after which a cancelled budget is noticed."""
 

@@ -106,10 +106,13 @@ class World:
 
     def instances(self, formula: ForAll | Exists, bound: Binding) -> Iterator[Binding]:
         """The bindings that matter to a quantifier: for the others its body is true (forall) or false (exists)."""
+        if not formula.variables:
+            yield bound
+            return
         guards = self.guards(formula.of) if isinstance(formula, Exists) else self._excuses(formula.of)
         # What a quantifier binds hides what is bound outside.
         inner = {name: value for name, value in bound.items() if name not in {v.name for v in formula.variables}}
-        return self.bindings(formula.variables, [fill(guard, inner) for guard in guards], inner)
+        yield from self.bindings(formula.variables, [fill(guard, inner) for guard in guards], inner)
 
     def _excuses(self, formula: Formula) -> list[Atom]:
         """Static facts without any one of which the formula is true."""

@@ -167,7 +167,7 @@ async def test_a_planner_that_ignores_its_time_is_left_alone(monkeypatch: pytest
     ids=["order", "type", "action", "arguments", "goal", "twice", "stage"],
 )
 async def test_a_wrong_plan_is_not_handed_out(plan: Plan, why: str) -> None:
-    # T59: power_up of a node, start_node of hardware, and starts before the hardware are what the paper's domain allows.
+    # T59: to power up a node, or start one before its hardware, is what the paper's own domain allows.
     with pytest.raises(InvalidPlan) as raised:
         await find_plan(Answers(lambda problem, budget: plan), power_up())
     assert why in str(raised.value)
