@@ -195,7 +195,9 @@ class Board:
 
     def _check_open(self) -> None:
         if self._keeper is None or self._keeper.done():
-            raise BoardUnreachable(self.url, "it is closed" if self._keeper else "enter it first: async with Board(...)")
+            raise BoardUnreachable(
+                self.url, "it is closed" if self._keeper else "enter it first: async with Board(...)"
+            )
 
     async def _ask(self, request: Request, kind: type[A]) -> A:
         try:

@@ -131,6 +131,11 @@ KINDS: Final[dict[int, type[Frame]]] = {
     0x83: Done,
     0x84: Refused,
 }
+EMPTY: Final[dict[type[Frame], Frame]] = {
+    AskSpecification: AskSpecification(),
+    AskMeasurements: AskMeasurements(),
+    Done: Done(),
+}
 NUMBERS: Final = {kind: number for number, kind in KINDS.items()}
 
 _SWITCH = struct.Struct("!BB")
@@ -259,7 +264,7 @@ def _frame(kind: type[Frame], body: bytes) -> Frame:
         return Measurements(_UPTIME.unpack_from(body)[0], channels)
     if kind is Refused:
         return Refused(body.decode())
-    return kind()
+    return EMPTY[kind]
 
 
 def _specification(body: bytes) -> Specification:

@@ -133,4 +133,3 @@ class SimulatedBoard:
 def _held(value: float) -> int:
     """Whole, and no more than a frame can hold."""
     return round(min(max(value, -MOST), MOST))
-

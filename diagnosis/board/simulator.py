@@ -1,4 +1,4 @@
-"""A board as an actor: it serves the real protocol on the loopback, and fails in the ways a board fails, when told to."""
+"""A board as an actor: it serves the real protocol on the loopback, and fails as a board does, when told to."""
 
 from __future__ import annotations
 

@@ -94,7 +94,7 @@ class Budget:
 class Planner(Protocol):
     """Finds plans. Called in a worker thread, perhaps in several at a time."""
 
-    def solve(self, problem: Problem, budget: Budget) -> Outcome:
+    def solve(self, problem: Problem, budget: Budget, /) -> Outcome:
         """A plan for all goals, the proof that there is none, or neither in time.
 
         It looks at the budget often enough to end soon after it: a thread cannot be stopped from outside.

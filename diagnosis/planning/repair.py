@@ -19,7 +19,7 @@ from .reading import read_domain, with_actions
 @functools.cache
 def repair_text() -> str:
     """The PDDL text of the domain that comes with holdfast."""
-    return files(__package__).joinpath("repair.pddl").read_text("utf-8")
+    return files(__name__.rpartition(".")[0]).joinpath("repair.pddl").read_text("utf-8")
 
 
 def repair_domain(*actions: str) -> Domain:

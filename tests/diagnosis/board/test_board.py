@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from zlib import crc32
 
 import pytest
 
@@ -74,7 +75,15 @@ async def test_a_board_says_what_it_is(simulator: hf.ActorRef[BoardSimulator]) -
     async with await client(simulator) as board:
         specification = await board.specification()
     names = [channel.name for channel in specification.channels]
-    assert names[:7] == ["robot base", "PC", "sensor pan-tilt unit", "laser alignment", "thermal camera", "LRF", "Kinect"]
+    assert names[:7] == [
+        "robot base",
+        "PC",
+        "sensor pan-tilt unit",
+        "laser alignment",
+        "thermal camera",
+        "LRF",
+        "Kinect",
+    ]
     assert len(names) == 10
     assert specification.defaults == {PC}
     assert specification.channels[BASE].millivolts == 24_000
@@ -281,8 +290,6 @@ async def spoken_to(simulator: hf.ActorRef[BoardSimulator], *pieces: bytes) -> t
 async def test_a_bad_frame_is_refused_and_the_connection_lives(simulator: hf.ActorRef[BoardSimulator]) -> None:
     wrong = bytearray(encode(5, Switch(9, True)))
     wrong[HEAD.size] = 10
-    from zlib import crc32
-
     wrong[-4:] = crc32(wrong[:-4]).to_bytes(4, "big")
     heard, is_over = await spoken_to(simulator, bytes(wrong), encode(6, Refused("no")), encode(99, AskMeasurements()))
     assert not is_over
@@ -336,7 +343,11 @@ async def test_simulated_devices_hear_of_their_power(system: hf.ActorSystem) -> 
         await board.switch(0, True)
         await board.switch(1, False)
         await board.measure()
-    for said in (ChannelSwitched(1, "hokuyo", True), ChannelSwitched(0, "jaguar", True), ChannelSwitched(1, "hokuyo", False)):
+    for said in (
+        ChannelSwitched(1, "hokuyo", True),
+        ChannelSwitched(0, "jaguar", True),
+        ChannelSwitched(1, "hokuyo", False),
+    ):
         assert (await devices.expect(ChannelSwitched)) == said
 
 
