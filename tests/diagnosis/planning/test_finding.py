@@ -214,3 +214,37 @@ async def test_virtual_time_stands_still_while_a_plan_is_made() -> None:
     began = loop.time()
     assert isinstance(await find_plan(ClingoPlanner(), power_up(), timeout=60), Plan)
     assert loop.time() == began
+
+
+DOORS = """
+(define (domain doors) (:requirements :adl :typing)
+  (:types thing - object)
+  (:predicates (power) (lit ?t - thing) (armed) (safe) (done) (gone))
+  (:action light :parameters (?t - thing) :precondition (power) :effect (and (lit ?t) (not (power))))
+  (:action recharge :parameters () :precondition (not (power)) :effect (power))
+  (:action use :parameters () :precondition (power) :effect (done))
+  (:action cut :parameters () :precondition (and) :effect (not (power)))
+  (:action disarm :parameters () :precondition (armed) :effect (not (armed)))
+  (:action go :parameters () :precondition (and) :effect (and (gone) (when (armed) (not (safe))))))
+"""
+
+
+@pytest.mark.parametrize(
+    ("init", "goal", "stages"),
+    [
+        ("(power)", "(and (lit a) (lit b))", [{"light(a)", "light(b)"}, {"recharge()"}, {"light(a)", "light(b)"}]),
+        ("(safe) (armed)", "(and (gone) (safe))", [{"disarm()"}, {"go()"}]),
+        ("(power) (safe) (armed)", "(and (done) (safe) (not (power)))", [{"use()"}, {"cut()"}]),
+    ],
+    ids=[
+        "what is used up is brought back",
+        "what would do harm is prevented",
+        "what is needed is not taken away first",
+    ],
+)
+async def test_what_an_action_takes_away_is_reckoned_with(init: str, goal: str, stages: list[set[str]]) -> None:
+    text = f"(define (problem p) (:domain doors) (:objects a b - thing) (:init {init}) (:goal {goal}))"
+    plan = await find_plan(ClingoPlanner(), read_problem(read_domain(DOORS), text))
+    made = told(plan)
+    assert [len(stage) for stage in made] == [1] * len(stages)
+    assert all(set(stage) <= allowed for stage, allowed in zip(made, stages, strict=True))
