@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any
 
 from ..actors.cell import GONE, RUNNING, Cell
 from ..actors.errors import HoldfastError, StartFailed, StartIgnored
 from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
+from .admission import Admission
 from .bound import HomeBound
+from .commits import Commits, Unkept
+from .inputs import HomeJournal
 from .journal import Journal
-from .method import Method
+from .method import Durability, Method
 from .rollback import roll_back
 from .switch import Switch
 
@@ -29,8 +32,12 @@ ERASING = "erasing"
 class Homes:
     """All recorded addresses of a root, and their journal. A home stays when its actor is stopped."""
 
-    def __init__(self, node: Node, journal: Journal) -> None:
-        self.node, self.journal = node, journal
+    def __init__(self, node: Node, journal: Journal, *, durability: Durability | None = None) -> None:
+        self.node = node
+        self.journal = Commits(
+            journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}"
+        )
+        self._unkept = Unkept(self.journal)
         self._switches: dict[str, Switch] = {}
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
@@ -43,9 +50,11 @@ class Homes:
         """The home of an address; taken up from the store when it is first asked for."""
         switch = self._switches.get(cell.path)
         if switch is None:
-            switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self.journal)
+            switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self._journal_of(method))
         self.absolve(cell.path)
         switch.method = method
+        if switch.journal.durable:
+            self.journal.want(cell.path, method.durability)
         switch.cell = cell
         more = cell.extra()
         if more.bound is not None:
@@ -53,6 +62,17 @@ class Homes:
         cell.admit = switch.admit
         more.outlet = switch
         return switch
+
+    def _journal_of(self, method: Method) -> HomeJournal:
+        """Where what happens at an address is kept, from its first life on."""
+        wanted = method.durability or self.journal.durability
+        return self._unkept if self.journal.durable and wanted == "memory" else self.journal
+
+    def refuses(self, method: Method) -> str:
+        """Why this method cannot work here; "" if it can."""
+        if method.durability in ("os", "fsync") and not self.journal.durable:
+            return f"durability={method.durability!r} needs a store: ActorSystem(store='sqlite:PATH')"
+        return ""
 
     def find(self, path: str) -> Cell | None:
         """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
@@ -132,6 +152,10 @@ class Homes:
         """The facts whose keys begin so, oldest first."""
         return self.journal.notes(prefix)
 
+    async def settled(self) -> None:
+        """Wait until everything that was submitted has taken effect."""
+        await self.journal.settled()
+
     def close(self) -> None:
         """Close the store."""
         self.journal.close()
@@ -200,6 +224,14 @@ class HomeHost:
         if switch.live is not None and not switch.live.done():
             switch.live.set_exception(StartFailed(cell.path, why))
             switch.live.exception()  # Nobody may be left to look.
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        """Admit a message for a sender that waits until it counts."""
+        commits = self.homes.journal
+        before = commits.submitted
+        cell.admit(cell, item)
+        last = commits.last if commits.submitted != before else None
+        return last.accepted() if isinstance(last, Admission) else None
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""

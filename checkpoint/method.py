@@ -22,6 +22,7 @@ class Method:
     journal_limit: int = 256_000_000
     keep: int = 2
     on_escalate: OnEscalate | None = None
+    durability: Durability | None = None
 
     def after_escalation(self, times: int) -> OnEscalate:
         """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
@@ -61,6 +62,7 @@ def hybrid(
     journal_limit: int = 256_000_000,
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
+    durability: Durability | None = None,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -74,6 +76,8 @@ def hybrid(
             is; go back to the "older_snapshot", without the turns since; begin "fresh". In all cases what has not been
             handled stays queued. Left out: an older snapshot the second time within the window of whoever restarted
             the supervisor, else restore.
+        durability: what an admission, and with it a reply, outlives when it is told of: "memory" any process but the
+            root, "os" the root too, "fsync" the machine. The last two need a store, whose own setting is the default.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -91,4 +95,7 @@ def hybrid(
     if on_escalate is not None and on_escalate not in get_args(OnEscalate):
         known = ", ".join(map(repr, get_args(OnEscalate)))
         raise SpecError("hybrid", f"on_escalate must be one of {known} or left out, not {on_escalate!r}")
-    return Method("hybrid", float(interval), max_deliveries, journal_limit, int(keep), on_escalate)
+    if durability is not None and durability not in get_args(Durability):
+        known = ", ".join(map(repr, get_args(Durability)))
+        raise SpecError("hybrid", f"durability must be one of {known} or left out, not {durability!r}")
+    return Method("hybrid", float(interval), max_deliveries, journal_limit, int(keep), on_escalate, durability)

@@ -48,13 +48,27 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
         HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
     """
     turn, older = record.turn, home.newest
-    meta = Meta(
-        FORMAT, turn, home.next_id, record.stash, home.timers.saved(), list(home.topics), home.journal.epoch, state,
-        turn,
-    )  # fmt: skip
+    timers, topics = outlasting(home)
+    meta = Meta(FORMAT, turn, home.next_id, record.stash, timers, topics, home.journal.epoch, state, turn)
     put(home, meta, home.method.keep)
     # In a store that lasts it is read back when it is wanted.
     home.older = older if home.method.keep > 1 and not home.journal.durable else None
+
+
+def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:
+    """Timers and topics as they are after the last turn, though some of it may not have taken effect yet."""
+    timers, topics = home.timers.saved(), dict(home.topics)
+    for out in home.outputs.kept:
+        match out.verb:
+            case "timer":
+                timers[out.to] = (out.name, out.body, out.seconds, out.interval)
+            case "cancel":
+                timers.pop(out.to, None)
+            case "subscribe":
+                topics[out.to] = None
+            case _:
+                topics.pop(out.to, None)
+    return timers, list(topics)
 
 
 def put(home: Switch, meta: Meta, keep: int) -> None:
@@ -65,7 +79,9 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
     """
     covered = [number for number in home.turns if number <= meta.turn]
     if home.journal.durable:
-        drop = [*home.dropped, *(position for number in covered for position in home.positions.get(number, ()))]
+        home.journal.barrier()  # From here on it is known where everything stands.
+        drop = [*(position for known in home.dropped for position in known)]
+        drop += [*(position for number in covered for position in home.positions.get(number, ()))]
         for number in covered:
             source = home.turns[number].input
             if source.id not in home.open:  # Else it is stashed, and not handled yet.
@@ -133,7 +149,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             home.calls.outcomes[turn, k] = Answer(kind, name, body)
         case ("drop", key):
             dropped = home.open.pop(key, None)
-            home.dropped.extend((*(dropped.positions if dropped is not None else ()), position))
+            home.dropped += ([] if dropped is None else dropped.positions, [position])
         case ("op", turn, verb, key, name, body, seconds, interval):
             home.positions_of(turn).append(position)
             match verb:

@@ -27,11 +27,11 @@ from ..actors.events import RecoveryFailed, SnapshotFailed, SnapshotTaken
 from ..actors.exits import pack_exit
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
+from .admission import Admission
 from .asks import Calls, SwitchAsk, answer_ask
 from .bound import HomeBound
 from .ends import Ends
-from .inputs import OVERHEAD, Batch, Input, Turn
-from .journal import Journal
+from .inputs import OVERHEAD, Batch, HomeJournal, Input, Turn
 from .limit import Limit
 from .method import Method
 from .outputs import Outputs
@@ -83,7 +83,7 @@ class LifePort(Protocol):
 class Switch:
     """The home of one recorded actor."""
 
-    def __init__(self, node: Node, path: str, method: Method, journal: Journal) -> None:
+    def __init__(self, node: Node, path: str, method: Method, journal: HomeJournal) -> None:
         self.node, self.path, self.method, self.journal = node, path, method, journal
         self.cell: Cell | None = None
         self.port: LifePort | None = None
@@ -115,7 +115,7 @@ class Switch:
         self.bytes = 0
         self._incoming: list[bytes] = []
         self.positions: dict[int, list[int]] = {}  # in the journal, of what belongs to a turn besides its input
-        self.dropped: list[int] = []  # the same of inputs that ended without a turn
+        self.dropped: list[list[int]] = []  # the same of inputs that ended without a turn
         self._replay_k = 0
         self._replay_turn = -1
         load(self)
@@ -147,7 +147,13 @@ class Switch:
 
     def take(self, ask: Ask | None, name: str, body: bytes, sender: str | None) -> None:
         """Admit a message for which there is room."""
-        source = self.record(MESSAGE, name, body, sender)
+        try:
+            source = self.record(MESSAGE, name, body, sender)
+        except HoldfastError as error:  # The store has no room, or has failed.
+            if ask is None:
+                raise
+            ask.fail(error)
+            return
         if ask is not None:
             source.ask, source.chain = ask, ask.chain
             ask.started = True
@@ -182,15 +188,54 @@ class Switch:
             self.bound.added(source)
         if self.journal.durable:
             entry = ("in", key, kind, name, body, source.time, sender, origin)
-            source.positions = []
+            source.positions, source.held = [], True
             if batch is not None:
                 batch.add(self.path, entry, source.positions)
+            elif kind == MESSAGE:
+                self._submit(Admission(self, source, entry), source)
             else:
-                source.positions.append(self.journal.append(((self.path, entry),))[0])
+                self.journal.submit(Admission(self, source, entry))
         return source
+
+    def _submit(self, admission: Admission, source: Input) -> None:
+        """Have an input from outside journaled, which the store may refuse."""
+        try:
+            self.journal.admit(admission)
+        except HoldfastError:
+            self._forget(source)
+            raise
+
+    def _forget(self, source: Input) -> None:
+        """An input was not admitted after all."""
+        if self.open.pop(source.id, None) is not None:
+            self.bytes -= len(source.body) + OVERHEAD
+            if self.bound is not None:
+                self.bound.ended(source)
+
+    def admitted(self, source: Input) -> None:
+        """An input is as safe now as it has to be."""
+        source.held = False
+        if source.id in self.open:
+            self.forward(source)
+
+    def take_back(self, source: Input, error: HoldfastError, *, told: bool) -> bool:
+        """The store refused an input; False if it has happened all the same. `told`: its sender hears of it."""
+        if source.kind != MESSAGE:
+            return False
+        if source.id in self.open:
+            self._forget(source)
+            ask, source.ask = source.ask, None
+            if ask is not None:
+                ask.started = False
+                ask.fail(error)
+            elif not told:
+                self.ends.lost(source.name, source.body, str(error))
+        return True
 
     def forward(self, source: Input) -> None:
         """Feed an input that is safe, unless they are held."""
+        if source.held:
+            return
         if self.is_released and self.port is not None and (self.bound is None or self.bound.may_feed(source)):
             self.port.to_life(source.feed())
 
@@ -257,6 +302,7 @@ class Switch:
         first = next((source for source in self.open.values() if source.kind == START), None)
         if self.is_new and first is None:  # Messages may have come before it.
             first = self.record(START, "", b"", None)
+            first.held = False  # Nobody waits for it, and what it leads to is safe only behind it.
         for number, turn in self.turns.items():
             if turn.status in (OK, STASHED):
                 port.to_life(turn.input.feed(number, tuple(sorted(self.pipes_done.get(number, ())))))
@@ -272,7 +318,9 @@ class Switch:
         port = self.port
         assert port is not None
         stashed = self.stashed()
-        waiting = [one for one in self.open.values() if one.kind != START and one.id not in stashed]
+        waiting = [
+            one for one in self.open.values() if one.kind != START and one.id not in stashed and not one.held
+        ]
         waiting.sort(key=lambda one: one.id != self.partial_id)
         pipes = tuple(sorted(self.pipes_done.get(self.turn + 1, ())))
         for index, source in enumerate(waiting):

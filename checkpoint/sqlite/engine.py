@@ -90,6 +90,18 @@ class SqliteJournal:
                 db.executemany("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", self._rows(packed))
                 return list(range(first, self._store.last + 1))
 
+    def sync(self) -> None:
+        """Have everything appended so far survive a power loss; see `Journal`. Appends go on meanwhile.
+
+        Raises:
+            StoreFailed: from now on everything is refused.
+        """
+        self._store.sync()
+
+    def has_failed(self) -> bool:
+        """Whether everything is refused from now on."""
+        return self._store.failure is not None
+
     def _rows(self, packed: list[tuple[str, Primitive, bytes]]) -> list[tuple[int, int, int, Primitive, bytes, int]]:
         """Give each entry its position and its place in its chain."""
         rows: list[tuple[int, int, int, Primitive, bytes, int]] = []
