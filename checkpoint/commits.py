@@ -146,7 +146,15 @@ class Commits:
             return
         if self._overdue is None:
             self._overdue = self._loop.call_later(PATIENCE_SECONDS, self._help, context=self._context)
-        self.wake_handler()
+        try:
+            self.wake_handler()
+        except HoldfastError:  # It has ended for good.
+            self.wake_handler = None
+            self._loop.call_soon(self.flush, context=self._context)
+
+    def come(self) -> None:
+        """What the message handler does when it was woken, in nobody's name."""
+        self._context.run(self.flush)
 
     def _help(self) -> None:
         """The message handler has not come: it may be between two lives."""
@@ -159,9 +167,6 @@ class Commits:
     def flush(self) -> None:
         """Write what was submitted, and let what is safe now take effect. (The message handler's work.)"""
         self._is_awake = False
-        if self._overdue is not None and not self._pending:
-            self._overdue.cancel()
-            self._overdue = None
         if self.blocked is None and (self._is_urgent or self._syncing is None):
             self._write()
         self._run()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from ..actors.cell import GONE, RUNNING, Cell
@@ -39,6 +39,7 @@ class Homes:
         )
         self._unkept = Unkept(self.journal)
         self._switches: dict[str, Switch] = {}
+        self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         unfinished = journal.notes(ERASING).get(ERASING)
@@ -51,6 +52,9 @@ class Homes:
         switch = self._switches.get(cell.path)
         if switch is None:
             switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self._journal_of(method))
+            if self.on_first is not None:
+                begin, self.on_first = self.on_first, None
+                begin()
         self.absolve(cell.path)
         switch.method = method
         if switch.journal.durable:

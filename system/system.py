@@ -37,6 +37,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .recovery import RecoveryTree
 from .script import load_script
 from .transaction.addresses import Moved
 from .transaction.transaction import Transaction, Transactions
@@ -117,6 +118,7 @@ class ActorSystem(Controls):
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
         engine = open_journal(self._store, takeover=self._takeover)
         self._homes = Homes(node, engine, durability=self._durability)
+        self._recovery = RecoveryTree(node, self._homes)
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         node.host_for = self._host_for
         self._moves = Moves(node, self._workers)

@@ -1,0 +1,1 @@
+"""The recovery parts as actors: what watches over recoveries, below `/<system>/recovery`."""

@@ -1,0 +1,23 @@
+"""What the recovery parts have in common: all that they know stands in the homes, and outlives them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...actors.actor import Actor
+
+if TYPE_CHECKING:
+    from ..homes import Homes
+
+
+class Part(Actor):
+    """One of the actors below `/<system>/recovery`.
+
+    It keeps nothing of its own: each life begins by looking at the homes. Nothing waits for it, either: what must be
+    done while it is down is done by the homes themselves.
+    """
+
+    deterministic = False
+
+    def __init__(self, homes: Homes) -> None:
+        self._homes = homes
