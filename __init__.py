@@ -47,6 +47,9 @@ from holdfast.actors.events import (
     DeadLetter,
     Event,
     EventStream,
+    JournalBlocked,
+    JournalGoesOn,
+    JournalStopped,
     LogLine,
     LoopLagged,
     MessageIn,
@@ -92,6 +95,7 @@ from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
 from holdfast.checkpoint.method import Method, fresh, hybrid
+from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -195,6 +199,9 @@ __all__ = [
     "Ignore",
     "InputRefused",
     "Job",
+    "JournalBlocked",
+    "JournalGoesOn",
+    "JournalStopped",
     "KILLED",
     "KeyFreed",
     "KeyRegistered",
@@ -221,6 +228,7 @@ __all__ = [
     "NoSuchChild",
     "Normal",
     "NotAnActor",
+    "NotQuarantined",
     "NotSupported",
     "NotSuspended",
     "NotUnique",
@@ -242,6 +250,7 @@ __all__ = [
     "ProgramInput",
     "ProgramStatus",
     "Quarantined",
+    "QuarantinedMessage",
     "Recovered",
     "RecoveryFailed",
     "Refusal",

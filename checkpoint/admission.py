@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ..actors.errors import HoldfastError
+from .inputs import OVERHEAD
+from .records import MESSAGE
 
 if TYPE_CHECKING:
     from .inputs import Input
@@ -41,9 +43,49 @@ class Admission:
 
     def refused(self, error: HoldfastError) -> bool:
         """It was not written: nobody has heard of it. What comes from the runtime itself waits."""
-        if not self._home.take_back(self._source, error, told=self._accepted is not None):
+        if not take_back(self._home, self._source, error, told=self._accepted is not None):
             return False
         if self._accepted is not None and not self._accepted.done():
             self._accepted.set_exception(error)
             self._accepted.exception()  # The sender may have gone.
         return True
+
+
+def submit(home: Switch, source: Input, entry: Entry) -> None:
+    """Have an input journaled.
+
+    Raises:
+        HoldfastError: it comes from outside, and the store takes nothing now.
+    """
+    admission = Admission(home, source, entry)
+    if source.kind != MESSAGE:
+        home.journal.submit(admission)
+        return
+    try:
+        home.journal.admit(admission)
+    except HoldfastError:
+        _forget(home, source)
+        raise
+
+
+def take_back(home: Switch, source: Input, error: HoldfastError, *, told: bool) -> bool:
+    """The store refused an input; False if it has happened all the same. `told`: its sender hears of it."""
+    if source.kind != MESSAGE:
+        return False
+    if source.id in home.open:
+        _forget(home, source)
+        ask, source.ask = source.ask, None
+        if ask is not None:
+            ask.started = False
+            ask.fail(error)
+        elif not told:
+            home.ends.lost(source.name, source.body, str(error))
+    return True
+
+
+def _forget(home: Switch, source: Input) -> None:
+    """An input was not admitted after all."""
+    if home.open.pop(source.id, None) is not None:
+        home.bytes -= len(source.body) + OVERHEAD
+        if home.bound is not None:
+            home.bound.ended(source)

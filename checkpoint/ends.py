@@ -50,6 +50,8 @@ class Ends:
         home = self._home
         home.node.emit(MessageQuarantined(home.path, source.name, source.deliveries))
         batch = Batch()
+        if home.quarantine is not None:
+            home.quarantine.hold(home, source, batch)
         self.begun(source, Quarantined(home.path, source.deliveries), batch)
         batch.commit(home.journal)
 

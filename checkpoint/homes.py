@@ -18,6 +18,7 @@ from .commits import Commits, Unkept
 from .inputs import HomeJournal
 from .journal import Journal
 from .method import Durability, Method
+from .quarantine import PLACE, Quarantine
 from .rollback import roll_back
 from .switch import Switch
 
@@ -38,12 +39,13 @@ class Homes:
             journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}"
         )
         self._unkept = Unkept(self.journal)
+        self.quarantine = Quarantine(node, self.journal)
         self._switches: dict[str, Switch] = {}
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
         unfinished = journal.notes(ERASING).get(ERASING)
-        self._stored = set(journal.addresses())
+        self._stored = set(journal.addresses()) - {PLACE}
         if unfinished is not None:  # This process's predecessor died in the middle of it.
             self._erase_tree(unfinished.decode())
 
@@ -52,6 +54,7 @@ class Homes:
         switch = self._switches.get(cell.path)
         if switch is None:
             switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self._journal_of(method))
+            switch.quarantine = self.quarantine
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
                 begin()
@@ -77,6 +80,10 @@ class Homes:
         if method.durability in ("os", "fsync") and not self.journal.durable:
             return f"durability={method.durability!r} needs a store: ActorSystem(store='sqlite:PATH')"
         return ""
+
+    def at(self, path: str) -> Switch | None:
+        """The home of an address that somebody was started at."""
+        return self._switches.get(path)
 
     def find(self, path: str) -> Cell | None:
         """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
@@ -118,6 +125,7 @@ class Homes:
 
     def _erase(self, path: str) -> None:
         self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
+        self.quarantine.forget(path)
         self._stored.discard(path)
         self._blamed.discard(path)
         self._returns.pop(path, None)

@@ -27,7 +27,7 @@ from ..actors.events import RecoveryFailed, SnapshotFailed, SnapshotTaken
 from ..actors.exits import pack_exit
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
-from .admission import Admission
+from .admission import submit
 from .asks import Calls, SwitchAsk, answer_ask
 from .bound import HomeBound
 from .ends import Ends
@@ -35,6 +35,7 @@ from .inputs import OVERHEAD, Batch, HomeJournal, Input, Turn
 from .limit import Limit
 from .method import Method
 from .outputs import Outputs
+from .quarantine import Quarantine
 from .records import (
     DOWN,
     EXIT,
@@ -99,6 +100,7 @@ class Switch:
         self.ends = Ends(self)
         self.limit = Limit(self)
         self.bound: HomeBound | None = None
+        self.quarantine: Quarantine | None = None
         self.pipes_done: dict[int, set[int]] = {}
         self.topics: dict[str, None] = {}
         self.newest: Meta | None = None  # the snapshot to begin with
@@ -191,46 +193,15 @@ class Switch:
             source.positions, source.held = [], True
             if batch is not None:
                 batch.add(self.path, entry, source.positions)
-            elif kind == MESSAGE:
-                self._submit(Admission(self, source, entry), source)
             else:
-                self.journal.submit(Admission(self, source, entry))
+                submit(self, source, entry)
         return source
-
-    def _submit(self, admission: Admission, source: Input) -> None:
-        """Have an input from outside journaled, which the store may refuse."""
-        try:
-            self.journal.admit(admission)
-        except HoldfastError:
-            self._forget(source)
-            raise
-
-    def _forget(self, source: Input) -> None:
-        """An input was not admitted after all."""
-        if self.open.pop(source.id, None) is not None:
-            self.bytes -= len(source.body) + OVERHEAD
-            if self.bound is not None:
-                self.bound.ended(source)
 
     def admitted(self, source: Input) -> None:
         """An input is as safe now as it has to be."""
         source.held = False
         if source.id in self.open:
             self.forward(source)
-
-    def take_back(self, source: Input, error: HoldfastError, *, told: bool) -> bool:
-        """The store refused an input; False if it has happened all the same. `told`: its sender hears of it."""
-        if source.kind != MESSAGE:
-            return False
-        if source.id in self.open:
-            self._forget(source)
-            ask, source.ask = source.ask, None
-            if ask is not None:
-                ask.started = False
-                ask.fail(error)
-            elif not told:
-                self.ends.lost(source.name, source.body, str(error))
-        return True
 
     def forward(self, source: Input) -> None:
         """Feed an input that is safe, unless they are held."""

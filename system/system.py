@@ -37,6 +37,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
 from .transaction.addresses import Moved
@@ -54,7 +55,7 @@ STOP_TIMEOUT = 365 * 86_400.0
 """Seconds `stop` waits: no limit of its own, the child specs say how long an end may take."""
 
 
-class ActorSystem(Controls):
+class ActorSystem(Recorded, Controls):
     """A tree of actors: an async context manager that lives in whatever loop it is entered in.
 
     Args:
