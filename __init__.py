@@ -94,8 +94,11 @@ from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
+from holdfast.checkpoint.compared import StateDiverged
+from holdfast.checkpoint.groups import NoSuchGroup
 from holdfast.checkpoint.method import Method, fresh, hybrid
 from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
+from holdfast.checkpoint.strict import NotDeterministic
 from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -226,8 +229,10 @@ __all__ = [
     "NoRoute",
     "NoSuchActor",
     "NoSuchChild",
+    "NoSuchGroup",
     "Normal",
     "NotAnActor",
+    "NotDeterministic",
     "NotQuarantined",
     "NotSupported",
     "NotSuspended",
@@ -279,6 +284,7 @@ __all__ = [
     "StartChild",
     "StartFailed",
     "StartIgnored",
+    "StateDiverged",
     "Statistics",
     "Status",
     "Step",

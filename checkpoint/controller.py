@@ -44,6 +44,7 @@ class TaskHost(HomeHost, lives.LocalHost):
         cell.table = start.kind._table
         switch, live, recovering = self.open(cell)
         life = self.life = Life(cell, LocalHome(self, cell), self.method.interval, None)
+        life.obey(self.method.rules)
         for record in switch.restore_records():
             life.from_home(record)
         life.begin(start, switch.state_turn, switch.stash)
@@ -147,6 +148,7 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         for record in switch.restore_records():
             port.to_life(record)
         options = {"recorded": {"interval": self.method.interval, "turn": switch.state_turn, "stash": switch.stash}}
+        options["recorded"]["rules"] = self.method.rules
         try:
             await worker.launch(cell, recipe, options)
             clock.mark("restart")

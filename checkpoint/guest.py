@@ -54,6 +54,7 @@ class RecordedGuest:
         """
         port = self._port(cell.path)
         life = Life(cell, port, float(options["interval"]), self._guest.page)
+        life.obey(options["rules"])
         cell.host = OwnHost(self._guest, life)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
@@ -235,6 +236,7 @@ class InnerLifeHost(LifeHost):
         cell.life = record.life - 1
         page = self._guest.page[record.slot : record.slot + 1]
         self._life = life = Life(cell, port, self._method.interval, page)
+        life.obey(self._method.rules)
         try:
             port.begin(life, record.turn, record.stash)
         except StartFailed as error:

@@ -15,8 +15,9 @@ from ..actors.keeper import child_key
 from .admission import Admission
 from .bound import HomeBound
 from .commits import Commits, Unkept
+from .groups import Groups
 from .inputs import HomeJournal
-from .journal import Journal
+from .journal import Journal, Saved
 from .method import Durability, Method
 from .quarantine import PLACE, Quarantine
 from .rollback import roll_back
@@ -35,25 +36,27 @@ class Homes:
 
     def __init__(self, node: Node, journal: Journal, *, durability: Durability | None = None) -> None:
         self.node = node
-        self.journal = Commits(
-            journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}"
-        )
+        self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
         self._unkept = Unkept(self.journal)
         self.quarantine = Quarantine(node, self.journal)
         self._switches: dict[str, Switch] = {}
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
+        self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         unfinished = journal.notes(ERASING).get(ERASING)
         self._stored = set(journal.addresses()) - {PLACE}
         if unfinished is not None:  # This process's predecessor died in the middle of it.
             self._erase_tree(unfinished.decode())
+        self.groups = Groups(self)
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for."""
         switch = self._switches.get(cell.path)
         if switch is None:
-            switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self._journal_of(method))
+            switch = self._switches[cell.path] = Switch(
+                self.node, cell.path, method, self._journal_of(method), self.planted.pop(cell.path, None)
+            )  # fmt: skip
             switch.quarantine = self.quarantine
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
@@ -66,6 +69,7 @@ class Homes:
         more = cell.extra()
         if more.bound is not None:
             switch.bound, more.bound = HomeBound(switch, more.bound), None
+        self.groups.open(cell, method)
         cell.admit = switch.admit
         more.outlet = switch
         return switch
@@ -74,6 +78,13 @@ class Homes:
         """Where what happens at an address is kept, from its first life on."""
         wanted = method.durability or self.journal.durability
         return self._unkept if self.journal.durable and wanted == "memory" else self.journal
+
+    def vacate(self, path: str, why: str) -> None:
+        """What is known here of an address where nobody lives is not true any more; the store is somebody else's."""
+        self._stored.add(path)
+        switch = self._switches.pop(path, None)
+        if switch is not None:
+            switch.ends.erased(why)
 
     def refuses(self, method: Method) -> str:
         """Why this method cannot work here; "" if it can."""
@@ -129,6 +140,7 @@ class Homes:
         self._stored.discard(path)
         self._blamed.discard(path)
         self._returns.pop(path, None)
+        self.planted.pop(path, None)
         switch = self._switches.pop(path, None)
         if switch is not None:
             switch.ends.erased("what was recorded of it has been erased")
@@ -163,6 +175,11 @@ class Homes:
     def notes(self, prefix: str) -> dict[str, bytes]:
         """The facts whose keys begin so, oldest first."""
         return self.journal.notes(prefix)
+
+    async def synced(self) -> None:
+        """Wait until all that has happened is as safe as the store's durability says."""
+        if self.journal.durability == "fsync":
+            await self.node.loop.run_in_executor(None, self.journal.engine.sync)
 
     async def settled(self) -> None:
         """Wait until everything that was submitted has taken effect."""

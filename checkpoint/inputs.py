@@ -62,6 +62,7 @@ class Turn(msgspec.Struct, gc=False, eq=False):
     input: Input
     status: str
     digests: list[int]
+    state: int = 0  # digest of the state it has left, if that is checked
 
 
 class TimerState:

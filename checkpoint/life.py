@@ -17,11 +17,15 @@ from ..actors.errors import BadMessage, ControlFailed, HoldfastError, StartFaile
 from ..actors.exits import ExitReason
 from ..actors.mail import Item
 from ..actors.message import Message, message_name
+from .compared import digest_of
 from .context import RecordedContext
 from .keys import restore_state, save_state
+from .method import Rules
 from .records import (
     FAILED,
+    OK,
     REPLY,
+    STASHED,
     Answer,
     Begin,
     Feed,
@@ -41,6 +45,7 @@ from .records import (
     Unsaved,
     pieces,
 )
+from .strict import Guard
 from .turns import Fed, GoLive, Hook, TakeSnapshot
 
 
@@ -77,6 +82,8 @@ class Life:
         self.has_replayed = False
         self.begins_suspended = False
         self.in_hook = False
+        self.guard: Guard | None = None  # of a strict actor
+        self.is_checked = False  # whether the state is compared under replay
         self.ignored_why: str | None = None
         self._snapshot_turn = -1
         self._state: list[bytes] = []
@@ -115,6 +122,12 @@ class Life:
         if self._has_state and start.kind.on_start is not Actor.on_start:
             mailbox.queue_of(cell).append(Hook(self, "on_start"))
         lives.up(cell)
+
+    def obey(self, rules: Rules) -> None:
+        """What its method asks of a life, besides snapshots."""
+        strict, self.is_checked = rules
+        if strict:
+            self.guard = Guard()
 
     def _context(self, cell: Cell) -> RecordedContext:
         """Made before `__init__` runs: that may use `ctx` already."""
@@ -199,8 +212,9 @@ class Life:
         feed = self.feed
         if feed is None:
             return  # The life was abandoned in this very turn: what it says does not count.
+        state = digest_of(self.cell.actor) if self.is_checked and self.cell.actor and status in (OK, STASHED) else 0
         self.feed = None
-        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer))
+        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state))
         self.outs = []
         if self.page is not None:
             self.page[0] = 0

@@ -9,6 +9,8 @@ from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
 
 Durability = Literal["memory", "os", "fsync"]
+Rules = tuple[bool, bool]
+"""What a method asks of a life, besides snapshots: whether it is strict, and whether its replay is checked."""
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]
 
 
@@ -23,6 +25,13 @@ class Method:
     keep: int = 2
     on_escalate: OnEscalate | None = None
     durability: Durability | None = None
+    strict: bool = False
+    check_replay: bool = False
+
+    @property
+    def rules(self) -> Rules:
+        """What it asks of a life, besides snapshots."""
+        return self.strict, self.check_replay
 
     def after_escalation(self, times: int) -> OnEscalate:
         """How an actor comes back whose supervisor has ended because of it for the `times`-th time in the window.
@@ -63,6 +72,8 @@ def hybrid(
     keep: int = 2,
     on_escalate: OnEscalate | None = None,
     durability: Durability | None = None,
+    strict: bool = False,
+    check_replay: bool = False,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -78,6 +89,11 @@ def hybrid(
             the supervisor, else restore.
         durability: what an admission, and with it a reply, outlives when it is told of: "memory" any process but the
             root, "os" the root too, "fsync" the machine. The last two need a store, whose own setting is the default.
+
+        strict: a turn that calls the clock, chance or a background task of the world instead of its `ctx` raises
+            NotDeterministic at that call. It makes handlers several times slower: for tests and for the search.
+        check_replay: the state after each turn gets a digest, and a replay that leaves another one is stopped with the
+            number of the first such turn and its message. Costs a pass over the state per turn: for tests, too.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -98,4 +114,10 @@ def hybrid(
     if durability is not None and durability not in get_args(Durability):
         known = ", ".join(map(repr, get_args(Durability)))
         raise SpecError("hybrid", f"durability must be one of {known} or left out, not {durability!r}")
-    return Method("hybrid", float(interval), max_deliveries, journal_limit, int(keep), on_escalate, durability)
+    for name, value in (("strict", strict), ("check_replay", check_replay)):
+        if not isinstance(value, bool):
+            raise SpecError("hybrid", f"{name} must be True or False, not {value!r}")
+    return Method(
+        "hybrid", float(interval), max_deliveries, journal_limit, int(keep), on_escalate, durability,
+        strict, check_replay,
+    )  # fmt: skip

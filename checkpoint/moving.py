@@ -95,6 +95,7 @@ class RecordedToProcess(ToProcess):
         for record in switch.restore_records():
             port.to_life(record)
         recorded = {"interval": self.host.method.interval, "turn": switch.state_turn, "stash": switch.stash}
+        recorded["rules"] = self.host.method.rules
         kept = {"suspended": more.suspended, "trap_exits": more.trap_exits}
         launched = worker.launch(cell, self.recipe, {"recorded": {**recorded, **kept}})
         await self.within(launched, self.timeout, lambda: "its new life was not up")
@@ -175,6 +176,7 @@ class RecordedToTask(FromProcess):
         settled: asyncio.Future[None] = self.node.loop.create_future()
         home = ArrivingHome(host, cell, other, settled)
         life = Life(other, home, host.method.interval, None)
+        life.obey(host.method.rules)
         life.begins_suspended = self.suspended
         for record in switch.restore_records():
             life.from_home(record)

@@ -144,6 +144,7 @@ class TurnEnd(msgspec.Struct, array_like=True, tag=12):
     status: str
     outs: list[Out]
     answer: Answer
+    state: int = 0  # digest of the state it has left, if that is checked
 
 
 class Live(msgspec.Struct, array_like=True, tag=13):

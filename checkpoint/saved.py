@@ -9,6 +9,7 @@ import msgspec
 from ..actors.errors import HoldfastError
 from .inputs import OVERHEAD, Input, Turn
 from .journal import Entry
+from .journal import Saved as Journaled
 from .records import PIPE, STASHED, TICK, Answer, Snapshot
 from .timers import Saved
 
@@ -98,9 +99,9 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
         del home.calls.outcomes[key]
 
 
-def load(home: Switch) -> None:
-    """Take up where the store left off."""
-    saved = home.journal.load(home.path)
+def load(home: Switch, planted: Journaled | None = None) -> None:
+    """Take up where the store left off, or (in memory) where something else says."""
+    saved = planted if planted is not None and not home.journal.durable else home.journal.load(home.path)
     timers: dict[str, Saved] = {}
     if saved.snapshot is not None:
         meta = home.newest = decode_meta(saved.snapshot)
@@ -131,10 +132,10 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             if kind == PIPE:
                 turn, k = map(int, origin.split("."))
                 home.pipes_done.setdefault(turn, set()).add(k)
-        case ("end", turn, key, status, digests):
+        case ("end", turn, key, status, digests, *more):
             if key not in home.open:
                 return
-            past = home.turns[turn] = Turn(home.open[key], status, list(digests))
+            past = home.turns[turn] = Turn(home.open[key], status, list(digests), *more)
             home.positions_of(turn).append(position)
             past.input.turn = home.turn = turn
             home.partial, home.partial_id = [], -1

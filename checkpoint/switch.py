@@ -30,8 +30,10 @@ from ..actors.message import message_name
 from .admission import submit
 from .asks import Calls, SwitchAsk, answer_ask
 from .bound import HomeBound
+from .compared import StateDiverged
 from .ends import Ends
 from .inputs import OVERHEAD, Batch, HomeJournal, Input, Turn
+from .journal import Saved
 from .limit import Limit
 from .method import Method
 from .outputs import Outputs
@@ -84,7 +86,7 @@ class LifePort(Protocol):
 class Switch:
     """The home of one recorded actor."""
 
-    def __init__(self, node: Node, path: str, method: Method, journal: HomeJournal) -> None:
+    def __init__(self, node: Node, path: str, method: Method, journal: HomeJournal, saved: Saved | None = None) -> None:
         self.node, self.path, self.method, self.journal = node, path, method, journal
         self.cell: Cell | None = None
         self.port: LifePort | None = None
@@ -120,7 +122,7 @@ class Switch:
         self.dropped: list[list[int]] = []  # the same of inputs that ended without a turn
         self._replay_k = 0
         self._replay_turn = -1
-        load(self)
+        load(self, saved)
 
     # -- admission --------------------------------------------------------------------------------------------------
 
@@ -289,9 +291,7 @@ class Switch:
         port = self.port
         assert port is not None
         stashed = self.stashed()
-        waiting = [
-            one for one in self.open.values() if one.kind != START and one.id not in stashed and not one.held
-        ]
+        waiting = [one for one in self.open.values() if one.kind != START and one.id not in stashed and not one.held]
         waiting.sort(key=lambda one: one.id != self.partial_id)
         pipes = tuple(sorted(self.pipes_done.get(self.turn + 1, ())))
         for index, source in enumerate(waiting):
@@ -318,9 +318,9 @@ class Switch:
         if source.deliveries >= self.method.max_deliveries:
             self.ends.quarantine(source)
 
-    def end_turn(self, source: Input, number: int, status: str, batch: Batch) -> None:
+    def end_turn(self, source: Input, number: int, status: str, batch: Batch, state: int = 0) -> None:
         """A turn is over: its end record."""
-        turn = self.turns[number] = Turn(source, status, self.partial)
+        turn = self.turns[number] = Turn(source, status, self.partial, state)
         self.partial, self.partial_id = [], -1
         self.turn = source.turn = number
         source.deliveries = 0
@@ -329,7 +329,7 @@ class Switch:
         if self.bound is not None:
             batch.after.append(functools.partial(self.bound.ended, source))
         if self.journal.durable:
-            entry = ("end", number, source.id, status, tuple(turn.digests))
+            entry = ("end", number, source.id, status, tuple(turn.digests), *((state,) if state else ()))
             batch.add(self.path, entry, self.positions_of(number))
 
     def positions_of(self, turn: int) -> list[int]:
@@ -421,7 +421,9 @@ class Switch:
         if source.kind == START and end.status == FAILED:
             return  # Its start failed, and will be tried again.
         if not end.outs and source.ask is None and not self.partial and self.bound is None and not self.journal.durable:
-            self.turns[end.turn] = Turn(source, end.status, [])  # The shortest way: nothing leaves, nobody waits.
+            self.turns[end.turn] = Turn(
+                source, end.status, [], end.state
+            )  # The shortest way: nothing leaves, nobody waits.
             self.turn = source.turn = end.turn
             self.partial_id, source.deliveries = -1, 0
             if end.status != STASHED:
@@ -429,7 +431,7 @@ class Switch:
             return
         batch = Batch()
         self._take(end.turn, end.id, end.outs, batch)
-        self.end_turn(source, end.turn, end.status, batch)
+        self.end_turn(source, end.turn, end.status, batch, end.state)
         if end.answer.kind == LATER:
             if source.ask is not None:
                 self.later[end.id] = source.ask
@@ -444,6 +446,8 @@ class Switch:
         seen = self._replay_k if self._replay_turn == end.turn else 0
         if past is None or seen != len(past.digests) or end.status != past.status:
             raise ReplayDiverged(self.path, end.turn, seen + 1)
+        if end.state != past.state and end.state and past.state:
+            raise StateDiverged(self.path, end.turn, past.input.name or past.input.kind)
 
     def give(self, source: Input, answer: Answer, batch: Batch) -> None:
         """Answer the ask of an input, behind the append."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from ..actors.ref import ActorRef
 from ..checkpoint.homes import Homes
 from ..checkpoint.quarantine import QuarantinedMessage
+from ..supervision.admin import RestartChild, TerminateChild
+from ..supervision.supervisor import Supervisor
 
 
 class Recorded:
@@ -43,3 +46,42 @@ class Recorded:
             NotQuarantined: it was tried again, dropped or erased meanwhile.
         """
         self.homes.quarantine.drop(message)
+
+    async def checkpoint_group(self, actors: Sequence[ActorRef[Any]], *, name: str) -> None:
+        """Keep one consistent cut of several recorded actors: their states, and the messages between them (R78).
+
+        It takes the place of an older one of that name. With a store it is kept over restarts of the root, and as safe
+        as its `durability` says when this returns.
+
+        Raises:
+            HoldfastError: one of them is not recorded, or the store refused.
+        """
+        homes = self.homes
+        homes.groups.take(name, [actor.path for actor in actors])
+        await homes.synced()
+
+    async def restore_group(self, name: str, *, timeout: float = 60.0) -> None:
+        """Bring all actors of a group snapshot back to it, with the messages that were under way between them.
+
+        They are stopped, last named first, and started again, first named first; messages to them meanwhile, and all
+        that they did since the cut, do not count: asks that wait fail with ActorStopped. What they have sent to others
+        since is not called back.
+
+        Raises:
+            NoSuchGroup: there is none of that name. HoldfastError: an actor could not be stopped or started by its
+                supervisor, or the store refused.
+        """
+        groups = self.homes.groups
+        living: list[tuple[ActorRef[Supervisor], str]] = []
+        for path in groups.members(name):
+            home = self.homes.at(path)
+            cell = None if home is None else home.cell
+            if cell is None or cell.is_dead:
+                continue  # Whoever starts it finds it as it was.
+            above, _, child = path.rpartition("/")
+            living.append((ActorRef[Supervisor](cell.node.cell_at(above)), child))
+        for supervisor, child in reversed(living):
+            await supervisor.ask(TerminateChild(child), timeout)
+        groups.replace(name)
+        for supervisor, child in living:
+            await supervisor.ask(RestartChild(child), timeout)

@@ -112,9 +112,7 @@ async def test_it_goes_with_what_is_erased(tmp_path: Path) -> None:
     async with running(store) as system:
         await poisoned(system, "process", tmp_path / "deaths")
     async with running(store) as system:
-        await system.start(
-            hf.child("doer", hf.start(Doer), isolation="process", recovery=RECOVERY), fresh=True
-        )
+        await system.start(hf.child("doer", hf.start(Doer), isolation="process", recovery=RECOVERY), fresh=True)
         assert system.quarantined() == []
 
 
@@ -134,5 +132,3 @@ async def test_many_that_have_come_and_gone_take_no_room(tmp_path: Path) -> None
         assert system.quarantined() == [first]
     async with running(store) as system:
         assert len(system.quarantined()) == 1
-
-
