@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ..actors.cell import Cell
 from ..actors.errors import HoldfastError
 from .asks import SwitchAsk
 from .inputs import Input
 from .journal import Entry, Saved
-from .method import Method
 from .records import Out
 from .saved import FORMAT, Meta, outlasting
 
@@ -78,6 +76,7 @@ class Groups:
 
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
+        self._waiting: set[str] = set()  # who waits for the others of a group that is restored
         self._asks: list[Pending] = []  # of the group that was restored last: to be joined when its homes are open
         unfinished = homes.journal.noted(RESTORING)
         if unfinished is not None:  # This process's predecessor died in the middle of it.
@@ -178,8 +177,21 @@ class Groups:
             raise NoSuchGroup(name)
         return msgspec.msgpack.decode(data, type=Group)
 
-    def open(self, cell: Cell, method: Method) -> None:
-        """A home of the group is open again: asks between it and those that are open already are joined."""
+    def wait(self, paths: Iterable[str]) -> None:
+        """From now on these homes hold what waits, until `let_go`: what they send would find nobody."""
+        self._waiting.update(paths)
+
+    def let_go(self, paths: Iterable[str]) -> None:
+        """All of them are there, or will not come."""
+        for path in paths:
+            self._waiting.discard(path)
+            home = self._homes.at(path)
+            if home is not None:
+                home.let_go()
+
+    def opened(self, home: Switch) -> None:
+        """A home has its next cell: asks between it and those that are open already are joined."""
+        home.kept_back = home.path in self._waiting
         left: list[Pending] = []
         for one in self._asks:
             asker, receiver = self._homes.at(one.asker), self._homes.at(one.receiver)

@@ -69,7 +69,7 @@ class Homes:
         more = cell.extra()
         if more.bound is not None:
             switch.bound, more.bound = HomeBound(switch, more.bound), None
-        self.groups.open(cell, method)
+        self.groups.opened(switch)
         cell.admit = switch.admit
         more.outlet = switch
         return switch

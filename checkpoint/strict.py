@@ -70,10 +70,10 @@ def _functions() -> dict[CodeType, tuple[str, str]]:
 
 
 def _drawing() -> dict[CodeType, str]:
-    """The methods of `random.Random` written in Python: forbidden on the hidden one that the module shares."""
+    """Methods of generators written in Python: forbidden on the hidden one that `random` shares, and on the system's."""
     return {
-        member.__code__: f"random.{name}"
-        for name, member in vars(random.Random).items()
+        member.__code__: name
+        for name, member in {**vars(random.Random), **vars(random.SystemRandom)}.items()
         if isinstance(member, types.FunctionType) and not name.startswith("_")
     }
 
@@ -133,8 +133,12 @@ class Guard:
             known = FUNCTIONS.get(frame.f_code)
             if known is not None:
                 self._refuse(*known, frame.f_back)
-            elif frame.f_code in DRAWING and frame.f_locals.get("self") is SHARED:
-                self._refuse(DRAWING[frame.f_code], DICE, frame.f_back)
+            elif frame.f_code in DRAWING:
+                drawn_from = frame.f_locals.get("self")
+                if drawn_from is SHARED:
+                    self._refuse(f"random.{DRAWING[frame.f_code]}", DICE, frame.f_back)
+                elif isinstance(drawn_from, random.SystemRandom):
+                    self._refuse(f"random.SystemRandom.{DRAWING[frame.f_code]}", DICE, frame.f_back)
 
     def _look_at_builtin(self, frame: FrameType, function: Any) -> None:
         known = BUILTINS.get(id(function))

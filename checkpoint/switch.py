@@ -111,6 +111,7 @@ class Switch:
         self.live: asyncio.Future[float] | None = None
         self.live_at = 0.0
         self.is_released = False
+        self.kept_back = False  # it is live, but waits for the others of its group
         self.replayed = 0
         self.diverged: ReplayDiverged | None = None
         self.is_void = False  # a state that was put in place from outside could not be kept: this life does not count
@@ -374,7 +375,17 @@ class Switch:
         self.live_at = time.monotonic()
         if self.live is not None and not self.live.done():
             self.live.set_result(record.restore_seconds)
+        if self.kept_back:
+            return  # Those that it may send to are not there yet.
         self._release()
+
+    def let_go(self) -> None:
+        """All of its group are there."""
+        if self.kept_back:
+            self.kept_back = False
+            if self.port is not None and self.live is not None and self.live.done() and not self.live.cancelled():
+                if self.live.exception() is None and not self.is_released:
+                    self._release()
 
     def _released(self, record: Released) -> None:
         batch = Batch()

@@ -83,5 +83,10 @@ class Recorded:
         for supervisor, child in reversed(living):
             await supervisor.ask(TerminateChild(child), timeout)
         groups.replace(name)
-        for supervisor, child in living:
-            await supervisor.ask(RestartChild(child), timeout)
+        members = groups.members(name)
+        groups.wait(members)
+        try:
+            for supervisor, child in living:
+                await supervisor.ask(RestartChild(child), timeout)
+        finally:
+            groups.let_go(members)
