@@ -247,6 +247,10 @@ async def test_the_death_of_an_actor_before_the_sync_feeds_nothing_twice(engine:
                 if isinstance(event, hf.Recovered):
                     break
         later = doer.ask(Note("d"), timeout=30.0)
+        await asyncio.sleep(0.05)
+        home = system.homes.at(doer.path)
+        assert home is not None
+        assert home.turn == 0  # The new life has been fed nothing that is not safe.
         engine.let_sync.set()
         assert [await reply for reply in (*replies, later)] == [1, 2, 3, 4]
         assert await doer.ask(Seen(), timeout=30.0) == list("abcd")

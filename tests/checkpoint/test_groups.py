@@ -48,9 +48,7 @@ class Purse(hf.Actor):
 
 
 async def purses(system: hf.ActorSystem, isolation: str) -> list[hf.ActorRef[Any]]:
-    return [
-        await start(system, isolation, f"purse{n}", hf.start(Purse, n), recovery=RECOVERY) for n in range(MEMBERS)
-    ]
+    return [await start(system, isolation, f"purse{n}", hf.start(Purse, n), recovery=RECOVERY) for n in range(MEMBERS)]
 
 
 def running(store: str | None) -> hf.ActorSystem:
