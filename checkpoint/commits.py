@@ -34,7 +34,10 @@ PATIENCE_SECONDS = 0.05
 class Submission(Protocol):
     """What is to be written, and what follows."""
 
-    entries: Sequence[tuple[str, Entry]]
+    @property
+    def entries(self) -> Sequence[tuple[str, Entry]]:
+        """What is written, by address."""
+        ...
 
     def written(self, positions: Sequence[int]) -> None:
         """It stands there in the journal."""

@@ -70,7 +70,7 @@ def _functions() -> dict[CodeType, tuple[str, str]]:
 
 
 def _drawing() -> dict[CodeType, str]:
-    """Methods of generators written in Python: forbidden on the hidden one that `random` shares, and on the system's."""
+    """Methods of generators written in Python: forbidden on the one that `random` shares, and on the system's."""
     return {
         member.__code__: name
         for name, member in {**vars(random.Random), **vars(random.SystemRandom)}.items()

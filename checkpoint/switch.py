@@ -383,9 +383,11 @@ class Switch:
         """All of its group are there."""
         if self.kept_back:
             self.kept_back = False
-            if self.port is not None and self.live is not None and self.live.done() and not self.live.cancelled():
-                if self.live.exception() is None and not self.is_released:
-                    self._release()
+            live = self.live
+            if self.port is None or live is None or not live.done() or live.cancelled():
+                return  # It lets itself go when it is live.
+            if live.exception() is None and not self.is_released:
+                self._release()
 
     def _released(self, record: Released) -> None:
         batch = Batch()

@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from ..actors.errors import HoldfastError
 from ..checkpoint.journal import Entry, Journal, Saved
 
 Factory = Callable[[Path], Journal]
@@ -161,7 +162,7 @@ class StoreConformance:
         journal.close()
         journal.close()
         if journal.durable:
-            with pytest.raises(Exception, match="."):
+            with pytest.raises(HoldfastError):
                 journal.append([(A, ("in", 1))])
 
     @pytest.mark.parametrize("seed", range(5))

@@ -1,4 +1,4 @@
-"""A root process that is killed under load, run by `test_kills.py`: python kill_player.py STORE DURABILITY FROM [N ...].
+"""A root process that is killed under load, run by `test_kills.py`: python kill_player.py STORE DURABILITY [N ...].
 
 Eight callers at once send numbers to a recorded actor in a process, which passes them on to another one, a task. What
 was accepted is said on stdout. Caller c begins with the c-th N. Without any N it only says what the two have.

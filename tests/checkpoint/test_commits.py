@@ -304,10 +304,14 @@ async def test_a_real_disk_without_room(tmp_path: Path) -> None:
         (pages,) = db.execute("PRAGMA page_count").fetchone()
         db.execute(f"PRAGMA max_page_count = {pages + 2}")
         accepted: list[str] = []
-        with pytest.raises(StoreFailed, match="make room"):
+
+        async def fill() -> None:
             for n in range(1000):
                 accepted.append(f"{n} {'x' * 1000}")
                 await doer.ask(Note(accepted[-1]), timeout=30.0)
+
+        with pytest.raises(StoreFailed, match="make room"):
+            await fill()
         refused = accepted.pop()
         db.execute("PRAGMA max_page_count = 100000")
         await until(lambda: system.homes.journal.blocked is None)

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import json
 import os
 import random
@@ -50,7 +51,7 @@ def judge(accepted: dict[int, set[int]], numbers: list[list[int]]) -> Verdict:
     for caller, seen in by_caller.items():
         verdict.lost += len(accepted[caller] - set(seen))
         verdict.doubled += len(seen) - len(set(seen))
-        verdict.reordered += sum(before > after for before, after in zip(seen, seen[1:], strict=False))
+        verdict.reordered += sum(before > after for before, after in itertools.pairwise(seen))
     return verdict
 
 

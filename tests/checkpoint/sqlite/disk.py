@@ -1,4 +1,4 @@
-"""A disk that can be cut off at any operation: what was written and not synced is there, lost, torn, or out of order."""
+"""A disk that can be cut off at any operation: what was not synced is there, lost, torn, or out of order."""
 
 from __future__ import annotations
 

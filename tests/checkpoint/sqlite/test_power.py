@@ -32,7 +32,8 @@ acks = os.open(folder + "/acks", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
 number, live, refused = 0, {0: [], 1: []}, False
 for step in range(120):
     try:
-        batch = [(f"/{(number + n) % 2}", ("in", number + n, "x" * draw.randrange(300))) for n in range(draw.choice([1, 2, 7]))]
+        numbers = range(number, number + draw.choice([1, 2, 7]))
+        batch = [(f"/{n % 2}", ("in", n, "x" * draw.randrange(300))) for n in numbers]
         for (address, _), position in zip(batch, journal.append(batch)):
             live[int(address[1])].append(position)
         number += len(batch)
