@@ -294,7 +294,7 @@ class Commits:
             self._thread = ThreadPoolExecutor(1, "holdfast-sync")
         written = self._written
         self._syncing = self._loop.run_in_executor(self._thread, self.engine.sync)
-        self._syncing.add_done_callback(functools.partial(self._context.run, self._synced_to, written))
+        self._syncing.add_done_callback(functools.partial(self._synced_to, written), context=self._context)
 
     def _synced_to(self, number: int, done: asyncio.Future[None]) -> None:
         self._syncing = None

@@ -79,7 +79,7 @@ def _drawing() -> dict[CodeType, str]:
 
 
 BUILTINS, FUNCTIONS, DRAWING = _builtins(), _functions(), _drawing()
-SHARED: random.Random = random._inst  # type: ignore[attr-defined]
+SHARED: random.Random = random._inst
 CLASS_CLOCKS = {("datetime", "now"), ("datetime", "utcnow"), ("datetime", "today"), ("date", "today")}
 
 
@@ -123,7 +123,7 @@ class Guard:
                 turn.close()
                 raise
             except BaseException as error:
-                step, value = turn.throw, error  # type: ignore[assignment]  # as a coroutine has them
+                step, value = turn.throw, error
 
     def _look(self, frame: FrameType, event: str, arg: Any) -> None:
         """Called by the interpreter at each call; what is raised here is raised at the call, in place of it."""

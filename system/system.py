@@ -97,7 +97,7 @@ class ActorSystem(Recorded, Controls):
         self.name = name
         self._flags = Flags("one_for_one", intensity, period)
         self._store = store
-        self._durability = check_durability(store, durability)
+        self._durability: Durability | None = check_durability(store, durability)
         self._takeover = takeover
         self._preload = tuple(preload)
         self._log = log

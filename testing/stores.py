@@ -41,7 +41,10 @@ def conformance(factory: Factory, *, crash: Crash | None = None) -> type[StoreCo
         crash: given an open engine and its folder, makes a folder as a kill of the process would leave it now. Left
             out, nothing is tested of kills.
     """
-    return type("Conformance", (StoreConformance,), {"factory": staticmethod(factory), "crash": staticmethod(crash)})
+    made: dict[str, Any] = {"factory": staticmethod(factory)}
+    if crash is not None:
+        made["crash"] = staticmethod(crash)
+    return type("Conformance", (StoreConformance,), made)
 
 
 class StoreConformance:

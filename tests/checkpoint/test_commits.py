@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ import holdfast as hf
 from holdfast.checkpoint.commits import Commits
 from holdfast.checkpoint.journal import Entry, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.records import SnapshotNow
 from tests.checkpoint.players import Do, Doer, Note, Seen, Sink, start, until
 
 
@@ -69,7 +70,7 @@ def engine(tmp_path: Path) -> Any:
 
 
 @asynccontextmanager
-async def opened(engine: Any, events: list[Any] | None = None, durability: Any = "os") -> AsyncIterator[Commits]:
+async def opened(engine: Any, events: list[Any] | None = None, durability: Any = "os") -> AsyncGenerator[Commits]:
     emit = (lambda event: None) if events is None else events.append
     commits = Commits(engine, asyncio.get_running_loop(), durability=durability, emit=emit)
     try:
@@ -294,6 +295,36 @@ async def test_a_turn_that_ends_without_room_answers_when_there_is(engine: Any, 
         assert not reply.done()
         engine.full = False
         assert await reply == "1"
+
+
+async def test_a_snapshot_has_timers_and_topics_that_have_not_taken_effect_yet(
+    engine: Any, tmp_path: Path, gate: Path
+) -> None:
+    """They are in turns that the snapshot covers, so nothing else is left of them in the journal (T10)."""
+    engine.let_sync.set()
+    recovery = hf.hybrid(interval=1000.0)
+    async with hf.ActorSystem("app", log=False, store=engine, durability="fsync", intensity=1000) as system:
+        doer = await system.start(hf.child("doer", hf.start(Doer), recovery=recovery))
+        doer.tell(Do([f"gate {gate}", "after 1000", "subscribe /news"]))
+        await until(gate.exists)
+        engine.let_sync.clear()
+        Path(f"{gate}.open").touch()
+        home = system.homes.at(doer.path)
+        assert home is not None
+        await until(lambda: home.turn == 1)
+        assert home.port is not None
+        assert home.timers.saved() == {}
+        home.port.to_life(SnapshotNow())
+        await until(lambda: home.newest is not None and home.newest.turn == 1)
+        assert home.newest is not None
+        assert [name.rpartition(":")[2] for name, *_ in home.newest.timers.values()] == ["Tick"]
+        assert home.newest.topics == ["/news"]
+        engine.let_sync.set()
+    async with hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}") as system:
+        doer = await system.start(hf.child("doer", hf.start(Doer), recovery=recovery))
+        home = system.homes.at(doer.path)
+        assert home is not None
+        assert (len(home.timers.saved()), list(home.topics)) == (1, ["/news"])
 
 
 async def test_a_real_disk_without_room(tmp_path: Path) -> None:

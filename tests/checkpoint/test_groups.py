@@ -146,7 +146,8 @@ async def test_a_root_that_dies_on_the_way_back_finishes_it_at_its_next_start(tm
                 one.tell(Pass(7, 0, ring))
             assert await total(ring, 2) == 2 * EACH + 14
         async with running(store) as system:
-            engine = system.homes.journal.engine = Mortal(system.homes.journal.engine, step)
+            engine: Any = Mortal(system.homes.journal.engine, step)
+            system.homes.journal.engine = engine
             with contextlib.suppress(OSError):
                 system.homes.groups.replace("cut")
             died, system.homes.journal.engine = engine.is_dead, engine.real
