@@ -147,8 +147,11 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
-        options = {"recorded": {"interval": self.method.interval, "turn": switch.state_turn, "stash": switch.stash}}
-        options["recorded"]["rules"] = self.method.rules
+        recorded = {
+            "interval": self.method.interval, "turn": switch.state_turn, "stash": switch.stash,
+            "rules": self.method.rules,
+        }  # fmt: skip
+        options = {"recorded": recorded}
         try:
             await worker.launch(cell, recipe, options)
             clock.mark("restart")

@@ -186,8 +186,14 @@ class Groups:
         for path in paths:
             self._waiting.discard(path)
             home = self._homes.at(path)
-            if home is not None:
-                home.let_go()
+            if home is None or not home.kept_back:
+                continue
+            home.kept_back = False
+            live = home.live
+            if home.port is None or live is None or not live.done() or live.cancelled():
+                continue  # It lets itself go when it is live.
+            if live.exception() is None and not home.is_released:
+                home.release()
 
     def opened(self, home: Switch) -> None:
         """A home has its next cell: asks between it and those that are open already are joined."""

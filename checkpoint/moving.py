@@ -94,8 +94,10 @@ class RecordedToProcess(ToProcess):
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
-        recorded = {"interval": self.host.method.interval, "turn": switch.state_turn, "stash": switch.stash}
-        recorded["rules"] = self.host.method.rules
+        recorded = {
+            "interval": self.host.method.interval, "turn": switch.state_turn, "stash": switch.stash,
+            "rules": self.host.method.rules,
+        }  # fmt: skip
         kept = {"suspended": more.suspended, "trap_exits": more.trap_exits}
         launched = worker.launch(cell, self.recipe, {"recorded": {**recorded, **kept}})
         await self.within(launched, self.timeout, lambda: "its new life was not up")

@@ -286,7 +286,7 @@ class Switch:
         stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)
         port.to_life(Go(recovered, self.turn, tuple(key for key in stashed if key not in self.open)))
 
-    def _release(self) -> None:
+    def release(self) -> None:
         """Let new inputs at the actor: first the turn that had begun to send, then the others as they were admitted."""
         self.is_released = True
         port = self.port
@@ -377,17 +377,7 @@ class Switch:
             self.live.set_result(record.restore_seconds)
         if self.kept_back:
             return  # Those that it may send to are not there yet.
-        self._release()
-
-    def let_go(self) -> None:
-        """All of its group are there."""
-        if self.kept_back:
-            self.kept_back = False
-            live = self.live
-            if self.port is None or live is None or not live.done() or live.cancelled():
-                return  # It lets itself go when it is live.
-            if live.exception() is None and not self.is_released:
-                self._release()
+        self.release()
 
     def _released(self, record: Released) -> None:
         batch = Batch()

@@ -14,8 +14,8 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint.commits import Commits
 from holdfast.checkpoint.journal import Entry, StoreFailed
-from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.records import SnapshotNow
+from holdfast.checkpoint.sqlite import SqliteJournal
 from tests.checkpoint.players import Do, Doer, Note, Seen, Sink, start, until
 
 
@@ -311,11 +311,11 @@ async def test_a_snapshot_has_timers_and_topics_that_have_not_taken_effect_yet(
         Path(f"{gate}.open").touch()
         home = system.homes.at(doer.path)
         assert home is not None
-        await until(lambda: home.turn == 1)
+        await until(lambda home=home: home.turn == 1)
         assert home.port is not None
         assert home.timers.saved() == {}
         home.port.to_life(SnapshotNow())
-        await until(lambda: home.newest is not None and home.newest.turn == 1)
+        await until(lambda home=home: home.newest is not None and home.newest.turn == 1)
         assert home.newest is not None
         assert [name.rpartition(":")[2] for name, *_ in home.newest.timers.values()] == ["Tick"]
         assert home.newest.topics == ["/news"]
