@@ -48,7 +48,10 @@ from holdfast.actors.events import (
     Event,
     EventStream,
     HeldMessages,
+    JournalBlocked,
     JournalFull,
+    JournalGoesOn,
+    JournalStopped,
     LogLine,
     LoopLagged,
     MessageIn,
@@ -104,9 +107,12 @@ from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
+from holdfast.checkpoint.compared import StateDiverged
 from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.file import RecoveryFile, load_recovery
+from holdfast.checkpoint.groups import NoSuchGroup
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
+from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.checkpoint.readonly import NotReadonly
 from holdfast.checkpoint.recovery.settings import (
     Held,
@@ -117,6 +123,7 @@ from holdfast.checkpoint.recovery.settings import (
     recovery_hooks,
     safe_state,
 )
+from holdfast.checkpoint.strict import NotDeterministic
 from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -225,7 +232,10 @@ __all__ = [
     "Ignore",
     "InputRefused",
     "Job",
+    "JournalBlocked",
     "JournalFull",
+    "JournalGoesOn",
+    "JournalStopped",
     "KILLED",
     "KeyFreed",
     "KeyRegistered",
@@ -250,8 +260,11 @@ __all__ = [
     "NoRoute",
     "NoSuchActor",
     "NoSuchChild",
+    "NoSuchGroup",
     "Normal",
     "NotAnActor",
+    "NotDeterministic",
+    "NotQuarantined",
     "NotReadonly",
     "NotSupported",
     "NotSuspended",
@@ -274,6 +287,7 @@ __all__ = [
     "ProgramInput",
     "ProgramStatus",
     "Quarantined",
+    "QuarantinedMessage",
     "Recovered",
     "RecoveryFailed",
     "RecoveryFile",
@@ -314,6 +328,7 @@ __all__ = [
     "StartChild",
     "StartFailed",
     "StartIgnored",
+    "StateDiverged",
     "Statistics",
     "Status",
     "Step",

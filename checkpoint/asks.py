@@ -129,8 +129,9 @@ class Calls:
         self.asks.pop((turn, k), None)
         if turn > self._home.state_turn:  # Else it will not be replayed.
             self.outcomes[turn, k] = answer
-            entry = ("got", turn, k, answer.kind, answer.name, answer.body)
-            own.add(self._home.path, entry, self._home.positions_of(turn))
+            if self._home.journal.durable:
+                entry = ("got", turn, k, answer.kind, answer.name, answer.body)
+                own.add(self._home.path, entry, self._home.positions_of(turn))
         own.after.append(lambda: self._tell(turn, k, answer))
         if batch is None:
             own.commit(self._home.journal)

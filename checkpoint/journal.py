@@ -115,6 +115,13 @@ class Journal(Protocol):
         """Append (address, entry) pairs as one: all or none. Returns their positions, rising ints."""
         ...
 
+    def sync(self) -> None:
+        """Have everything appended so far survive a power loss; called in a worker thread, and `append` goes on.
+
+        A failure is for good (T13): from then on everything is refused.
+        """
+        ...
+
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep the snapshot, made after `turn`, then forget the positions it contains (T10: in this order).
 
@@ -211,6 +218,9 @@ class MemoryJournal:
         first = self._last + 1
         self._last += count
         return list(range(first, first + count))
+
+    def sync(self) -> None:
+        """Do nothing: nothing survives."""
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Do nothing: the switch keeps the snapshot."""

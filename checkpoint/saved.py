@@ -11,7 +11,7 @@ from ..actors.events import SnapshotDamaged
 from .compression import PLAIN, compressor, decompress
 from .inputs import OVERHEAD, Input, Turn
 from .journal import DamagedStore, Entry
-from .journal import Saved as FromStore
+from .journal import Saved as Journaled
 from .records import PIPE, STASHED, TICK, Answer, Snapshot
 from .segments import Place
 from .timers import Saved
@@ -83,9 +83,8 @@ def encode_meta(meta: Meta, compress: bool | int) -> bytes:
 
 def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> Meta:
     """A snapshot of the state after `turn`, with what the home knows at this moment."""
-    return Meta(
-        FORMAT, turn, home.next_id, stash, home.timers.saved(), list(home.topics), home.journal.epoch, state, turn
-    )
+    timers, topics = outlasting(home)
+    return Meta(FORMAT, turn, home.next_id, stash, timers, topics, home.journal.epoch, state, turn)
 
 
 def cut(home: Switch, state: bytes, record: Snapshot) -> None:
@@ -102,6 +101,22 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     home.images.tidy()
 
 
+def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:
+    """Timers and topics as they are after the last turn, though some of it may not have taken effect yet."""
+    timers, topics = home.timers.saved(), dict(home.topics)
+    for out in home.outputs.kept:
+        match out.verb:
+            case "timer":
+                timers[out.to] = (out.name, out.body, out.seconds, out.interval)
+            case "cancel":
+                timers.pop(out.to, None)
+            case "subscribe":
+                topics[out.to] = None
+            case _:
+                topics.pop(out.to, None)
+    return timers, list(topics)
+
+
 def put(home: Switch, meta: Meta, keep: int) -> None:
     """Have the next life begin with this, and forget the turns up to `meta.turn`; `keep` as in `Journal.cut`.
 
@@ -110,7 +125,9 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
     """
     covered = [number for number in home.turns if number <= meta.turn]
     if home.journal.durable:
-        drop = [*home.dropped, *(position for number in covered for position in home.positions.get(number, ()))]
+        home.journal.barrier()  # From here on it is known where everything stands.
+        drop = [*(position for known in home.dropped for position in known)]
+        drop += [*(position for number in covered for position in home.positions.get(number, ()))]
         # An image may be behind: what was stashed when it was begun may have been handled since.
         later = {turn.input.id for number, turn in home.turns.items() if number > meta.turn}
         for number in covered:
@@ -132,6 +149,7 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
 
 def go_back(home: Switch, meta: Meta) -> None:
     """Between two lives: timers and subscriptions are those of the snapshot again, as the state is."""
+    home.outputs.kept.clear()  # What has not taken effect yet is undone, too.
     if home.cell is not None:
         for topic in home.topics:
             if topic not in meta.topics:  # Those of its class are subscribed anew with the next life.
@@ -140,9 +158,12 @@ def go_back(home: Switch, meta: Meta) -> None:
     home.timers.replace(meta.timers)
 
 
-def load(home: Switch) -> None:
-    """Take up where the store left off."""
-    saved, newest = load_newest(home)
+def load(home: Switch, planted: Journaled | None = None) -> None:
+    """Take up where the store left off, or (in memory) where something else says."""
+    if planted is not None and not home.journal.durable:
+        saved, newest = planted, None if planted.snapshot is None else decode_meta(planted.snapshot)
+    else:
+        saved, newest = load_newest(home)
     timers: dict[str, Saved] = {}
     if newest is not None:
         meta = home.newest = newest
@@ -159,7 +180,7 @@ def load(home: Switch) -> None:
         home.timers.start(key, name, body, max(0.0, left), interval)
 
 
-def load_newest(home: Switch) -> tuple[FromStore, Meta | None]:
+def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:
     """The newest snapshot that can be used, with the journal since then; an event says if it is not the newest.
 
     Raises:
@@ -201,10 +222,10 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             if kind == PIPE:
                 turn, k = map(int, origin.split("."))
                 home.pipes_done.setdefault(turn, set()).add(k)
-        case ("end", turn, key, status, digests):
+        case ("end", turn, key, status, digests, *more):
             if key not in home.open:
                 return
-            past = home.turns[turn] = Turn(home.open[key], status, list(digests))
+            past = home.turns[turn] = Turn(home.open[key], status, list(digests), *more)
             home.positions_of(turn).append(position)
             past.input.turn = home.turn = turn
             home.partial, home.partial_id = [], -1
@@ -219,7 +240,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             home.calls.outcomes[turn, k] = Answer(kind, name, body)
         case ("drop", key):
             dropped = home.open.pop(key, None)
-            home.dropped.extend((*(dropped.positions if dropped is not None else ()), position))
+            home.dropped += ([] if dropped is None else dropped.positions, [position])
         case ("op", turn, verb, key, name, body, seconds, interval):
             home.positions_of(turn).append(position)
             match verb:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import types
-from collections.abc import Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
@@ -259,21 +259,35 @@ class Offered:
                         room.add_done_callback(self.go_on)
                         return
                     del self._cells[0]
-                    self._hand_to(cell)
+                    taken = self._hand_to(cell)
+                    if taken is not None:
+                        asyncio.ensure_future(taken).add_done_callback(self._taken)
+                        return
                 except HoldfastError as error:
                     if not self._is_published:
                         raise
                     self._cells = [other for other in self._cells if other is not cell]
                     peer.node.dead_letter(cell, self._parcel, str(error))  # One's trouble is not another's.
         except HoldfastError as error:
-            kind, name, body = peer.codec.encode_error(error)
-            peer.connection.send(frames.Failure(self._id, kind, name, Raw(body)))
+            self._fail(error)
         else:
             peer.connection.send(frames.Reply(self._id, Raw(NIL)))
 
-    def _hand_to(self, cell: Cell) -> None:
+    def _hand_to(self, cell: Cell) -> Awaitable[None] | None:
         message = self._peer.codec.message_in(cell, self._parcel.name, self._parcel.body)
-        cell.admit(cell, message if self._sender is None else Envelope(message, self._sender))
+        return cell.host.offer(cell, message if self._sender is None else Envelope(message, self._sender))
+
+    def _taken(self, done: asyncio.Future[None]) -> None:
+        """One receiver has accepted it, or not; then come the others."""
+        error = None if done.cancelled() else done.exception()
+        if isinstance(error, HoldfastError) and not self._is_published:
+            self._fail(error)
+        else:
+            self.go_on()
+
+    def _fail(self, error: HoldfastError) -> None:
+        kind, name, body = self._peer.codec.encode_error(error)
+        self._peer.connection.send(frames.Failure(self._id, kind, name, Raw(body)))
 
 
 class Arrived(Envelope, eq=False):
