@@ -66,7 +66,9 @@ class Due:
         """A future that ends when a snapshot of all turns up to now is safe."""
         home = self._home
         future: asyncio.Future[None] = home.node.loop.create_future()
-        if home.turn <= home.state_turn:
+        if not home.method.snapshots:
+            future.set_exception(CheckpointFailed(home.path, f"{home.method.name} takes no snapshots"))
+        elif home.turn <= home.state_turn:
             future.set_result(None)
         else:
             self.wishes.append((home.turn, future))

@@ -249,8 +249,8 @@ class Controls:
             AskTimeout: it was not within `timeout` seconds.
         """
         switch = switch_of(self._living(ref))
-        if switch is None:
-            raise SpecError(ref.path, "is not recorded, so there is nothing to save: give it recovery=hybrid(...)")
+        if switch is None or not switch.method.snapshots:
+            raise SpecError(ref.path, "keeps no snapshots: give it recovery=hybrid(...)")
         wish = switch.due.wish()
         done, _ = await asyncio.wait([wish], timeout=timeout)
         if not done:

@@ -48,8 +48,8 @@ class CheckpointHandler(Part):
 
     def _arm(self, home: Switch) -> None:
         """Look at this home as soon as it says so, and when its interval is over."""
-        if self.ctx.closed:
-            return  # Killed: the next one looks at everything.
+        if self.ctx.closed or not home.method.snapshots:  # Killed: the next one looks at everything.
+            return
         home.due.on_want = self._arm
         now = self.ctx.cell.node.loop.time()
         due = home.due.when(now)
@@ -79,7 +79,7 @@ class CheckpointHandler(Part):
                 continue
             del self._next[path]
             home = self._homes.at(path)
-            if home is not None:
+            if home is not None and home.method.snapshots:
                 self._consider(home, now)
         if self._heap and not self._timer:
             self._wake(self._heap[0][0])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from typing import Any
 
 import holdfast as hf
@@ -60,7 +60,7 @@ class Planner(Doer):
 
 
 @contextlib.asynccontextmanager
-async def running(store: str | None = None, **options: Any) -> AsyncIterator[hf.ActorSystem]:
+async def running(store: str | None = None, **options: Any) -> AsyncGenerator[hf.ActorSystem, None]:
     """A system that allows many restarts."""
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store, **options) as system:
         yield system

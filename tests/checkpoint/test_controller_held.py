@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.switch import Switch
 from tests.checkpoint.guards import over, running
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Tick, start, until
 from tests.checkpoint.strikes import doer, event, let_through, sink, strike, struck
@@ -67,6 +68,10 @@ async def test_tells_beyond_the_capacity(
                 except hf.MailboxFull:
                     failures += 1
             letters = [one.message.text for one in stream.take() if isinstance(one, hf.DeadLetter)]
+            if store is not None:  # What a root would find that is started now.
+                home: Any = ref._cell.host.switch  # type: ignore[attr-defined]
+                stored = Switch(system.node, ref.path, hf.hybrid(), system.homes.journal)
+                assert list(stored.open) == list(home.open), "drops are journaled"
             await held.let_go(system)
             told = await event(stream, hf.HeldMessages)
         expected = ["before", "waits", *kept]
@@ -311,7 +316,7 @@ async def test_timers_go_on_and_what_they_publish_is_heard_once(isolation: str) 
         ref = await start(system, isolation, "parent", hf.start(Parent), recovery=hf.hybrid(0.03))
         await ref.ask(Talk())
         for n in (3, 6, 9):
-            await until(lambda n=n: len(listener._cell.actor.seen) >= n)  # type: ignore[misc,union-attr]
+            await until(lambda n=n: len(listener._cell.actor.seen) >= n)  # type: ignore[union-attr]
             await struck(system, ref)
         await until(lambda: len(listener._cell.actor.seen) >= 12)  # type: ignore[union-attr]
         heard = await listener.ask(Seen())

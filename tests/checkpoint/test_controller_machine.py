@@ -6,7 +6,7 @@ import asyncio
 
 import hypothesis.strategies as st
 from hypothesis import settings
-from hypothesis.stateful import RuleBasedStateMachine, rule
+from hypothesis.stateful import RuleBasedStateMachine, precondition, rule
 
 import holdfast as hf
 from tests.checkpoint.guards import Wheels, part, words
@@ -67,8 +67,11 @@ class Overlap(RuleBasedStateMachine):
         self.runner.run(do())
         self.step(ticks)
 
-    @rule(path=st.sampled_from(PATHS), ticks=st.integers(0, 3))
-    def back(self, path: str, ticks: int) -> None:
+    @precondition(lambda self: self.hurt)
+    @rule(which=st.integers(0, 2), ticks=st.integers(0, 3))
+    def back(self, which: int, ticks: int) -> None:
+        path = sorted(self.hurt)[which % len(self.hurt)]
+
         async def do() -> None:
             self.recoveries.over(path)
 
@@ -119,5 +122,5 @@ class Overlap(RuleBasedStateMachine):
             self.runner.close()
 
 
-Overlap.TestCase.settings = settings(max_examples=40, stateful_step_count=25)
+Overlap.TestCase.settings = settings(max_examples=200, stateful_step_count=40)
 TestOverlap = Overlap.TestCase

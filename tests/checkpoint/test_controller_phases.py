@@ -10,7 +10,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.guards import POINTS, over, part, phases, planner, running, wheels, words
-from tests.checkpoint.players import Do, Note, Notes, Seen, until
+from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, until
 from tests.checkpoint.strikes import doer, event, sink, strike, struck
 
 ORDER = ["isolate", "restart", "restore", "replay", "release"]
@@ -177,6 +177,26 @@ async def test_a_part_that_is_down_for_good_is_not_waited_for(isolation: str, vi
             assert (called == []) == (victim == "controller")
 
 
+async def test_a_controller_that_ends_for_good_with_a_hook_in_hand(isolation: str) -> None:
+    """The recovery waits for that hook, which would take an hour; not for a controller that is no more."""
+    reached = asyncio.Event()
+
+    async def wait(step: hf.RecoveryStep) -> None:
+        reached.set()
+        await asyncio.sleep(3600.0)
+
+    async with running(recovery_hooks=hf.recovery_hooks(before={"restart": wait}, timeout=7200.0)) as system:
+        ref = await wheels(system)
+        robot = await planner(system, isolation)
+        with system.events() as stream:
+            robot.kill()
+            await reached.wait()
+            await system.stop(part(system, "controller"))
+            await event(stream, hf.Recovered)
+        await until(lambda: not system.homes.recoveries.all())
+        assert await words(ref) == ["safe", "free"]
+
+
 async def test_a_controller_that_does_not_come_to_it_is_not_waited_for(isolation: str) -> None:
     """Suspended, it lives and does nothing."""
     async with running() as system:
@@ -275,6 +295,36 @@ async def test_a_child_that_is_terminated_in_the_middle_stays_away(isolation: st
             await stopping
         assert kept.address == robot.path
         assert robot.path not in system.tree()
+
+
+@pytest.mark.parametrize("kind", ["task", "process"])
+async def test_a_sibling_has_it_started_anew_in_the_middle(kind: Any) -> None:
+    """one_for_all: the start that waits at a hook is given up; there is one new life, not two."""
+    reached, go_on = asyncio.Event(), asyncio.Event()
+
+    async def wait(step: hf.RecoveryStep) -> None:
+        reached.set()
+        await go_on.wait()
+
+    recovery = hf.hybrid(3600.0, hooks=hf.recovery_hooks(before={"restart": wait}, timeout=30.0))
+    async with running() as system:
+        children = [
+            hf.child("sibling", hf.start(Doer)),
+            hf.child("robot", hf.start(Doer), recovery=recovery, isolation=kind),
+        ]
+        await system.start(hf.supervisor("top", strategy="one_for_all", intensity=100, children=children))
+        robot, sibling = system.ref("/app/top/robot", Doer), system.ref("/app/top/sibling", Doer)
+        await robot.ask(Note("one"))
+        for _ in range(3):
+            reached.clear()
+            sibling.kill()
+            await reached.wait()
+            await asyncio.sleep(0.01)
+            assert (robot._cell.state, robot._cell.life) == ("down", 1)
+        go_on.set()
+        assert await robot.ask(Seen(), timeout=8.0) == ["one"]
+        await over(system)
+        assert robot._cell.life == 2
 
 
 async def test_a_system_ends_in_the_middle_of_a_recovery(isolation: str) -> None:
