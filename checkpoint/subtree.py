@@ -265,7 +265,8 @@ class SubtreeHome(HomeHost):
             self.restarting = bool(data["with_parent"])
 
     def retired(self, cell: Cell) -> None:
-        if self._starting is not None and not self._starting.done() and cell.state is GONE:
-            self._starting.cancel()
+        live = None if self.switch is None else self.switch.live
+        if self._starting is not None and cell.state is GONE and (live is None or not live.done()):
+            self._starting.cancel()  # Else it ends by itself, and tells how the recovery went.
         topics = self._wanted.topics if self._wanted is not None else ()
         self.give_up(cell, topics, restarting=self.restarting)

@@ -209,7 +209,7 @@ class Isolate(OnLiving):
 
     def __init__(self, target: Target, isolation: Isolation) -> None:
         super().__init__(target)
-        self._to = isolation
+        self._to: Isolation = isolation
         self._before: Isolation | None = None
         self._moving: asyncio.Task[None] | None = None
 

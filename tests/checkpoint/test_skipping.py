@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.actors.values import state_digest
-from holdfast.checkpoint.keys import save_state
+from holdfast.checkpoint.keys import state_of
 from tests.checkpoint.players import Note, Notes, Sink, gate, start, until
 from tests.checkpoint.strikes import NEVER, actor_of, event, home, let_through, strike, struck
 
@@ -341,7 +340,9 @@ def test_replays_that_leave_out_and_that_do_not_come_to_the_same(messages: list[
                 ref.kill()
             for ref in actors:
                 await ref.ask(Sum(), timeout=20.0)
-            digests = {state_digest(save_state(actor_of(ref))) for ref in actors}
-            assert len(digests) == 1
+            # Equal, not bit by bit: a dict may get its keys in another order when an early one is left out.
+            states = [state_of(actor_of(ref)).value for ref in actors]
+            assert states[0] == states[2]
+            assert states[1] == states[2]
 
     asyncio.run(play())
