@@ -11,7 +11,7 @@ import weakref
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from . import lives
+from . import lives, stopping
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
@@ -153,7 +153,7 @@ class Node(RunLoop):
             lives.retire(cell, "its parent has stopped")
             return cell.extra().reason
         stop = getattr(cell.spec, "stop", None)
-        reason: ExitReason = await (stop(cell) if stop is not None else lives.stop_in_time(cell))
+        reason: ExitReason = await (stop(cell) if stop is not None else stopping.stop_in_time(cell))
         lives.retire(cell, "its parent has stopped")
         return reason
 

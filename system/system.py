@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, TypeVar, cast
 
-from ..actors import lives
+from ..actors import lives, stopping
 from ..actors.actor import Actor, Start
 from ..actors.cell import Cell, Host
 from ..actors.control.drain import drain as drain_queue
@@ -191,7 +191,7 @@ class ActorSystem(Recorded, Controls):
             raise cancelled
 
     async def _close(self, root: Cell, node: Node) -> None:
-        await lives.stop_and_wait(root)
+        await stopping.stop_and_wait(root)
         await self._moves.close()
         if node.remains:
             await asyncio.wait(set(node.remains))
@@ -300,7 +300,7 @@ class ActorSystem(Recorded, Controls):
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:
-            await lives.stop_in_time(cell, reason)
+            await stopping.stop_in_time(cell, reason)
 
     def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
         """A ref to the actor at an address.
