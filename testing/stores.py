@@ -20,7 +20,8 @@ from typing import Any
 import pytest
 
 from ..actors.errors import HoldfastError
-from ..checkpoint.journal import Entry, Journal, Saved
+from ..checkpoint.journal import DamagedStore, Entry, Journal, Saved
+from ..checkpoint.segments import BLOCK, PAGE
 
 Factory = Callable[[Path], Journal]
 Crash = Callable[[Journal, Path], Path]
@@ -45,6 +46,14 @@ def conformance(factory: Factory, *, crash: Crash | None = None) -> type[StoreCo
     if crash is not None:
         made["crash"] = staticmethod(crash)
     return type("Conformance", (StoreConformance,), made)
+
+
+def _blocks(seed: int) -> list[tuple[int, memoryview]]:
+    """Blocks as a large snapshot has them: at multiples of a page, the last one of any length."""
+    draw = random.Random(seed)
+    pieces = (bytes(BLOCK), draw.randbytes(BLOCK), b"ab" * (PAGE // 2), draw.randbytes(PAGE + 5))
+    places = (0, BLOCK, 2 * BLOCK + 3 * PAGE, 3 * BLOCK)
+    return [(offset, memoryview(piece)) for offset, piece in zip(places, pieces, strict=True)]
 
 
 class StoreConformance:
@@ -126,6 +135,97 @@ class StoreConformance:
         assert older.entries == [(first[1], ("in", 2)), (second[0], ("in", 3))]
         journal.cut(A, b"newest", second, turn=3, keep=1)
         assert journal.load(A, older=True) == journal.load(A) == Saved(b"newest", 3, [])
+
+    @pytest.mark.parametrize("keep", [1, 2, 3, 5])
+    def test_as_many_snapshots_can_be_gone_back_as_are_kept(self, journal: Journal, tmp_path: Path, keep: int) -> None:
+        if not journal.durable:
+            pytest.skip("it keeps nothing")
+        positions: list[int] = []
+        for turn in range(1, 7):
+            positions += journal.append([(A, ("in", turn))])
+            journal.cut(A, b"%d" % turn, positions[-1:], turn=turn, keep=keep)
+        with closing(self.again(journal, tmp_path)) as reopened:
+            for older in (0, 1, 2, 4, 9):
+                turn = 6 - min(older, keep - 1)  # Never over the last one there is.
+                entries = [(positions[n - 1], ("in", n)) for n in range(turn + 1, 7)]
+                assert reopened.load(A, older=older) == Saved(b"%d" % turn, turn, entries)
+
+    @pytest.mark.parametrize("compress", [False, True, 19])
+    def test_blocks_come_back_at_their_places(self, journal: Journal, tmp_path: Path, compress: bool | int) -> None:
+        if compress:
+            pytest.importorskip("zstandard")
+        if not journal.durable:
+            self._keeps_no_blocks(journal)
+            return
+        blocks = _blocks(compress)
+        places = [(offset, len(block)) for offset, block in blocks]
+        journal.keep_blocks(A, 7, blocks, compress)
+        with closing(self.again(journal, tmp_path)) as reopened:
+            for wanted in (places, places[1:], places[:1], []):
+                segment = reopened.read_blocks(A, 7, wanted)
+                try:
+                    assert segment.number == 7
+                    for offset, block in blocks:
+                        if (offset, len(block)) in wanted:
+                            assert bytes(segment.block(offset, len(block))) == bytes(block)
+                finally:
+                    segment.close()
+
+    def test_blocks_that_are_not_there_are_refused(self, journal: Journal) -> None:
+        if not journal.durable:
+            self._keeps_no_blocks(journal)
+            return
+        blocks = _blocks(0)
+        offset, block = blocks[1]
+        journal.keep_blocks(A, 7, blocks, False)
+        for address, number, place in (
+            (A, 8, (offset, len(block))),
+            (B, 7, (offset, len(block))),
+            (A, 7, (offset + 4096, len(block))),
+            (A, 7, (offset, len(block) + 1)),
+        ):
+            with pytest.raises(DamagedStore):
+                journal.read_blocks(address, number, [place])
+
+    def test_blocks_that_no_snapshot_needs_can_be_forgotten(self, journal: Journal, tmp_path: Path) -> None:
+        if not journal.durable:
+            journal.forget_blocks(A, [])
+            return
+        for address, number in ((A, 1), (A, 2), (A, 1 << 55), (B, 2)):
+            journal.keep_blocks(address, number, _blocks(number), False)
+        journal.cut(A, b"of 2", [], turn=1)
+        journal.forget_blocks(A, [2, 99])
+        journal.forget_blocks("/unknown", [])
+        with closing(self.again(journal, tmp_path)) as reopened:
+            self._has_packs(reopened, {(A, 2), (B, 2)})
+            reopened.erase(A)
+            reopened.erase(B)  # It has blocks and nothing else.
+            self._has_packs(reopened, set())
+
+    def test_blocks_outlive_a_kill(self, journal: Journal, tmp_path: Path) -> None:
+        if self.crash is None or not journal.durable:
+            pytest.skip("nothing is known of kills")
+        folder = tmp_path / "0"
+        folder.mkdir()
+        with closing(self.factory(folder)) as killed:
+            killed.keep_blocks(A, 2, _blocks(2), False)
+            copy = self.crash(killed, folder)
+        with closing(self.factory(copy)) as reopened:
+            self._has_packs(reopened, {(A, 2)})
+
+    def _has_packs(self, journal: Journal, expected: set[tuple[str, int]]) -> None:
+        for address, number in ((A, 1), (A, 2), (A, 1 << 55), (B, 2)):
+            places = [(offset, len(block)) for offset, block in _blocks(number)]
+            if (address, number) in expected:
+                journal.read_blocks(address, number, places).close()
+            else:
+                with pytest.raises(DamagedStore):
+                    journal.read_blocks(address, number, places)
+
+    def _keeps_no_blocks(self, journal: Journal) -> None:
+        journal.keep_blocks(A, 7, _blocks(0), False)
+        with pytest.raises(DamagedStore):
+            journal.read_blocks(A, 7, [(0, 4096)])
 
     def test_what_is_erased_is_gone_and_nothing_else_is(self, journal: Journal, tmp_path: Path) -> None:
         journal.append([(A, ("in", 1)), (B, ("in", 2))])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING
 
@@ -47,7 +48,7 @@ class Offered:
                     del self._cells[0]
                     taken = self._hand_to(cell)
                     if taken is not None:
-                        asyncio.ensure_future(taken).add_done_callback(self._taken)
+                        asyncio.ensure_future(taken).add_done_callback(functools.partial(self._taken, cell))
                         return
                 except HoldfastError as error:
                     if not self._is_published:
@@ -63,13 +64,15 @@ class Offered:
         message = self._peer.codec.message_in(cell, self._parcel.name, self._parcel.body)
         return cell.host.offer(cell, message if self._sender is None else Envelope(message, self._sender))
 
-    def _taken(self, done: asyncio.Future[None]) -> None:
+    def _taken(self, cell: Cell, done: asyncio.Future[None]) -> None:
         """One receiver has accepted it, or not; then come the others."""
         error = None if done.cancelled() else done.exception()
-        if isinstance(error, HoldfastError) and not self._is_published:
-            self._fail(error)
-        else:
-            self.go_on()
+        if isinstance(error, HoldfastError):
+            if not self._is_published:
+                self._fail(error)
+                return
+            self._peer.node.dead_letter(cell, self._parcel, str(error))
+        self.go_on()
 
     def _fail(self, error: HoldfastError) -> None:
         kind, name, body = self._peer.codec.encode_error(error)

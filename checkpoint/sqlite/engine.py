@@ -247,6 +247,7 @@ class SqliteJournal:
         with self._store.lock:
             self._store.refresh()
             if address not in self._store.chains:
+                self.forget_blocks(address, ())  # of a snapshot that was never cut
                 return
             with self._store.transaction(note=True) as db:
                 # From here on it is gone; if we die before the rest is done, the next opening does it.
