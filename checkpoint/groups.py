@@ -146,7 +146,13 @@ class Groups:
         return [key.removeprefix(_key("")) for key in self._homes.journal.notes(_key(""))]
 
     def forget(self, name: str) -> None:
-        """Remove a group snapshot; an unknown one is no error."""
+        """Remove a group snapshot.
+
+        Raises:
+            NoSuchGroup: there is none of that name. HoldfastError: the store refused.
+        """
+        if self._homes.journal.noted(_key(name)) is None:
+            raise NoSuchGroup(name)
         self._homes.journal.note(_key(name), None)
 
     def replace(self, name: str) -> None:

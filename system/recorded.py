@@ -60,6 +60,19 @@ class Recorded:
         homes.groups.take(name, [actor.path for actor in actors])
         await homes.synced()
 
+    def group_snapshots(self) -> list[str]:
+        """The names of the group snapshots there are, oldest first."""
+        return self.homes.groups.names()
+
+    async def forget_group(self, name: str) -> None:
+        """Remove a group snapshot, which takes as much room as the states of its actors do.
+
+        Raises:
+            NoSuchGroup: there is none of that name. HoldfastError: the store refused.
+        """
+        self.homes.groups.forget(name)
+        await self.homes.synced()
+
     async def restore_group(self, name: str, *, timeout: float = 60.0) -> None:
         """Bring all actors of a group snapshot back to it, with the messages that were under way between them.
 

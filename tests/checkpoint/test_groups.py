@@ -159,6 +159,25 @@ async def test_a_root_that_dies_on_the_way_back_finishes_it_at_its_next_start(tm
     assert step > 4
 
 
+async def test_what_is_not_wanted_any_more_is_forgotten_for_good(store: str | None) -> None:
+    async with running(store) as system:
+        ring = await purses(system, "task")
+        for name in ("b", "a", "c", "b"):  # The last one takes the place of the first.
+            await system.checkpoint_group(ring, name=name)
+        assert system.group_snapshots() == ["a", "c", "b"]
+        await system.forget_group("c")
+        with pytest.raises(hf.NoSuchGroup, match="'c'"):
+            await system.forget_group("c")
+        assert system.group_snapshots() == ["a", "b"]
+    if store is not None:
+        async with running(store) as system:
+            assert system.group_snapshots() == ["a", "b"]
+            ring = await purses(system, "task")
+            with pytest.raises(hf.NoSuchGroup):
+                await system.restore_group("c")
+            await system.restore_group("a")
+
+
 class Mortal:
     """An engine whose process dies before its n-th writing call."""
 
