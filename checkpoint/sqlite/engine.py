@@ -172,7 +172,7 @@ class SqliteJournal:
                 files = self._delete_snapshots(db, outdated)
                 del chain.kept[: len(outdated)]
                 chain.write(db)
-            self._store.files.remove(files)
+            self._store.remove_files(files)
         if len(chain.kept) >= keep:
             self._remove_dropped(chain, chain.kept[0])
 
@@ -255,6 +255,8 @@ class SqliteJournal:
                 chain.path = None
                 chain.write(db)
         self._finish_erase(chain)
+        if self._packs.names(address):
+            self._store.sync_rows()
         self._packs.erase(address)
 
     def keep_blocks(
@@ -275,7 +277,7 @@ class SqliteJournal:
             return
         with self._store.transaction():
             pass  # Somebody else may own the store by now: then the packs are theirs.
-        self._store.files.sync_rows()
+        self._store.sync_rows()
         self._packs.remove(address, unneeded)
 
     def _finish_erase(self, chain: Chain) -> None:
@@ -285,7 +287,7 @@ class SqliteJournal:
             owned = db.execute("SELECT id FROM snapshots WHERE address = ?", (chain.id,)).fetchall()
             files = self._delete_snapshots(db, [number for (number,) in owned])
             db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
-        self._store.files.remove(files)
+        self._store.remove_files(files)
 
     def addresses(self) -> list[str]:
         """Every address that has something stored, sorted."""

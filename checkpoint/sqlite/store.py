@@ -7,7 +7,7 @@ import os
 import sqlite3
 import threading
 from array import array
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from typing import Final
 
 from ...actors.errors import HoldfastError
@@ -195,6 +195,32 @@ class Store:
         with self.lock:
             self.refuse_failed()
             self._mark.set_synced(last)
+
+    def sync_rows(self) -> None:
+        """Bring what was committed to the disk, before anything is removed that it does not name any more.
+
+        Raises:
+            StoreFailed: from now on everything is refused: the WAL is what the journal stands in.
+        """
+        try:
+            self.files.sync_rows()
+        except OSError as error:
+            with self.lock:
+                raise self.translate(error) from error
+
+    def remove_files(self, names: Sequence[str]) -> None:
+        """Remove snapshot files that no row names.
+
+        Raises:
+            StoreFailed: they could not be removed, which is done at the next opening; or as `sync_rows`.
+        """
+        if not names:
+            return
+        self.sync_rows()
+        try:
+            self.files.remove(names)
+        except OSError as error:
+            raise StoreFailed(self.path, f"{error}; snapshot files are left behind") from error
 
     def refuse_failed(self) -> None:
         """Raise the failure that ended the store, if there is one."""
