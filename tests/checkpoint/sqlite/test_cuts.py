@@ -259,13 +259,13 @@ def test_a_failed_sync_of_the_rows_before_files_are_removed_stops_the_store(
             fsync(fd)
 
         monkeypatch.setattr(os, "fsync", fail)
+        calls = {
+            "cut": lambda: journal.cut("/a", large, [], turn=2, keep=1),
+            "erase": lambda: journal.erase("/a"),
+            "forget_blocks": lambda: journal.forget_blocks("/a", []),
+        }
         with pytest.raises(StoreFailed, match="the disk is gone"):
-            if what == "cut":
-                journal.cut("/a", large, [], turn=2, keep=1)
-            elif what == "erase":
-                journal.erase("/a")
-            else:
-                journal.forget_blocks("/a", [])
+            calls[what]()
         assert journal.has_failed()
         for refused in (lambda: journal.append([("/a", ("in", 1))]), journal.sync):
             with pytest.raises(StoreFailed, match="the disk is gone"):
