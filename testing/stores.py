@@ -147,7 +147,7 @@ class StoreConformance:
         with closing(self.again(journal, tmp_path)) as reopened:
             for older in (0, 1, 2, 4, 9):
                 turn = 6 - min(older, keep - 1)  # Never over the last one there is.
-                entries = [(positions[n - 1], ("in", n)) for n in range(turn + 1, 7)]
+                entries: list[tuple[int, Entry]] = [(positions[n - 1], ("in", n)) for n in range(turn + 1, 7)]
                 assert reopened.load(A, older=older) == Saved(b"%d" % turn, turn, entries)
 
     @pytest.mark.parametrize("compress", [False, True, 19])

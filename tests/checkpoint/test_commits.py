@@ -202,7 +202,7 @@ async def test_an_effect_that_fails_does_not_hold_up_the_others(engine: Any) -> 
     async with opened(engine) as commits:
         commits.want("/a", None)
         bad = Effect("bad", done)
-        bad.safe = lambda: 1 / 0  # type: ignore[assignment, method-assign, return-value]
+        bad.safe = lambda: 1 / 0  # type: ignore[assignment, method-assign]
         commits.submit(bad)
         commits.submit(Effect("good", done))
         await ticks()
@@ -223,7 +223,8 @@ async def test_nothing_counts_before_the_sync(engine: Any, isolation: str) -> No
         engine.let_sync.clear()
         reply = doer.ask(Do(["add a", "tell out"], sink), timeout=30.0)
         sent = asyncio.ensure_future(doer.send(Note("b")))
-        done, _ = await asyncio.wait([reply, sent], timeout=0.1)
+        waiting: list[asyncio.Future[Any]] = [reply, sent]
+        done, _ = await asyncio.wait(waiting, timeout=0.1)
         assert done == set()
         home = system.homes.at(doer.path)
         assert home is not None
@@ -370,7 +371,7 @@ async def test_a_killed_message_handler_loses_nothing(isolation: str, tmp_path: 
 
 async def test_each_child_may_say_what_it_wants(tmp_path: Path) -> None:
     store = f"sqlite:{tmp_path / 'app.db'}"
-    specs = {word: hf.hybrid(interval=1000.0, durability=word) for word in ("memory", "os", "fsync")}  # type: ignore[arg-type]
+    specs = {word: hf.hybrid(interval=1000.0, durability=word) for word in ("memory", "os", "fsync")}
     async with hf.ActorSystem("app", log=False, store=store, intensity=1000) as system:
         for word, recovery in specs.items():
             doer = await system.start(hf.child(word, hf.start(Doer), recovery=recovery))

@@ -30,9 +30,11 @@ class TestSqlite(conformance(lambda path: SqliteJournal(path / "app.db"), crash=
     """The store of `store="sqlite:PATH"`."""
 
 
-class TestSqliteSynced(  # type: ignore[misc]
-    conformance(lambda path: SqliteJournal(path / "app.db", synchronous="fsync"), crash=killed)
-):
+def synced(path: Path) -> Journal:
+    return SqliteJournal(path / "app.db", synchronous="fsync")
+
+
+class TestSqliteSynced(conformance(synced, crash=killed)):  # type: ignore[misc]
     """The same, when each append is synced."""
 
 

@@ -186,6 +186,7 @@ async def test_a_replay_that_leads_to_the_same_state_is_none_the_wiser(isolation
 
 
 def test_the_settings_are_checked() -> None:
-    for wrong in ({"strict": 1}, {"check_replay": "yes"}, {"durability": "disk"}):
+    wrongs: list[dict[str, Any]] = [{"strict": 1}, {"check_replay": "yes"}, {"durability": "disk"}]
+    for wrong in wrongs:
         with pytest.raises(hf.SpecError, match=f"hybrid: {next(iter(wrong))} must be"):
-            hf.hybrid(**wrong)  # type: ignore[arg-type]
+            hf.hybrid(**wrong)
