@@ -33,6 +33,7 @@ from holdfast.actors.errors import (
     SpecError,
     StartFailed,
     StartIgnored,
+    StoreError,
     TreeFailed,
     UnknownMessage,
     WrongActor,
@@ -111,6 +112,7 @@ from holdfast.checkpoint.compared import StateDiverged
 from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.file import RecoveryFile, load_recovery
 from holdfast.checkpoint.groups import NoSuchGroup
+from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed, StoreInUse
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.checkpoint.readonly import NotReadonly
@@ -215,6 +217,7 @@ __all__ = [
     "CountChildren",
     "CountPartitions",
     "Crash",
+    "DamagedStore",
     "DeadLetter",
     "DeleteChild",
     "DynamicSupervisor",
@@ -324,6 +327,7 @@ __all__ = [
     "SnapshotFailed",
     "SnapshotTaken",
     "SpecError",
+    "StaleEpoch",
     "Start",
     "StartChild",
     "StartFailed",
@@ -332,6 +336,9 @@ __all__ = [
     "Statistics",
     "Status",
     "Step",
+    "StoreError",
+    "StoreFailed",
+    "StoreInUse",
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
