@@ -67,7 +67,9 @@ async def test_a_timer_has_run_on_while_the_root_was_away(tmp_path: Path, saved:
     async with hf.ActorSystem("app", store=store, log=False) as system:
         system.node.wall = lambda: time.time() + later
         alarm = await system.start(ALARM)
-        ((_, _, left, _),) = system.homes.at(alarm.path).timers.saved().values()
+        home = system.homes.at(alarm.path)
+        assert home is not None
+        ((_, _, left, _),) = home.timers.saved().values()
         assert left == pytest.approx(10.0 if later > 0 else 3600.0, abs=5.0)
 
 
