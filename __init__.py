@@ -33,6 +33,7 @@ from holdfast.actors.errors import (
     SpecError,
     StartFailed,
     StartIgnored,
+    StoreError,
     TreeFailed,
     UnknownMessage,
     WrongActor,
@@ -48,7 +49,10 @@ from holdfast.actors.events import (
     Event,
     EventStream,
     HeldMessages,
+    JournalBlocked,
     JournalFull,
+    JournalGoesOn,
+    JournalStopped,
     LogLine,
     LoopLagged,
     MessageIn,
@@ -104,9 +108,13 @@ from holdfast.actors.process.kept import ProgramFailed
 from holdfast.actors.process.limits import Limits
 from holdfast.actors.ref import ActorRef
 from holdfast.actors.timers import Timer
+from holdfast.checkpoint.compared import StateDiverged
 from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.file import RecoveryFile, load_recovery
+from holdfast.checkpoint.groups import NoSuchGroup
+from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed, StoreInUse
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
+from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.checkpoint.readonly import NotReadonly
 from holdfast.checkpoint.recovery.settings import (
     Held,
@@ -117,6 +125,7 @@ from holdfast.checkpoint.recovery.settings import (
     recovery_hooks,
     safe_state,
 )
+from holdfast.checkpoint.strict import NotDeterministic
 from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -208,6 +217,7 @@ __all__ = [
     "CountChildren",
     "CountPartitions",
     "Crash",
+    "DamagedStore",
     "DeadLetter",
     "DeleteChild",
     "DynamicSupervisor",
@@ -225,7 +235,10 @@ __all__ = [
     "Ignore",
     "InputRefused",
     "Job",
+    "JournalBlocked",
     "JournalFull",
+    "JournalGoesOn",
+    "JournalStopped",
     "KILLED",
     "KeyFreed",
     "KeyRegistered",
@@ -250,8 +263,11 @@ __all__ = [
     "NoRoute",
     "NoSuchActor",
     "NoSuchChild",
+    "NoSuchGroup",
     "Normal",
     "NotAnActor",
+    "NotDeterministic",
+    "NotQuarantined",
     "NotReadonly",
     "NotSupported",
     "NotSuspended",
@@ -274,6 +290,7 @@ __all__ = [
     "ProgramInput",
     "ProgramStatus",
     "Quarantined",
+    "QuarantinedMessage",
     "Recovered",
     "RecoveryFailed",
     "RecoveryFile",
@@ -310,13 +327,18 @@ __all__ = [
     "SnapshotFailed",
     "SnapshotTaken",
     "SpecError",
+    "StaleEpoch",
     "Start",
     "StartChild",
     "StartFailed",
     "StartIgnored",
+    "StateDiverged",
     "Statistics",
     "Status",
     "Step",
+    "StoreError",
+    "StoreFailed",
+    "StoreInUse",
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",

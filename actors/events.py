@@ -263,6 +263,22 @@ class JournalFull(Event, frozen=True, eq=False):
     way_out: str = ""
 
 
+class JournalBlocked(Event, frozen=True, eq=False):
+    """The store has no room, or is locked: nothing is admitted, and nothing leaves, until it writes again."""
+
+    reason: str
+
+
+class JournalGoesOn(Event, frozen=True, eq=False):
+    """The store writes again; what has waited leaves."""
+
+
+class JournalStopped(Event, frozen=True, eq=False):
+    """The store failed: nothing is admitted, and nothing leaves any more. Start the root again, which verifies it."""
+
+    reason: str
+
+
 class TurnSlow(Event, frozen=True, eq=False):
     """A turn occupied the event loop for `seconds`: nothing else ran meanwhile; `message` is its type."""
 

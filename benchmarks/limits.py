@@ -20,6 +20,7 @@ import subprocess
 import sys
 from collections import deque
 from collections.abc import AsyncGenerator, Callable, Generator
+from concurrent.futures import ThreadPoolExecutor
 from types import TracebackType
 from typing import Any, Final, Self, cast
 
@@ -325,6 +326,52 @@ async def echo_process() -> AsyncGenerator[Client, None]:
         finally:
             client.transport.abort()
             await client.closed
+
+
+# --- on the disk ----------------------------------------------------------------------------------------------------
+
+
+class GroupCommit:
+    """Limit of durable admissions: an append-only file, one write and one fdatasync in a thread for all that came."""
+
+    def __init__(self, path: str) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        self._thread = ThreadPoolExecutor(1)
+        self._records: list[bytes] = []
+        self._waiting: list[asyncio.Future[None]] = []
+        self._busy = False
+
+    def append(self, record: bytes) -> asyncio.Future[None]:
+        accepted: asyncio.Future[None] = self._loop.create_future()
+        self._records.append(record)
+        self._waiting.append(accepted)
+        if not self._busy:
+            self._busy = True
+            self._loop.call_soon(self._commit)
+        return accepted
+
+    def _commit(self) -> None:
+        records, self._records = self._records, []
+        waiting, self._waiting = self._waiting, []
+        done = self._loop.run_in_executor(self._thread, self._sync, b"".join(records))
+        done.add_done_callback(lambda _: self._synced(waiting))
+
+    def _sync(self, data: bytes) -> None:
+        os.write(self._fd, data)
+        os.fdatasync(self._fd)
+
+    def _synced(self, waiting: list[asyncio.Future[None]]) -> None:
+        for accepted in waiting:
+            accepted.set_result(None)
+        if self._records:
+            self._commit()
+        elif not self._waiting:
+            self._busy = False
+
+    def close(self) -> None:
+        self._thread.shutdown()
+        os.close(self._fd)
 
 
 # --- a process for each actor ---------------------------------------------------------------------------------------

@@ -9,8 +9,8 @@ import msgspec
 from ..actors.codec import Parcel
 from ..actors.errors import ActorStopped, AskFailed, HoldfastError, Quarantined
 from ..actors.events import MessageQuarantined
+from .commits import Unkept
 from .inputs import OVERHEAD, Batch, Input
-from .journal import MemoryJournal
 from .records import DROPPED, MESSAGE, START, Answer
 
 if TYPE_CHECKING:
@@ -30,8 +30,10 @@ class Ends:
         home.bytes -= len(source.body) + OVERHEAD
         if home.bound is not None:
             home.bound.ended(source)
-        home.dropped.extend(source.positions)
-        batch.add(home.path, ("drop", source.id), home.dropped)
+        if home.journal.durable:
+            position: list[int] = []
+            home.dropped += (source.positions, position)  # Perhaps they stand nowhere yet.
+            batch.add(home.path, ("drop", source.id), position)
         home.give(source, answer, batch)
 
     def begun(self, source: Input, error: HoldfastError, batch: Batch) -> None:
@@ -48,6 +50,8 @@ class Ends:
         home = self._home
         home.node.emit(MessageQuarantined(home.path, source.name, source.deliveries))
         batch = Batch()
+        if home.quarantine is not None:
+            home.quarantine.hold(home, source, batch)
         self.begun(source, Quarantined(home.path, source.deliveries), batch)
         batch.commit(home.journal)
 
@@ -96,7 +100,7 @@ class Ends:
     def erased(self, why: str) -> None:
         """All that was recorded is gone from the store; here it goes too, and nothing is written for it any more."""
         home = self._home
-        home.journal = MemoryJournal()
+        home.journal = Unkept(home.journal.commits)
         home.calls.abandon()
         self.drop_all(why)
         home.timers.replace({})

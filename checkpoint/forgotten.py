@@ -36,9 +36,11 @@ def forget_turns(home: Switch) -> None:
     count = sum(turn.status == OK and turn.input.kind != START for turn in home.turns.values())
     for number, turn in home.turns.items():
         source = turn.input
-        home.dropped += home.positions.pop(number, ())
-        if source.id not in home.open:  # Else it was put aside, and waits again.
-            home.dropped += source.positions
+        known = home.positions.pop(number, [])  # Perhaps they stand nowhere yet.
+        if home.journal.durable:
+            home.dropped.append(known)
+            if source.id not in home.open:  # Else it was put aside, and waits again.
+                home.dropped.append(source.positions)
         if turn.status != STASHED:
             home.bytes -= len(source.body) + OVERHEAD
         ask = home.later.pop(source.id, None)

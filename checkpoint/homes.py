@@ -4,22 +4,28 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Awaitable, Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any
 
 from ..actors.cell import GONE, RUNNING, Cell
 from ..actors.errors import HoldfastError, StartFailed, StartIgnored
 from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
+from .admission import Admission
 from .bound import HomeBound
+from .commits import Commits, Unkept
 from .due import nobody
 from .file import RecoveryFile
 from .forgotten import forget_turns
-from .journal import Journal
-from .method import Method
+from .groups import Groups
+from .inputs import HomeJournal
+from .journal import Journal, Saved
+from .method import Durability, Method
+from .quarantine import PLACE, Quarantine
 from .recovery.held import hold, inlet, let_go
 from .recovery.register import Recoveries, Recovery
+from .rejoin import Rejoin
 from .rollback import roll_back
 from .switch import Switch
 
@@ -34,8 +40,11 @@ ERASING = "erasing"
 class Homes:
     """All recorded addresses of a root, and their journal. A home stays when its actor is stopped."""
 
-    def __init__(self, node: Node, journal: Journal) -> None:
-        self.node, self.journal = node, journal
+    def __init__(self, node: Node, journal: Journal, *, durability: Durability | None = None) -> None:
+        self.node = node
+        self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
+        self._unkept = Unkept(self.journal)
+        self.quarantine = Quarantine(node, self.journal)
         self._switches: dict[str, Switch] = {}
         self.recoveries = Recoveries(node)
         self.on_first: Callable[[], None] | None = None  # there is something to watch over from now on
@@ -43,40 +52,68 @@ class Homes:
         self._blamed: set[str] = set()  # because of whom a supervisor has ended that is not back yet
         self.file: RecoveryFile | None = None
         self._returns: dict[str, list[float]] = {}  # when that came back to an address, on the loop's clock
+        self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         unfinished = journal.notes(ERASING).get(ERASING)
-        self._stored = set(journal.addresses())
+        self._stored = set(journal.addresses()) - {PLACE}
         if unfinished is not None:  # This process's predecessor died in the middle of it.
             self._erase_tree(unfinished.decode())
+        self.groups = Groups(self)
+        self.rejoin = Rejoin(self)
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for."""
         switch = self._switches.get(cell.path)
         if switch is None:
-            switch = self._switches[cell.path] = Switch(self.node, cell.path, method, self.journal)
-            switch.recoveries = self.recoveries
+            switch = self._switches[cell.path] = Switch(
+                self.node, cell.path, method, self._journal_of(method), self.planted.pop(cell.path, None)
+            )  # fmt: skip
+            switch.recoveries, switch.quarantine, switch.rejoin = self.recoveries, self.quarantine, self.rejoin
+            switch.cell = cell
+            self.rejoin.loaded(switch)
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
                 begin()
         self.absolve(cell.path)
         switch.use(method)
+        if switch.journal.durable:
+            self.journal.want(cell.path, method.durability)
         switch.cell = cell
         self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
             let_go(switch)
             switch.bound, more.bound = HomeBound(switch, more.bound), None
+        self.groups.opened(switch)
         cell.admit = switch.admit
         more.outlet = switch
         return switch
+
+    def _journal_of(self, method: Method) -> HomeJournal:
+        """Where what happens at an address is kept, from its first life on."""
+        wanted = method.durability or self.journal.durability
+        return self._unkept if self.journal.durable and wanted == "memory" else self.journal
+
+    def vacate(self, path: str, why: str) -> None:
+        """What is known here of an address where nobody lives is not true any more; the store is somebody else's."""
+        self._stored.add(path)
+        switch = self._switches.pop(path, None)
+        if switch is not None:
+            switch.ends.erased(why)
+
+    def refuses(self, method: Method) -> str:
+        """Why this method cannot work here; "" if it can."""
+        if method.durability in ("os", "fsync") and not self.journal.durable:
+            return f"durability={method.durability!r} needs a store: ActorSystem(store='sqlite:PATH')"
+        return ""
+
+    def at(self, path: str) -> Switch | None:
+        """The home of an address that somebody was started at."""
+        return self._switches.get(path)
 
     def find(self, path: str) -> Cell | None:
         """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
         switch = self._switches.get(path)
         return None if switch is None or switch.cell is None or switch.cell.state is GONE else switch.cell
-
-    def home(self, path: str) -> Switch | None:
-        """The home of an address, if there is one."""
-        return self._switches.get(path)
 
     def __iter__(self) -> Iterator[Switch]:
         return iter(self._switches.values())
@@ -113,9 +150,11 @@ class Homes:
 
     def _erase(self, path: str) -> None:
         self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
+        self.quarantine.forget(path)
         self._stored.discard(path)
         self._blamed.discard(path)
         self._returns.pop(path, None)
+        self.planted.pop(path, None)
         switch = self._switches.pop(path, None)
         if switch is not None:
             switch.ends.erased("what was recorded of it has been erased")
@@ -150,6 +189,15 @@ class Homes:
     def notes(self, prefix: str) -> dict[str, bytes]:
         """The facts whose keys begin so, oldest first."""
         return self.journal.notes(prefix)
+
+    async def synced(self) -> None:
+        """Wait until all that has happened is as safe as the store's durability says."""
+        if self.journal.durability == "fsync":
+            await self.node.loop.run_in_executor(None, self.journal.engine.sync)
+
+    async def settled(self) -> None:
+        """Wait until everything that was submitted has taken effect."""
+        await self.journal.settled()
 
     def close(self) -> None:
         """Close the store, and let go of the states."""
@@ -287,6 +335,14 @@ class HomeHost:
             switch.live.set_exception(StartFailed(cell.path, why))
             switch.live.exception()  # Nobody may be left to look.
 
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        """Admit a message for a sender that waits until it counts."""
+        commits = self.homes.journal
+        before = commits.submitted
+        cell.admit(cell, item)
+        last = commits.last if commits.submitted != before else None
+        return last.accepted() if isinstance(last, Admission) else None
+
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
@@ -355,7 +411,8 @@ class HomeHost:
             await self.gate("release")
             if port is None or switch.port is not port:
                 raise StartFailed(switch.path, ENDED)
-            switch.release()
+            switch.waits_for_release = False
+            switch.let_at()
 
 
 def parent_ended(cell: Cell) -> bool:

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
+from ..actors.errors import HoldfastError
 from ..actors.mail import Ask
-from .journal import Entry, Journal
+from .journal import Entry
 from .records import TICK, Feed
 
+if TYPE_CHECKING:
+    from .commits import Commits, Unkept
+
+HomeJournal: TypeAlias = "Commits | Unkept"
+"""What a home writes to."""
 OVERHEAD = 200
 """Bytes an input is counted with besides its payload."""
 EXPIRED = 1e-9
@@ -36,6 +43,7 @@ class Input(msgspec.Struct, gc=False, eq=False):
     deliveries: int = 0  # deaths of the process in this very turn
     origin: str = ""  # the timer or pipe it comes from
     positions: list[int] = NO_POSITIONS
+    held: bool = False  # not as safe yet as it has to be: it must not be fed
 
     def feed(self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False) -> Feed:
         """As the life gets it; what has begun is finished whatever its deadline."""
@@ -54,6 +62,7 @@ class Turn(msgspec.Struct, gc=False, eq=False):
     input: Input
     status: str
     digests: list[int]
+    state: int = 0  # digest of the state it has left, if that is checked
 
 
 class TimerState:
@@ -77,14 +86,27 @@ class Batch:
         self.after: list[Callable[[], None]] = []
 
     def add(self, path: str, entry: Entry, sink: list[int]) -> None:
-        """One more entry; `sink` gets its position."""
+        """One more entry, of a home that keeps a journal; `sink` gets its position."""
         self.entries.append((path, entry))
         self.sinks.append(sink)
 
-    def commit(self, journal: Journal) -> None:
-        """Append all of it, then let it take effect."""
-        if self.entries and journal.durable:
-            for sink, position in zip(self.sinks, journal.append(self.entries), strict=True):
-                sink.append(position)
+    def commit(self, journal: HomeJournal) -> None:
+        """Have all of it appended; then it takes effect."""
+        if self.entries:
+            journal.submit(self)
+        else:
+            self.safe()
+
+    def written(self, positions: Sequence[int]) -> None:
+        """It stands there in the journal."""
+        for sink, position in zip(self.sinks, positions, strict=True):
+            sink.append(position)
+
+    def safe(self) -> None:
+        """Let it take effect."""
         for effect in self.after:
             effect()
+
+    def refused(self, error: HoldfastError) -> bool:
+        """It has happened: it waits."""
+        return False

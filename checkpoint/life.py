@@ -17,6 +17,7 @@ from ..actors.errors import BadMessage, ControlFailed, HoldfastError, StartFaile
 from ..actors.exits import ExitReason
 from ..actors.mail import Item
 from ..actors.message import Message, message_name
+from .compared import digest_of
 from .context import RecordedContext
 from .imaging import Imaging
 from .keys import check_keys, restore_state, save_state
@@ -24,7 +25,9 @@ from .method import Method
 from .readonly import check_readonly
 from .records import (
     FAILED,
+    OK,
     REPLY,
+    STASHED,
     Answer,
     Begin,
     Feed,
@@ -45,6 +48,7 @@ from .records import (
     Unsaved,
     pieces,
 )
+from .strict import Guard
 from .turns import Fed, GoLive, Hook, TakeSnapshot
 
 
@@ -84,6 +88,8 @@ class Life:
         self.has_replayed = False
         self.begins_suspended = False
         self.in_hook = False
+        self.guard = Guard() if method.strict else None
+        self.is_checked = method.check_replay  # whether the state is compared under replay
         self.ignored_why: str | None = None
         self._snapshot_turn = -1
         self._state: list[bytes] = []
@@ -220,8 +226,9 @@ class Life:
         feed = self.feed
         if feed is None:
             return  # The life was abandoned in this very turn: what it says does not count.
+        state = digest_of(self.cell.actor) if self.is_checked and self.cell.actor and status in (OK, STASHED) else 0
         self.feed = None
-        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer))
+        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state))
         self.outs = []
         if self.page is not None:
             self.page[0] = 0

@@ -25,7 +25,7 @@ Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]
 Pacing = Literal["fast", "original"] | float
 JOURNAL_LIMIT = 256_000_000
-OF_LIVES = ("name", "interval", "check_readonly", "key_variables", "origin")
+OF_LIVES = ("name", "interval", "check_readonly", "key_variables", "origin", "strict", "check_replay")
 """The settings that concern a life, not its home."""
 
 
@@ -55,6 +55,9 @@ class Method:
     every: int | None = None
     journal_bytes: int | None = None
     compress: bool | int = False
+    durability: Durability | None = None
+    strict: bool = False
+    check_replay: bool = False
 
     def __post_init__(self) -> None:
         """Raises SpecError: naming the method, the setting, and what it may be."""
@@ -79,7 +82,10 @@ class Method:
         if self.on_escalate is not None and self.on_escalate not in get_args(OnEscalate):
             known = ", ".join(map(repr, get_args(OnEscalate)))
             raise SpecError(where, f"on_escalate must be one of {known} or left out, not {self.on_escalate!r}")
-        for name in ("skip", "check_readonly"):
+        if self.durability is not None and self.durability not in get_args(Durability):
+            known = ", ".join(map(repr, get_args(Durability)))
+            raise SpecError(where, f"durability must be one of {known} or left out, not {self.durability!r}")
+        for name in ("skip", "check_readonly", "strict", "check_replay"):
             if not isinstance(getattr(self, name), bool):
                 raise SpecError(where, f"{name} must be True or False, not {getattr(self, name)!r}")
 
@@ -164,6 +170,7 @@ def checkpoint_only(
     every: int | None = None,
     journal_bytes: int | None = None,
     compress: bool | int = False,
+    durability: Durability | None = None,
     safe_state: str | Sequence[str] | SafeState | None = None,
     safe_state_timeout: float = SAFE_STATE_TIMEOUT,
     held: Held | Mapping[str, Held] | None = None,
@@ -188,6 +195,7 @@ def checkpoint_only(
         every=every,
         journal_bytes=journal_bytes,
         compress=compress,
+        durability=durability,
         **_meanwhile("checkpoint_only", safe_state, safe_state_timeout, held, hooks),
     )
 
@@ -200,6 +208,9 @@ def replay_only(
     on_escalate: OnEscalate | None = None,
     skip: bool = True,
     check_readonly: bool = False,
+    durability: Durability | None = None,
+    strict: bool = False,
+    check_replay: bool = False,
     safe_state: str | Sequence[str] | SafeState | None = None,
     safe_state_timeout: float = SAFE_STATE_TIMEOUT,
     held: Held | Mapping[str, Held] | None = None,
@@ -221,6 +232,9 @@ def replay_only(
         pacing=pacing,
         skip=skip,
         check_readonly=check_readonly,
+        durability=durability,
+        strict=strict,
+        check_replay=check_replay,
         **_meanwhile("replay_only", safe_state, safe_state_timeout, held, hooks),
     )
 
@@ -242,6 +256,9 @@ def hybrid(
     every: int | None = None,
     journal_bytes: int | None = None,
     compress: bool | int = False,
+    durability: Durability | None = None,
+    strict: bool = False,
+    check_replay: bool = False,
 ) -> Method:
     """State comes back from the last snapshot and the messages since: nothing accepted is lost (RORY).
 
@@ -270,6 +287,13 @@ def hybrid(
         every: a snapshot also after so many handled messages, whatever the time.
         journal_bytes: a snapshot also when so many bytes of messages have been journaled since the last one.
         compress: True, or a level from 1 to 22: what goes to a store is compressed, with the library zstandard.
+        durability: what an admission, and with it a reply, outlives when it is told of: "memory" any process but the
+            root, "os" the root too, "fsync" the machine. The last two need a store, whose own setting is the default.
+        strict: a turn that calls the clock, chance or a background task of the world instead of its `ctx` raises
+            NotDeterministic at that call. It makes handlers several times slower: for tests and for the search.
+        check_replay: the state after each turn gets a digest, and a replay that leaves another one is stopped with the
+            number of the first such turn and its message. Costs a pass over the state per turn, and nothing is
+            left out of the replay: for tests, too.
 
     Source:
         Zou and Bai, checkpoint and replay combined.
@@ -287,6 +311,9 @@ def hybrid(
         every=every,
         journal_bytes=journal_bytes,
         compress=compress,
+        durability=durability,
+        strict=strict,
+        check_replay=check_replay,
         **_meanwhile("hybrid", safe_state, safe_state_timeout, held, hooks),
     )
 

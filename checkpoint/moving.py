@@ -31,8 +31,8 @@ from ..actors.process.to_task import FromProcess, dispose
 from ..actors.process.workers import Worker, Workers
 from .controller import FROM_LIFE, LocalHome, LocalLife, RecordedProcessHost, RemoteLife, TaskHost
 from .life import Life
-from .records import Live, ToHome
-from .switch import LifePort, Switch
+from .records import LifePort, Live, ToHome
+from .switch import Switch
 from .turns import StopRecorded
 
 if TYPE_CHECKING:
@@ -44,6 +44,7 @@ class Detached:
 
     def __init__(self, switch: Switch) -> None:
         self._switch, self._next_id = switch, switch.next_id
+        self._held = {source.id for source in switch.open.values() if source.held}  # not fed yet
         self._port: LifePort | None = switch.port
         bound = switch.bound
         self._in_hand = None if bound is None else bound.in_hand()
@@ -63,7 +64,7 @@ class Detached:
         if switch.bound is not None and self._in_hand is not None:
             switch.bound.take_up(self._in_hand)
         for source in list(switch.open.values()):
-            if source.id >= self._next_id:
+            if source.id >= self._next_id or source.id in self._held:
                 switch.forward(source)
 
 

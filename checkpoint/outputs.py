@@ -10,7 +10,7 @@ from ..actors.cell import GONE, Cell
 from ..actors.codec import Parcel
 from ..actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ..actors.mail import Envelope
-from .asks import SwitchAsk, answer_ask
+from .asks import SwitchAsk, answer_ask, origin_of
 from .inputs import Batch
 from .records import MESSAGE, Answer, Out
 from .recovery.held import Inlet, inlet
@@ -24,6 +24,7 @@ class Outputs:
 
     def __init__(self, home: Switch) -> None:
         self._home = home
+        self.kept: list[Out] = []  # what outlives the life, and has not taken effect yet
 
     def execute(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         """Let one output take effect, when the append is safe."""
@@ -47,6 +48,8 @@ class Outputs:
                     ask, source.ask = source.ask, None
                 kind, _, name = out.name.partition("|")
                 if isinstance(ask, SwitchAsk):
+                    if home.journal.durable:
+                        batch.add(home.path, ("replied", turn, int(out.to)), home.positions_of(turn))
                     ask.give(Answer(kind, name, out.body), batch)
                 elif ask is not None:
                     batch.after.append(lambda: answer_ask(home, ask, Answer(kind, name, out.body)))
@@ -56,7 +59,7 @@ class Outputs:
                 self._keep(turn, out, batch)
                 if out.verb == "cancel":
                     home.timers.drop_ticks(out.to, key, batch)
-                batch.after.append(lambda: home.timers.operate(out))
+                batch.after.append(lambda: self._operate(out))
             case "subscribe" | "unsubscribe":
                 self._keep(turn, out, batch)
                 batch.after.append(lambda: self._subscribe(out))
@@ -67,9 +70,23 @@ class Outputs:
             case verb:
                 raise HoldfastError(f"{home.path}: unknown output {verb!r}")
 
+    def _operate(self, out: Out) -> None:
+        if self._stands(out):
+            self._home.timers.operate(out)
+
+    def _stands(self, out: Out) -> bool:
+        """Whether what outlives the life takes effect now; else its turn was undone meanwhile."""
+        if out in self.kept:
+            self.kept.remove(out)
+            return True
+        return not self._home.journal.durable
+
     def _keep(self, turn: int, out: Out, batch: Batch) -> None:
         """What outlives the life is journaled."""
-        entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval)
+        if not self._home.journal.durable:
+            return
+        self.kept.append(out)
+        entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, self._home.node.wall())
         batch.add(self._home.path, entry, self._home.positions_of(turn))
 
     def _deliver(self, target: Cell, out: Out, batch: Batch, sender: str | None = None) -> None:
@@ -84,7 +101,7 @@ class Outputs:
             try:
                 if switch.bound is None or switch.bound.makes_room(None, out.name, out.body, cell.path):
                     source = switch.record(MESSAGE, out.name, out.body, cell.path, batch)
-                    batch.after.append(lambda: switch.forward(source))
+                    batch.after.append(lambda: switch.admitted(source))
             except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
                 home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
             return
@@ -111,7 +128,7 @@ class Outputs:
             if bound is None or bound.overflow == "block" or bound.makes_room(None, out.name, out.body, home.path):
                 # Even if there is no room: what is journaled in this append cannot be lost, and the sender waits.
                 source = switch.record(MESSAGE, out.name, out.body, home.path, batch)
-                batch.after.append(lambda: switch.forward(source))
+                batch.after.append(lambda: switch.admitted(source))
         except MailboxFull as error:
             home.calls.refused(turn, out.k, error, batch)
             return
@@ -164,10 +181,10 @@ class Outputs:
         elif switch.waits(ask):
             ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, tuple(p for p, _ in chain)))), batch)
         elif switch.bound is None or switch.bound.makes_room(ask, out.name, out.body, home.path):
-            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch)
+            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
             asked.ask, asked.chain = ask, chain
             ask.started = True
-            batch.after.append(lambda: switch.forward(asked))
+            batch.after.append(lambda: switch.admitted(asked))
 
     def _send_ask(self, target: Cell, ask: SwitchAsk) -> None:
         home = self._home
@@ -219,6 +236,8 @@ class Outputs:
     def _subscribe(self, out: Out) -> None:
         """Subscriptions belong to the address and outlive its lives."""
         home = self._home
+        if not self._stands(out):
+            return
         if out.verb == "subscribe":
             home.topics[out.to] = None
             if home.cell is not None:

@@ -7,7 +7,7 @@ reports each turn's outputs and outcome. Payloads stay encoded in between.
 from __future__ import annotations
 
 import zlib
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -159,6 +159,7 @@ class TurnEnd(msgspec.Struct, array_like=True, tag=12):
     status: str
     outs: list[Out]
     answer: Answer
+    state: int = 0  # digest of the state it has left, if that is checked
 
 
 class Live(msgspec.Struct, array_like=True, tag=13):
@@ -242,6 +243,15 @@ class Ignored(msgspec.Struct, array_like=True, tag=19):
 
 
 ToHome = Ignored | Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked
+
+
+class LifePort(Protocol):
+    """The way to the present life."""
+
+    def to_life(self, record: ToLife) -> None:
+        """Hand a record to the life; it is handled in order."""
+        ...
+
 
 PIECE = 4 * 1024 * 1024
 """Bytes of state per record, so that a large state does not hold up everything else."""

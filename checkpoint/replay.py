@@ -14,7 +14,8 @@ from ..actors.events import ReplayPaced
 from .inputs import Turn
 
 if TYPE_CHECKING:
-    from .switch import LifePort, Switch
+    from .records import LifePort
+    from .switch import Switch
 
 TELL_EVERY = 1.0
 """Seconds between two events that tell how long a paced replay will still take, at least."""

@@ -8,10 +8,11 @@ import msgspec
 
 from ..actors.errors import HoldfastError
 from ..actors.events import SnapshotDamaged
+from .asks import SwitchAsk, origin_of
 from .compression import PLAIN, compressor, decompress
 from .inputs import OVERHEAD, Input, Turn
 from .journal import DamagedStore, Entry
-from .journal import Saved as FromStore
+from .journal import Saved as Journaled
 from .records import PIPE, STASHED, TICK, Answer, Snapshot
 from .segments import Place
 from .timers import Saved
@@ -30,6 +31,9 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     A large state is not in `state`, but in `blocks`: places in packs. `earlier` packs are needed by older snapshots.
     `codec`: how `state` is compressed, and `length` what it was before.
 
+    `time` (Unix) is when it was made, 0 in stores of before: timers have run on since. `owed`: inputs that are to be
+    answered later, with the address that has asked and their origin.
+
     `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
     were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh.
     """
@@ -47,6 +51,8 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     earlier: list[int] = []
     codec: int = PLAIN
     length: int = 0
+    time: float = 0.0
+    owed: dict[int, tuple[str, str]] = {}
 
     @property
     def has_state(self) -> bool:
@@ -83,9 +89,9 @@ def encode_meta(meta: Meta, compress: bool | int) -> bytes:
 
 def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> Meta:
     """A snapshot of the state after `turn`, with what the home knows at this moment."""
-    return Meta(
-        FORMAT, turn, home.next_id, stash, home.timers.saved(), list(home.topics), home.journal.epoch, state, turn
-    )
+    timers, topics = outlasting(home)
+    epoch, now = home.journal.epoch, home.node.wall()
+    return Meta(FORMAT, turn, home.next_id, stash, timers, topics, epoch, state, turn, time=now, owed=owed(home))
 
 
 def cut(home: Switch, state: bytes, record: Snapshot) -> None:
@@ -102,6 +108,28 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     home.images.tidy()
 
 
+def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:
+    """Timers and topics as they are after the last turn, though some of it may not have taken effect yet."""
+    timers, topics = home.timers.saved(), dict(home.topics)
+    for out in home.outputs.kept:
+        match out.verb:
+            case "timer":
+                timers[out.to] = (out.name, out.body, out.seconds, out.interval)
+            case "cancel":
+                timers.pop(out.to, None)
+            case "subscribe":
+                topics[out.to] = None
+            case _:
+                topics.pop(out.to, None)
+    return timers, list(topics)
+
+
+def owed(home: Switch) -> dict[int, tuple[str, str]]:
+    """The asks from recorded turns that are to be answered later."""
+    asks = ((key, ask) for key, ask in home.later.items() if isinstance(ask, SwitchAsk) and not ask.is_over)
+    return {key: (ask.sender.path, origin_of(ask)) for key, ask in asks}
+
+
 def put(home: Switch, meta: Meta, keep: int) -> None:
     """Have the next life begin with this, and forget the turns up to `meta.turn`; `keep` as in `Journal.cut`.
 
@@ -110,7 +138,9 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
     """
     covered = [number for number in home.turns if number <= meta.turn]
     if home.journal.durable:
-        drop = [*home.dropped, *(position for number in covered for position in home.positions.get(number, ()))]
+        home.journal.barrier()  # From here on it is known where everything stands.
+        drop = [*(position for known in home.dropped for position in known)]
+        drop += [*(position for number in covered for position in home.positions.get(number, ()))]
         # An image may be behind: what was stashed when it was begun may have been handled since.
         later = {turn.input.id for number, turn in home.turns.items() if number > meta.turn}
         for number in covered:
@@ -132,6 +162,7 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
 
 def go_back(home: Switch, meta: Meta) -> None:
     """Between two lives: timers and subscriptions are those of the snapshot again, as the state is."""
+    home.outputs.kept.clear()  # What has not taken effect yet is undone, too.
     if home.cell is not None:
         for topic in home.topics:
             if topic not in meta.topics:  # Those of its class are subscribed anew with the next life.
@@ -140,14 +171,21 @@ def go_back(home: Switch, meta: Meta) -> None:
     home.timers.replace(meta.timers)
 
 
-def load(home: Switch) -> None:
-    """Take up where the store left off."""
-    saved, newest = load_newest(home)
+def load(home: Switch, planted: Journaled | None = None) -> None:
+    """Take up where the store left off, or (in memory) where something else says."""
+    if planted is not None and not home.journal.durable:
+        saved, newest = planted, None if planted.snapshot is None else decode_meta(planted.snapshot)
+    else:
+        saved, newest = load_newest(home)
     timers: dict[str, Saved] = {}
     if newest is not None:
         meta = home.newest = newest
-        home.turn, home.next_id, home.stash, timers = meta.turn, meta.next_id, meta.stash, dict(meta.timers)
-        home.topics = dict.fromkeys(meta.topics)
+        home.turn, home.next_id, home.stash = meta.turn, meta.next_id, meta.stash
+        home.topics, home.owed = dict.fromkeys(meta.topics), dict(meta.owed)
+        timers = {
+            key: (name, body, left - elapsed(home, meta.time), interval)
+            for key, (name, body, left, interval) in meta.timers.items()
+        }
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     for source in home.open.values():
@@ -159,7 +197,12 @@ def load(home: Switch) -> None:
         home.timers.start(key, name, body, max(0.0, left), interval)
 
 
-def load_newest(home: Switch) -> tuple[FromStore, Meta | None]:
+def elapsed(home: Switch, since: float) -> float:
+    """Seconds since a moment that a store of before may not have (0), by a clock that may have been set back."""
+    return max(0.0, home.node.wall() - since) if since else 0.0
+
+
+def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:
     """The newest snapshot that can be used, with the journal since then; an event says if it is not the newest.
 
     Raises:
@@ -201,10 +244,10 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             if kind == PIPE:
                 turn, k = map(int, origin.split("."))
                 home.pipes_done.setdefault(turn, set()).add(k)
-        case ("end", turn, key, status, digests):
+        case ("end", turn, key, status, digests, *more):
             if key not in home.open:
                 return
-            past = home.turns[turn] = Turn(home.open[key], status, list(digests))
+            past = home.turns[turn] = Turn(home.open[key], status, list(digests), *more)
             home.positions_of(turn).append(position)
             past.input.turn = home.turn = turn
             home.partial, home.partial_id = [], -1
@@ -219,12 +262,20 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             home.calls.outcomes[turn, k] = Answer(kind, name, body)
         case ("drop", key):
             dropped = home.open.pop(key, None)
-            home.dropped.extend((*(dropped.positions if dropped is not None else ()), position))
-        case ("op", turn, verb, key, name, body, seconds, interval):
+            home.dropped += ([] if dropped is None else dropped.positions, [position])
+        case ("later", turn, key):
+            home.positions_of(turn).append(position)
+            source = home.turns[turn].input
+            if source.sender is not None:
+                home.owed[key] = (source.sender, source.origin)
+        case ("replied", turn, key):
+            home.positions_of(turn).append(position)
+            home.owed.pop(key, None)
+        case ("op", turn, verb, key, name, body, seconds, interval, *when):
             home.positions_of(turn).append(position)
             match verb:
                 case "timer":
-                    timers[key] = (name, body, seconds, interval)
+                    timers[key] = (name, body, seconds - elapsed(home, *when or (0.0,)), interval)
                 case "cancel":
                     timers.pop(key, None)
                 case "subscribe":

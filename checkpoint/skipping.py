@@ -41,7 +41,8 @@ class Skipping:
     def choose(self) -> Skipped:
         """The ended turns that a replay may leave out."""
         home = self._home
-        kind = cell_kind(home.cell) if home.cell is not None and home.method.skip else None
+        skips = home.method.skip and not home.method.check_replay  # States in between are compared, too.
+        kind = cell_kind(home.cell) if home.cell is not None and skips else None
         chosen = Skipped(set(), set())
         if kind is None or not any(one.readonly or one.supersedes is not None for one in kind._declared.values()):
             return chosen
@@ -85,8 +86,15 @@ class Skipping:
         message = self._home.node.codec.decode(kind._table.kind_named(turn.input.name), turn.input.body)
         return cast("Hashable", getattr(message, by) if isinstance(by, str) else by(message))
 
-    def tell(self, chosen: Skipped) -> None:
-        """An event, if there is something to tell."""
+    def left(self) -> list[tuple[int, Turn]]:
+        """The turns to replay, in order; an event tells of those that are not."""
+        chosen = self.choose()
+        self._tell(chosen)
+        out = chosen.readonly | chosen.superseded
+        turns = self._home.turns.items()
+        return [(number, turn) for number, turn in turns if turn.status in (OK, STASHED) and number not in out]
+
+    def _tell(self, chosen: Skipped) -> None:
         home = self._home
         if home.node.watched and any(chosen):
             counts = len(chosen.readonly), len(chosen.superseded)
@@ -102,7 +110,9 @@ class Skipping:
         for number in chosen.readonly | chosen.superseded:
             source = home.turns.pop(number).input
             home.bytes -= len(source.body) + OVERHEAD
-            home.dropped += (*home.positions.pop(number, ()), *source.positions)
+            known = home.positions.pop(number, [])
+            if home.journal.durable:
+                home.dropped += (known, source.positions)
             home.pipes_done.pop(number, None)
             for key in [key for key in home.calls.outcomes if key[0] == number]:
                 del home.calls.outcomes[key]

@@ -2,21 +2,52 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 from ..actors.errors import SpecError
 from .journal import Journal, MemoryJournal
+from .method import Durability
 
 
-def open_journal(store: str | None, *, takeover: bool = False) -> Journal:
-    """The journal that `store` names: None or "memory", or "sqlite:PATH".
+def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Journal:
+    """The journal that `store` names: None or "memory", or "sqlite:PATH"; or the open engine that it is.
 
     Raises:
         SpecError: the name is of no known form. StoreInUse: another living process has it open.
     """
     if store is None or store == "memory":
         return MemoryJournal()
+    if not isinstance(store, str):
+        return store
     kind, _, path = store.partition(":")
     if kind != "sqlite" or not path:
-        raise SpecError("store", f"must be None, 'memory' or 'sqlite:PATH', not {store!r}")
+        raise SpecError("store", f"must be None, 'memory', 'sqlite:PATH' or an engine, not {store!r}")
     from .sqlite import SqliteJournal  # only now: sqlite3 takes a while to import, and most tests need no store
 
     return SqliteJournal(path, takeover=takeover)
+
+
+PARTS = (
+    "append", "sync", "cut", "load", "erase", "keep_blocks", "read_blocks", "forget_blocks", "addresses",
+    "note", "noted", "notes", "close", "durable", "epoch",
+)  # fmt: skip
+"""What an engine has."""
+
+
+def check_durability(store: str | Journal | None, durability: Durability | None) -> Durability | None:
+    """Refuse what cannot be kept.
+
+    Raises:
+        SpecError: it is no known word, or there is no store for it; or the store has not what an engine has.
+    """
+    if durability is not None and durability not in get_args(Durability):
+        known = ", ".join(map(repr, get_args(Durability)))
+        raise SpecError("ActorSystem", f"durability must be one of {known} or left out, not {durability!r}")
+    if store is not None and not isinstance(store, str):
+        missing = [part for part in PARTS if not hasattr(store, part)]
+        if missing:
+            raise SpecError("store", f"must be a name or an engine, but {store!r:.100} has no {missing[0]!r}")
+    lasts = store is not None and store != "memory" and (isinstance(store, str) or store.durable)
+    if durability in ("os", "fsync") and not lasts:
+        raise SpecError("ActorSystem", f"durability={durability!r} needs a store: store='sqlite:PATH'")
+    return durability

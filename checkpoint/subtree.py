@@ -138,6 +138,10 @@ class SubtreeHome(HomeHost):
         if not self._slot:
             port.to_life(Started(wanted.number, "its process holds as many recorded actors as it can"))
             return
+        problem = self.homes.refuses(wanted.method)
+        if problem:
+            port.to_life(Started(wanted.number, problem))
+            return
         switch, live, recovering = self.enter(cell)
         if self.is_gated:
             self._run(cell, self._step_by_step(cell, wanted, live, recovering))
@@ -247,9 +251,6 @@ class SubtreeHome(HomeHost):
     def push(self, cell: Cell, item: Item) -> None:
         if self.switch is not None:
             self.switch.push(item)
-
-    def offer(self, cell: Cell, item: Any) -> None:
-        cell.admit(cell, item)
 
     def control(self, cell: Cell, call: Call) -> None:
         if self._worker is not None and cell.state is RUNNING:

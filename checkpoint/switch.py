@@ -10,41 +10,33 @@ from __future__ import annotations
 import asyncio
 import functools
 import time
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-import msgspec
-
-from ..actors import links
 from ..actors.cell import Cell
 from ..actors.codec import Parcel
-from ..actors.errors import (
-    AskDeadlock,
-    HoldfastError,
-    ReplayDiverged,
-    StartIgnored,
-)
-from ..actors.events import RecoveryFailed, SnapshotTaken
-from ..actors.exits import pack_exit
+from ..actors.errors import AskDeadlock, HoldfastError, ReplayDiverged, StartIgnored
+from ..actors.events import RecoveryFailed
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
-from .asks import Calls, SwitchAsk, answer_ask
+from .admission import submit, taken_up
+from .arrival import Arrival
+from .asks import Calls, SwitchAsk, answer_ask, origin_of
 from .bound import HomeBound
+from .compared import StateDiverged
 from .due import Due
 from .ends import Ends
-from .inputs import OVERHEAD, Batch, Input, Turn
-from .journal import Journal
+from .inputs import OVERHEAD, Batch, HomeJournal, Input, Turn
+from .journal import Saved
 from .keeping import Images
 from .limit import Limit
 from .method import Method
 from .outputs import Outputs
+from .quarantine import Quarantine
 from .records import (
-    DOWN,
-    EXIT,
     FAILED,
     LATER,
     MESSAGE,
     NOTHING,
-    OK,
     PIPE,
     START,
     STASHED,
@@ -53,6 +45,7 @@ from .records import (
     Closed,
     Go,
     Ignored,
+    LifePort,
     Live,
     Marked,
     Out,
@@ -60,37 +53,28 @@ from .records import (
     Released,
     Restore,
     Snapshot,
-    SnapshotNow,
     ToHome,
-    ToLife,
     TurnEnd,
     Unsaved,
     Wanted,
     pieces,
-)
+)  # fmt: skip
 from .recovery.held import Holding, Inlet, let_go
 from .replay import Replay
-from .saved import Meta, cut, load
+from .saved import Meta, load
 from .skipping import Skipping
 from .timers import Timers
 
 if TYPE_CHECKING:
     from ..actors.node import Node
     from .recovery.register import Recoveries
-
-
-class LifePort(Protocol):
-    """The way to the present life."""
-
-    def to_life(self, record: ToLife) -> None:
-        """Hand a record to the life; it is handled in order."""
-        ...
+    from .rejoin import Rejoin
 
 
 class Switch:
     """The home of one recorded actor."""
 
-    def __init__(self, node: Node, path: str, method: Method, journal: Journal) -> None:
+    def __init__(self, node: Node, path: str, method: Method, journal: HomeJournal, saved: Saved | None = None) -> None:
         self.node, self.path, self.method, self.journal = node, path, method, journal
         self.cell: Cell | None = None
         self.port: LifePort | None = None
@@ -101,6 +85,7 @@ class Switch:
         self.partial: list[int] = []  # digests of what the turn after `turn` has released
         self.partial_id = -1
         self.later: dict[int, Ask] = {}
+        self.owed: dict[int, tuple[str, str]] = {}  # as read back: asker and origin of what was to be answered later
         self.timers = Timers(self)
         self.outputs = Outputs(self)
         self.ends = Ends(self)
@@ -109,6 +94,8 @@ class Switch:
         self.holding: Holding | None = None  # stands as the bound while the actor is recovered
         self.inlets: dict[str, Inlet] = {}
         self.recoveries: Recoveries | None = None
+        self.quarantine: Quarantine | None = None
+        self.rejoin: Rejoin | None = None
         self.waits_for_release = False  # somebody else says when the actor gets what is new
         self.replay = Replay(self)
         self.skipping = Skipping(self)
@@ -122,18 +109,19 @@ class Switch:
         self.live: asyncio.Future[float] | None = None
         self.live_at = 0.0
         self.is_released = False
+        self.kept_back = False  # it is live, but waits for the others of its group
         self.replayed = 0
         self.diverged: ReplayDiverged | None = None
         self.is_void = False  # a state that was put in place from outside could not be kept: this life does not count
         self.unsaved: list[str] = []  # why, for each of those
         self.next_id = 0
         self.bytes = 0
-        self._incoming: list[bytes] = []
+        self.arrival = Arrival(self)
         self.positions: dict[int, list[int]] = {}  # in the journal, of what belongs to a turn besides its input
-        self.dropped: list[int] = []  # the same of inputs that ended without a turn
+        self.dropped: list[list[int]] = []  # the same of inputs that ended without a turn
         self._replay_k = 0
         self._replay_turn = -1
-        load(self)
+        load(self, saved)
 
     def use(self, method: Method) -> None:
         """Work as this method says, from now on."""
@@ -175,7 +163,14 @@ class Switch:
 
     def take(self, ask: Ask | None, name: str, body: bytes, sender: str | None) -> None:
         """Admit a message for which there is room."""
-        source = self.record(MESSAGE, name, body, sender)
+        origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
+        try:
+            source = self.record(MESSAGE, name, body, sender, origin=origin)
+        except HoldfastError as error:  # The store has no room, or has failed.
+            if ask is None:
+                raise
+            ask.fail(error)
+            return
         if ask is not None:
             source.ask, source.chain = ask, ask.chain
             ask.started = True
@@ -210,35 +205,31 @@ class Switch:
             self.bound.added(source)
         if self.journal.durable:
             entry = ("in", key, kind, name, body, source.time, sender, origin)
-            source.positions = []
+            source.positions, source.held = [], True
             if batch is not None:
                 batch.add(self.path, entry, source.positions)
             else:
-                source.positions.append(self.journal.append(((self.path, entry),))[0])
+                submit(self, source, entry)
         return source
+
+    def admitted(self, source: Input) -> None:
+        """An input is as safe now as it has to be."""
+        source.held = False
+        if source.id in self.open:
+            self.forward(source)
 
     def forward(self, source: Input) -> None:
         """Feed an input that is safe, unless they are held."""
+        if source.held:
+            return
         if self.is_released and self.port is not None and (self.bound is None or self.bound.may_feed(source)):
             self.port.to_life(source.feed())
 
     def push(self, item: Item) -> None:
         """An EXIT or DOWN is an input too."""
-        if isinstance(item, links.Exit):
-            data: dict[str, Any] = {"source": item.source.path, "reason": pack_exit(item.reason)}
-            kind = EXIT
-        elif isinstance(item, links.Down):
-            if not item.watch.active:
-                return
-            data = {
-                "source": item.watch.target.path,
-                "reason": pack_exit(item.reason),
-                "recovering": item.recovering,
-            }
-            kind = DOWN
-        else:
-            raise HoldfastError(f"{type(item).__name__} cannot be journaled for {self.path}")
-        self.forward(self.record(kind, "", msgspec.msgpack.encode(data), None))
+        given = taken_up(self, item)
+        if given is not None:
+            self.forward(self.record(*given, None))
 
     # -- recovery ---------------------------------------------------------------------------------------------------
 
@@ -250,8 +241,9 @@ class Switch:
     @property
     def is_live(self) -> bool:
         """Whether the life has caught up, even if somebody else says when it gets what is new."""
-        waits = self.waits_for_release and self.live is not None and self.live.done() and self.port is not None
-        return self.is_released or waits
+        waits = self.waits_for_release or self.kept_back
+        caught_up = self.port is not None and self.live is not None and self.live.done()
+        return self.is_released or (waits and caught_up)
 
     @property
     def state_turn(self) -> int:
@@ -270,8 +262,7 @@ class Switch:
         self.diverged = None
         self.is_void = False
         self.replay.cancel()
-        self._incoming.clear()  # The last life may have died in the middle of a snapshot.
-        self.images.cancel()
+        self.arrival.cancel()  # The last life may have died in the middle of a snapshot.
         self.due.restarted()
         self.timers.resume()
         if self.live is not None and not self.live.done():
@@ -299,14 +290,8 @@ class Switch:
         first = next((source for source in self.open.values() if source.kind == START), None)
         if self.is_new and first is None:  # Messages may have come before it.
             first = self.record(START, "", b"", None)
-        skipped = self.skipping.choose()
-        self.skipping.tell(skipped)
-        left_out = skipped.readonly | skipped.superseded
-        again = [
-            (number, turn)
-            for number, turn in self.turns.items()
-            if turn.status in (OK, STASHED) and number not in left_out
-        ]
+            first.held = False  # Nobody waits for it, and what it leads to is safe only behind it.
+        again = self.skipping.left()
         self.replayed = len(again)
         self.replay.begin(port, again, functools.partial(self._caught_up, port, first, recovered))
 
@@ -317,6 +302,11 @@ class Switch:
         stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)
         port.to_life(Go(recovered, self.turn, tuple(key for key in stashed if key not in self.open)))
 
+    def let_at(self) -> None:
+        """Release the actor, unless somebody else has a say in it, or those that it may send to are not there yet."""
+        if not self.waits_for_release and not self.kept_back:
+            self.release()
+
     def release(self) -> None:
         """Let new inputs at the actor: first the turn that had begun to send, then the others as they were admitted."""
         self.is_released, self.waits_for_release = True, False
@@ -326,7 +316,7 @@ class Switch:
         port = self.port
         assert port is not None
         stashed = self.stashed()
-        waiting = [one for one in self.open.values() if one.kind != START and one.id not in stashed]
+        waiting = [one for one in self.open.values() if one.kind != START and one.id not in stashed and not one.held]
         waiting.sort(key=lambda one: one.id != self.partial_id)
         pipes = tuple(sorted(self.pipes_done.get(self.turn + 1, ())))
         for index, source in enumerate(waiting):
@@ -357,9 +347,9 @@ class Switch:
         if source.deliveries >= self.method.max_deliveries:
             self.ends.quarantine(source)
 
-    def end_turn(self, source: Input, number: int, status: str, batch: Batch) -> None:
+    def end_turn(self, source: Input, number: int, status: str, batch: Batch, state: int = 0) -> None:
         """A turn is over: its end record."""
-        turn = self.turns[number] = Turn(source, status, self.partial)
+        turn = self.turns[number] = Turn(source, status, self.partial, state)
         self.partial, self.partial_id = [], -1
         self.turn = source.turn = number
         source.deliveries = 0
@@ -368,7 +358,7 @@ class Switch:
         if self.bound is not None:
             batch.after.append(functools.partial(self.bound.ended, source))
         if self.journal.durable:
-            entry = ("end", number, source.id, status, tuple(turn.digests))
+            entry = ("end", number, source.id, status, tuple(turn.digests), *((state,) if state else ()))
             batch.add(self.path, entry, self.positions_of(number))
 
     def positions_of(self, turn: int) -> list[int]:
@@ -388,7 +378,7 @@ class Switch:
                 case Released():
                     self._released(record)
                 case Snapshot():
-                    self._snapshot(record)
+                    self.arrival.take(record)
                 case Live():
                     self._live(record)
                 case PipeDone():
@@ -415,8 +405,7 @@ class Switch:
         self.live_at = time.monotonic()
         if self.live is not None and not self.live.done():
             self.live.set_result(record.restore_seconds)
-        if not self.waits_for_release:
-            self.release()
+        self.let_at()
 
     def _released(self, record: Released) -> None:
         batch = Batch()
@@ -446,7 +435,7 @@ class Switch:
                     raise ReplayDiverged(self.path, turn, out.k)
                 self._replay_k = out.k
                 if out.verb in ("ask", "send"):
-                    self.calls.join(out.verb, turn, out.k)
+                    self.calls.join(turn, key, out)
             elif ended:
                 raise ReplayDiverged(self.path, turn, out.k)
             else:
@@ -463,7 +452,8 @@ class Switch:
         if source.kind == START and end.status == FAILED:
             return  # Its start failed, and will be tried again.
         if not end.outs and source.ask is None and not self.partial and self.bound is None and not self.journal.durable:
-            self.turns[end.turn] = Turn(source, end.status, [])  # The shortest way: nothing leaves, nobody waits.
+            # The shortest way: nothing leaves, nobody waits.
+            self.turns[end.turn] = Turn(source, end.status, [], end.state)
             self.turn = source.turn = end.turn
             self.partial_id, source.deliveries = -1, 0
             if end.status != STASHED:
@@ -471,10 +461,12 @@ class Switch:
             return
         batch = Batch()
         self._take(end.turn, end.id, end.outs, batch)
-        self.end_turn(source, end.turn, end.status, batch)
+        self.end_turn(source, end.turn, end.status, batch, end.state)
         if end.answer.kind == LATER:
             if source.ask is not None:
                 self.later[end.id] = source.ask
+                if self.journal.durable and isinstance(source.ask, SwitchAsk):
+                    batch.add(self.path, ("later", end.turn, end.id), self.positions_of(end.turn))
         elif end.status != STASHED:
             self.give(source, end.answer, batch)
         batch.commit(self.journal)
@@ -486,6 +478,8 @@ class Switch:
         seen = self._replay_k if self._replay_turn == end.turn else 0
         if past is None or seen != len(past.digests) or end.status != past.status:
             raise ReplayDiverged(self.path, end.turn, seen + 1)
+        if end.state != past.state and end.state and past.state:
+            raise StateDiverged(self.path, end.turn, past.input.name or past.input.kind)
 
     def give(self, source: Input, answer: Answer, batch: Batch) -> None:
         """Answer the ask of an input, behind the append."""
@@ -503,29 +497,3 @@ class Switch:
             done.add(record.k)
             origin = f"{record.turn}.{record.k}"
             self.forward(self.record(PIPE, record.name, record.body, self.path, origin=origin))
-
-    # -- snapshots --------------------------------------------------------------------------------------------------
-
-    def _snapshot(self, record: Snapshot) -> None:
-        if record.image is not None:
-            self.images.take(record, record.image)
-            return
-        self._incoming.append(record.data)
-        if not record.is_last:
-            return
-        state = b"".join(self._incoming)
-        self._incoming.clear()
-        try:
-            cut(self, state, record)
-        except HoldfastError as error:
-            self.due.failed(str(error))
-            if self.port is not None:
-                self.port.to_life(SnapshotNow(at_once=False))
-            if record.is_replaced and self.cell is not None:
-                self.is_void, self.unsaved = True, [*self.unsaved, str(error)]
-                self.cell.kill()
-            return
-        self.limit.cut()
-        self.due.kept(record.turn)
-        if self.node.watched:
-            self.node.emit(SnapshotTaken(self.path, record.turn, len(state), record.pause, len(state)))

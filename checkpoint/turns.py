@@ -51,12 +51,12 @@ class Fed(Item):
                 life.close_turn(DROPPED, life.answer_error(error) if feed.is_ask else Answer())
                 return None
         try:
-            result = item.call(actor)
+            result = item.call(actor) if life.guard is None else life.guard.call(item.call, actor)
         except Refusal as no:
             item.refuse(no)
             return None
         if type(result) is Coroutine_:
-            return item.finish(result)
+            return item.finish(result if life.guard is None else life.guard.drive(result))
         item.end_with(result)
         return None
 

@@ -11,7 +11,7 @@ import asyncio
 import dataclasses
 from typing import Any, ClassVar
 
-from ..actors import exits, lives
+from ..actors import exits, lives, stopping
 from ..actors.actor import Start, on
 from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import HoldfastError, SpecError, type_name
@@ -181,8 +181,8 @@ async def stop_together(cells: list[Cell]) -> None:
         if cell.state in (DOWN, GONE):
             lives.retire(cell, "its parent has stopped")
             continue
-        waiting.append((cell, lives.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
-        patience = lives.PATIENCE if spec is None else spec.shutdown
+        waiting.append((cell, stopping.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
+        patience = stopping.PATIENCE if spec is None else spec.shutdown
         if not isinstance(patience, str):
             late.setdefault(patience, []).append(cell)
     timers = [cells[0].node.loop.call_later(seconds, _kill_all, those) for seconds, those in late.items()]

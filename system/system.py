@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, TypeVar, cast
 
-from ..actors import lives
+from ..actors import lives, stopping
 from ..actors.actor import Actor, Start
 from ..actors.cell import Cell, Host
 from ..actors.control.drain import drain as drain_queue
@@ -27,8 +27,10 @@ from ..actors.watch import LoopWatch, check_limits
 from ..checkpoint.controller import RecordedProcessHost, TaskHost
 from ..checkpoint.file import RecoveryFile, load_recovery
 from ..checkpoint.homes import Homes
+from ..checkpoint.journal import Journal
+from ..checkpoint.method import Durability
 from ..checkpoint.recovery.settings import RecoveryHooks
-from ..checkpoint.stores import open_journal
+from ..checkpoint.stores import check_durability, open_journal
 from ..checkpoint.subtree import SubtreeHost
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.respec import respec
@@ -37,6 +39,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
 from .transaction.addresses import Moved
@@ -54,13 +57,16 @@ STOP_TIMEOUT = 365 * 86_400.0
 """Seconds `stop` waits: no limit of its own, the child specs say how long an end may take."""
 
 
-class ActorSystem(Controls):
+class ActorSystem(Recorded, Controls):
     """A tree of actors: an async context manager that lives in whatever loop it is entered in.
 
     Args:
         name: the first part of all addresses.
         store: where journals and snapshots go: None (memory: survives any process but this one), or
-            "sqlite:PATH".
+            "sqlite:PATH", or an engine of your own: anything that keeps to `Journal` (see holdfast.testing.stores).
+        durability: what an admission outlives when it is told of (send returns, an ask is fed, a reply leaves):
+            "memory" (without a store) any process but this one, "os" (with one) this one too, "fsync" the machine.
+            Each child may say otherwise: `hybrid(durability=...)`.
         intensity, period: how many restarts of its direct children the root allows before the tree fails.
         preload: modules the fork server imports beforehand, besides those of the actors it starts.
         log: write events to structlog (crashes, restarts, dead letters, output of processes).
@@ -80,7 +86,8 @@ class ActorSystem(Controls):
         self,
         name: str = "app",
         *,
-        store: str | None = None,
+        store: str | Journal | None = None,
+        durability: Durability | None = None,
         intensity: int = 3,
         period: float = 5.0,
         preload: Sequence[str] = (),
@@ -97,6 +104,7 @@ class ActorSystem(Controls):
         self.name = name
         self._flags = Flags("one_for_one", intensity, period)
         self._store = store
+        self._durability: Durability | None = check_durability(store, durability)
         self._takeover = takeover
         self._preload = tuple(preload)
         self._log = log
@@ -126,7 +134,8 @@ class ActorSystem(Controls):
         if file is not None:
             file.check_classes()
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
-        self._homes = Homes(node, open_journal(self._store, takeover=self._takeover))
+        engine = open_journal(self._store, takeover=self._takeover)
+        self._homes = Homes(node, engine, durability=self._durability)
         self._homes.recoveries.hooks = self._recovery_hooks
         self._recovery = RecoveryTree(node, self._homes)
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
@@ -182,19 +191,23 @@ class ActorSystem(Controls):
             raise cancelled
 
     async def _close(self, root: Cell, node: Node) -> None:
-        await lives.stop_and_wait(root)
+        await stopping.stop_and_wait(root)
         await self._moves.close()
         if node.remains:
             await asyncio.wait(set(node.remains))
         self._watch.close()
         await self._workers.close()
         await node.close()
+        await self._homes.settled()
         self._homes.close()
         node.deadlines.close()
         node.events.close()
 
     def _host_for(self, spec: ChildSpec) -> Host:
         """Where a child's lives are lived."""
+        problem = "" if spec.recovery is None else self._homes.refuses(spec.recovery)
+        if problem:
+            raise SpecError(spec.id, problem)
         if spec.isolation == "process":
             self._workers.want(spec.start.kind.__module__)
             if spec.recovery is not None and spec.recovery.records:
@@ -287,7 +300,7 @@ class ActorSystem(Controls):
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:
-            await lives.stop_in_time(cell, reason)
+            await stopping.stop_in_time(cell, reason)
 
     def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
         """A ref to the actor at an address.

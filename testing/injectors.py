@@ -18,7 +18,9 @@ from ..actors.node import message_of
 from ..actors.process import frames
 from ..actors.process.workers import Worker
 from ..actors.ref import ActorRef
-from ..checkpoint.journal import Entry, Journal, Saved, StoreFailed
+from ..checkpoint.commits import Submission
+from ..checkpoint.inputs import HomeJournal
+from ..checkpoint.journal import Saved, StoreFailed
 from ..checkpoint.outputs import switch_of
 from ..system.system import ActorSystem
 from .damage import damaged
@@ -380,23 +382,24 @@ def frame(strikes: Strikes, target: Target) -> None:
 class FaultyJournal:
     """A journal that sometimes refuses: what it refuses is not written."""
 
-    def __init__(self, strikes: Strikes, real: Journal) -> None:
+    def __init__(self, strikes: Strikes, real: HomeJournal) -> None:
         self._strikes, self._real = strikes, real
-        self.durable, self.epoch = real.durable, real.epoch
+        self.durable, self.epoch, self.commits = real.durable, real.epoch, real.commits
 
     def _refuse(self, point: str, what: object) -> None:
         if self._strikes.at == point and self._strikes.next(what) is not None:
             raise StoreFailed(f"of {self._strikes.path}", f"injected fault at {point!r} (seed {self._strikes.seed})")
 
-    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
-        self._refuse("journal append", [entry[0] for _, entry in entries])
-        return self._real.append(entries)
+    def admit(self, submission: Submission) -> None:
+        """What has happened already (`submit`) is not refused: it waits until it can be written."""
+        self._refuse("journal append", [entry[0] for _, entry in submission.entries])
+        self._real.admit(submission)
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         self._refuse("snapshot write", f"{len(snapshot)} bytes after turn {turn}")
         self._real.cut(address, snapshot, drop, turn=turn, keep=keep)
 
-    def load(self, address: str, *, older: bool = False) -> Saved:
+    def load(self, address: str, *, older: int = False) -> Saved:
         return self._real.load(address, older=older)
 
     def __getattr__(self, name: str) -> Any:

@@ -9,8 +9,6 @@ from collections.abc import Callable, Iterable
 from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
-import msgspec
-
 from .. import links
 from ..codec import Codec, Parcel, Raw
 from ..errors import AskDeadlock, BadMessage, HoldfastError, type_name
@@ -19,6 +17,7 @@ from ..mail import Ask, Envelope, Item
 from ..message import Message, message_name
 from . import frames
 from .connection import BadFrame, Connection
+from .offered import Offered
 
 if TYPE_CHECKING:
     from ..cell import Cell
@@ -26,7 +25,6 @@ if TYPE_CHECKING:
     from ..node import Node
 
 Coroutine_ = types.CoroutineType
-NIL = msgspec.msgpack.encode(None)
 
 
 Route = tuple["Cell", Callable[[Any], Any], Callable[[Any], Any]]
@@ -232,48 +230,6 @@ class Accepted(Message[None]):
 
 
 _ACCEPTANCE = Accepted()
-
-
-class Offered:
-    """A message from the other side on its way to receivers that may have no room yet."""
-
-    __slots__ = ("_cells", "_id", "_is_published", "_parcel", "_peer", "_sender")
-
-    def __init__(
-        self, peer: Peer, key: int, cells: list[Cell], parcel: Parcel, sender: Cell | None, *, is_published: bool
-    ) -> None:
-        self._peer, self._id, self._cells, self._parcel, self._sender = peer, key, cells, parcel, sender
-        self._is_published = is_published
-
-    def go_on(self, _: object = None) -> None:
-        """Hand it to one receiver after the other; come back when the next one has room."""
-        peer = self._peer
-        if not peer.connection.is_open:
-            return  # Not accepted, and lost with its sender.
-        try:
-            while self._cells:
-                cell = self._cells[0]
-                try:
-                    room = cell.room()
-                    if room is not None:
-                        room.add_done_callback(self.go_on)
-                        return
-                    del self._cells[0]
-                    self._hand_to(cell)
-                except HoldfastError as error:
-                    if not self._is_published:
-                        raise
-                    self._cells = [other for other in self._cells if other is not cell]
-                    peer.node.dead_letter(cell, self._parcel, str(error))  # One's trouble is not another's.
-        except HoldfastError as error:
-            kind, name, body = peer.codec.encode_error(error)
-            peer.connection.send(frames.Failure(self._id, kind, name, Raw(body)))
-        else:
-            peer.connection.send(frames.Reply(self._id, Raw(NIL)))
-
-    def _hand_to(self, cell: Cell) -> None:
-        message = self._peer.codec.message_in(cell, self._parcel.name, self._parcel.body)
-        cell.admit(cell, message if self._sender is None else Envelope(message, self._sender))
 
 
 class Arrived(Envelope, eq=False):

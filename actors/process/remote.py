@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 from .. import links, lives, mailbox
@@ -345,8 +345,9 @@ class ProcessHost:
         else:
             send_signal(outlet.worker, cell.path, item)
 
-    def offer(self, cell: Cell, item: Any) -> None:
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         cell.admit(cell, item)
+        return None
 
     def control(self, cell: Cell, call: Call) -> None:
         from ..control.calls import send_call

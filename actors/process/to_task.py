@@ -15,8 +15,8 @@ from ..control.moving import decoded, now, obey_commands, settle, sorted_out, tw
 from ..errors import AskFailed, StartFailed, error_text
 from ..exits import KILLED, ExitReason
 from ..links import Monitor
-from ..lives import PATIENCE
 from ..mail import Ask
+from ..stopping import PATIENCE
 from . import frames
 from .mover import Move
 from .moves import Luggage, await_up

@@ -78,7 +78,7 @@ class CheckpointHandler(Part):
             if self._next.get(path) != when:
                 continue
             del self._next[path]
-            home = self._homes.home(path)
+            home = self._homes.at(path)
             if home is not None and home.method.snapshots:
                 self._consider(home, now)
         if self._heap and not self._timer:

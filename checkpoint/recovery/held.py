@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Awaitable
 from typing import TYPE_CHECKING, Any
 
 from ...actors.cell import Cell
@@ -214,8 +215,8 @@ class InletHost:
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
 
-    def offer(self, cell: Cell, item: Any) -> None:
-        cell.admit(cell, item)
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        return self._cell.host.offer(cell, item)
 
     def __getattr__(self, name: str) -> Any:
         host: Host = self._cell.host

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from .checkpoints import CheckpointHandler
 from .controller import RecoveryController
+from .handler import MessageHandler
 from .part import Part
 from .switch import MessageSwitch
 
@@ -11,4 +12,5 @@ PARTS: tuple[tuple[str, type[Part]], ...] = (
     ("controller", RecoveryController),
     ("switch", MessageSwitch),
     ("checkpoints", CheckpointHandler),
+    ("messages", MessageHandler),
 )

@@ -8,16 +8,27 @@ import zlib
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Sequence
-from typing import Final, Literal
+from typing import Final, Literal, TypeAlias
 
 from ..journal import DamagedStore, Entry, Primitive, Saved, StaleEpoch, StoreFailed
 from ..segments import Segment
 from .chains import MODULUS, Chain
 from .packs import Packs
 from .reading import ChainReader
-from .rows import CHUNK, check_entry, crc_of, entry_packer, pack_positions, row_crc, snapshot_digest, unpack_positions
+from .rows import (
+    CHUNK,
+    check_entry,
+    crc_of,
+    entry_packer,
+    is_plain,
+    pack_positions,
+    row_crc,
+    snapshot_digest,
+    unpack_positions,
+)
 from .store import Store
 
+Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]
 _INLINE_BYTES: Final = 1 << 20  # SQLite reads and writes larger blobs at less than half a file's speed.
 
 
@@ -81,28 +92,40 @@ class SqliteJournal:
         if not entries:
             return []
         with self._store.lock:
-            packed: list[tuple[str, Primitive, bytes]] = []
-            size = 0
-            for address, entry in entries:
-                check_entry(entry)
-                data = self._pack(entry)
-                packed.append((address, entry[0], data))
-                size += len(data)
-            with self._store.transaction(size) as db:
+            pack = self._pack
+            packed: list[bytes] = []
+            for _, entry in entries:
+                if not is_plain(entry):
+                    check_entry(entry)
+                packed.append(pack(entry))
+            with self._store.transaction(sum(map(len, packed))) as db:
                 first = self._store.last + 1
-                db.executemany("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", self._rows(packed))
+                db.executemany("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", self._rows(entries, packed))
                 return list(range(first, self._store.last + 1))
 
-    def _rows(self, packed: list[tuple[str, Primitive, bytes]]) -> list[tuple[int, int, int, Primitive, bytes, int]]:
+    def sync(self) -> None:
+        """Have everything appended so far survive a power loss; see `Journal`. Appends go on meanwhile.
+
+        Raises:
+            StoreFailed: from now on everything is refused.
+        """
+        self._store.sync()
+
+    def has_failed(self) -> bool:
+        """Whether everything is refused from now on."""
+        return self._store.failure is not None
+
+    def _rows(self, entries: Sequence[tuple[str, Entry]], packed: list[bytes]) -> list[Row]:
         """Give each entry its position and its place in its chain."""
-        rows: list[tuple[int, int, int, Primitive, bytes, int]] = []
-        position = self._store.last
-        for address, kind, data in packed:
-            chain = self._store.chain(address)
+        rows: list[Row] = []
+        position, address, chain = self._store.last, None, None
+        for (where, entry), data in zip(entries, packed, strict=True):
+            if chain is None or where != address:
+                address, chain = where, self._store.chain(where)
             position += 1
-            chain.last += 1
+            number = chain.last = chain.last + 1
             chain.positions.append(position)
-            rows.append((position, chain.id, chain.last, kind, data, row_crc(position, chain.id, chain.last, data)))
+            rows.append((position, chain.id, number, entry[0], data, row_crc(position, chain.id, number, data)))
         self._store.last = position
         self._store.live += len(rows)
         return rows
@@ -149,7 +172,7 @@ class SqliteJournal:
                 files = self._delete_snapshots(db, outdated)
                 del chain.kept[: len(outdated)]
                 chain.write(db)
-            self._store.files.remove(files)
+            self._store.remove_files(files)
         if len(chain.kept) >= keep:
             self._remove_dropped(chain, chain.kept[0])
 
@@ -224,6 +247,7 @@ class SqliteJournal:
         with self._store.lock:
             self._store.refresh()
             if address not in self._store.chains:
+                self.forget_blocks(address, ())  # of a snapshot that was never cut
                 return
             with self._store.transaction(note=True) as db:
                 # From here on it is gone; if we die before the rest is done, the next opening does it.
@@ -231,6 +255,8 @@ class SqliteJournal:
                 chain.path = None
                 chain.write(db)
         self._finish_erase(chain)
+        if self._packs.names(address):
+            self._store.sync_rows()
         self._packs.erase(address)
 
     def keep_blocks(
@@ -251,7 +277,7 @@ class SqliteJournal:
             return
         with self._store.transaction():
             pass  # Somebody else may own the store by now: then the packs are theirs.
-        self._store.files.sync_rows()
+        self._store.sync_rows()
         self._packs.remove(address, unneeded)
 
     def _finish_erase(self, chain: Chain) -> None:
@@ -261,7 +287,7 @@ class SqliteJournal:
             owned = db.execute("SELECT id FROM snapshots WHERE address = ?", (chain.id,)).fetchall()
             files = self._delete_snapshots(db, [number for (number,) in owned])
             db.execute("DELETE FROM addresses WHERE id = ?", (chain.id,))
-        self._store.files.remove(files)
+        self._store.remove_files(files)
 
     def addresses(self) -> list[str]:
         """Every address that has something stored, sorted."""

@@ -38,25 +38,26 @@ class SnapshotFiles:
         return Path(self.folder, name).read_bytes()
 
     def remove(self, names: Sequence[str]) -> None:
-        """Remove snapshot files that no row names.
-
-        First the WAL is synced: otherwise a power loss could bring back the rows, but not the files. (It has no locks,
-        so that closing it drops none.)
-        """
-        if names:
-            self.sync_rows()
+        """Remove snapshot files that no row names, which is on the disk (`sync_rows`)."""
         for name in names:
             with contextlib.suppress(FileNotFoundError):
                 os.unlink(os.path.join(self.folder, name))
 
     def sync_rows(self) -> None:
-        """Bring what was committed to the disk."""
+        """Bring what was committed to the disk.
+
+        Otherwise a power loss could bring back the rows, but not the files. (The WAL has no locks, so that closing it
+        drops none.)
+        """
         if os.path.exists(f"{self.path}-wal"):
             sync(f"{self.path}-wal")
 
     def remove_all_but(self, known: Collection[str]) -> None:
         """Remove what an earlier owner has written or left half made, and never named in a row."""
-        self.remove([name for name in os.listdir(self.folder) if name not in known])
+        unknown = [name for name in os.listdir(self.folder) if name not in known]
+        if unknown:
+            self.sync_rows()
+            self.remove(unknown)
 
 
 def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:

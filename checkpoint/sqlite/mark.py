@@ -14,6 +14,7 @@ from ..journal import DamagedStore
 from .claim import boot_id
 
 _MARK: Final = struct.Struct("<Q?36s")  # last acknowledged position, synced at each commit?, boot
+_SYNCED: Final = struct.Struct("<Q")  # behind it: the last position that was synced
 
 
 class Mark:
@@ -37,9 +38,11 @@ class Mark:
         """
         boot = boot_id().encode()
         self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        found = os.pread(self._fd, _MARK.size, 0)
-        if len(found) == _MARK.size:
-            position, was_synced, marked_boot = _MARK.unpack(found)
+        found = os.pread(self._fd, _MARK.size + _SYNCED.size, 0)
+        if len(found) >= _MARK.size:
+            position, was_synced, marked_boot = _MARK.unpack_from(found)
+            if not was_synced and marked_boot != boot and len(found) == _MARK.size + _SYNCED.size:
+                (position,), was_synced = _SYNCED.unpack_from(found, _MARK.size), True
             # After a power loss entries may be gone that were not synced. After anything else they may not.
             if position > last and (was_synced or marked_boot == boot):
                 reason = (
@@ -47,11 +50,16 @@ class Mark:
                     f"(remove {self.path} to go on without them)"
                 )
                 raise DamagedStore(self._store, None, last + 1, reason)
-        os.pwrite(self._fd, _MARK.pack(last, synced, boot), 0)
+        os.pwrite(self._fd, _MARK.pack(last, synced, boot) + _SYNCED.pack(last if synced else 0), 0)
 
     def set(self, position: int) -> None:
         """Everything up to this position is acknowledged from now on."""
         os.pwrite(self._fd, position.to_bytes(8, "little"), 0)
+
+    def set_synced(self, position: int) -> None:
+        """Everything up to this position survives a power loss, too."""
+        if self._fd >= 0:
+            os.pwrite(self._fd, _SYNCED.pack(position), _MARK.size)
 
     def close(self) -> None:
         """Give the descriptor back; the file stays. A second call does nothing."""

@@ -31,6 +31,11 @@ def check_entry(entry: Entry) -> None:
     _check_items(entry)
 
 
+def is_plain(entry: Entry) -> bool:
+    """Whether it certainly passes `check_entry`: the common case, and a quick look."""
+    return type(entry) is tuple and _PLAIN.issuperset(map(type, entry)) and bool(entry) and type(entry[0]) is str
+
+
 def _check_items(items: tuple[Primitive, ...]) -> None:
     if _PLAIN.issuperset(map(type, items)):
         return

@@ -7,7 +7,7 @@ import os
 import sqlite3
 import threading
 from array import array
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from typing import Final
 
 from ...actors.errors import HoldfastError
@@ -47,6 +47,7 @@ class Store:
         self.failure: HoldfastError | None = None
         self._fsync = fsync
         self._mark = Mark(path)
+        self._wal = -1  # a descriptor of the WAL, once somebody has it synced
         self._in_doubt = False  # Is what we hold in memory behind or ahead of the file?
         self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly
         self._checkpointer: threading.Thread | None = None
@@ -132,6 +133,9 @@ class Store:
 
     def _disconnect(self) -> None:
         self._mark.close()
+        if self._wal >= 0:
+            wal, self._wal = self._wal, -1
+            os.close(wal)
         for db in (self.reader, self.db):
             with contextlib.suppress(sqlite3.Error):
                 db.close()
@@ -171,6 +175,52 @@ class Store:
             self._unsaved_bytes += size + 8192
             if self._unsaved_bytes > _CHECKPOINT_BYTES:
                 self._start_checkpoint()
+
+    def sync(self) -> None:
+        """Bring what was committed so far to the disk.
+
+        Without a lock while the disk works: the WAL only grows, or begins again when all of it is in the synced
+        database; and its file stays the same for as long as somebody has it open.
+        """
+        with self.lock:
+            self.refuse_failed()
+            last = self.last
+            if self._wal < 0:  # It has no locks: to close it later drops none.
+                self._wal = os.open(f"{self.path}-wal", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fdatasync(self._wal)
+        except OSError as error:
+            with self.lock:
+                raise self.translate(error) from error
+        with self.lock:
+            self.refuse_failed()
+            self._mark.set_synced(last)
+
+    def sync_rows(self) -> None:
+        """Bring what was committed to the disk, before anything is removed that it does not name any more.
+
+        Raises:
+            StoreFailed: from now on everything is refused: the WAL is what the journal stands in.
+        """
+        try:
+            self.files.sync_rows()
+        except OSError as error:
+            with self.lock:
+                raise self.translate(error) from error
+
+    def remove_files(self, names: Sequence[str]) -> None:
+        """Remove snapshot files that no row names.
+
+        Raises:
+            StoreFailed: they could not be removed, which is done at the next opening; or as `sync_rows`.
+        """
+        if not names:
+            return
+        self.sync_rows()
+        try:
+            self.files.remove(names)
+        except OSError as error:
+            raise StoreFailed(self.path, f"{error}; snapshot files are left behind") from error
 
     def refuse_failed(self) -> None:
         """Raise the failure that ended the store, if there is one."""

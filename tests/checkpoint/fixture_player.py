@@ -6,6 +6,8 @@ A fixture is never made again: it is what a holdfast of then has written, and ev
 from __future__ import annotations
 
 import asyncio
+import os
+import signal
 from collections import deque
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,9 @@ class Add(hf.Message[int]):
 
 
 class Lock(hf.Message): ...
+
+
+class Die(hf.Message): ...
 
 
 class Show(hf.Message[list[str]]): ...
@@ -48,6 +53,10 @@ class Record(hf.Actor):
     def close(self, message: Lock) -> None:
         self.lock = asyncio.Lock()
 
+    @hf.on(Die)
+    def die(self, message: Die) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
     @hf.on(Show, readonly=True)
     def show(self, message: Show) -> list[str]:
         ones = [int(one) for one in np.flatnonzero(self.grid)]
@@ -57,6 +66,24 @@ class Record(hf.Actor):
 def expected(cells: int) -> list[str]:
     """What every fixture holds: a snapshot after three numbers, and two more in the journal."""
     return ["[1, 2, 3, 4, 5]", "{(1, 2): 'x'}", "deque([4, 5], maxlen=2)", "[1, 2, 3, 4, 5]", str(cells)]
+
+
+CHECKED = hf.replay_only(check_replay=True, max_deliveries=1)
+"""How "checked.db" was recorded."""
+
+
+async def make_checked(name: str) -> None:
+    """Record a journal with digests of states, a message in quarantine, and a group snapshot after three numbers."""
+    FOLDER.mkdir(exist_ok=True)
+    async with hf.ActorSystem("app", store=f"sqlite:{FOLDER / name}", log=False) as system:
+        ref = await system.start(hf.child("record", hf.start(Record, 10), isolation="process", recovery=CHECKED))
+        for n in (1, 2, 3):
+            await ref.ask(Add(n))
+        await system.checkpoint_group([ref], name="three")
+        for n in (4, 5):
+            await ref.ask(Add(n))
+        ref.tell(Die())
+        await ref.ask(Show(), timeout=20.0)
 
 
 async def make(name: str, cells: int) -> None:

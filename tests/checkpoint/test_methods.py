@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import dataclasses
+import inspect
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import holdfast as hf
+from holdfast.checkpoint.file import RecoveryFile
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, start, until
 from tests.checkpoint.strikes import NEVER, event, home, host_of, let_through, strike
 
@@ -128,6 +131,30 @@ async def test_the_document_has_the_table(name: str) -> None:
         "twice" if promise.repeats else "once",
         "called again" if promise.start else "not called again",
     ]
+
+
+def test_the_document_has_the_settings() -> None:
+    """Each setting of a method, with its default and the methods that have it; and no other."""
+    text = (Path(__file__).parents[2] / "docs/recovery/methods.md").read_text()
+    lines = text.partition("## Settings\n")[2].partition("\n## ")[0].splitlines()
+    rows = [tuple(cell.strip(" `") for cell in line.split("|")[1:4]) for line in lines if line.startswith("| `")]
+    expected: dict[str, tuple[object, str]] = {}
+    for letter, make in (("h", hf.hybrid), ("c", hf.checkpoint_only), ("r", hf.replay_only)):
+        for name, parameter in inspect.signature(make).parameters.items():
+            default, letters = expected.get(name, (parameter.default, ""))
+            assert default == parameter.default, f"{name} has two defaults"
+            expected[name] = default, f"{letters} {letter}".strip()
+    documented = {name: (ast.literal_eval(default), letters) for name, default, letters in rows}
+    assert documented == expected
+    assert len(rows) == len(documented)
+
+
+def test_the_document_of_the_recovery_file_has_one_that_can_be_read() -> None:
+    text = (Path(__file__).parents[2] / "docs/recovery/file.md").read_text()
+    file = RecoveryFile(text.partition("```toml\n")[2].partition("```")[0], "recovery.toml")
+    tested = file.method_for("/app/lab/one", Doer)
+    assert tested is not None
+    assert (tested.strict, tested.check_replay) == (True, True)
 
 
 async def test_what_is_lost_is_counted_and_an_answer_owed_fails_at_once(isolation: str, store: str | None) -> None:
@@ -420,7 +447,7 @@ async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
     system: hf.ActorSystem, there: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The store refuses it: the old life goes on, with all it has."""
-    import holdfast.checkpoint.switch as of_switches
+    import holdfast.checkpoint.arrival as of_arrivals
 
     def full(*_: Any) -> None:
         raise hf.HoldfastError("the disk is full")
@@ -428,7 +455,7 @@ async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
     ref = await doer(system, "process" if there == "task" else "task", "checkpoint_only")
     await ref.ask(Note("kept"))
     with monkeypatch.context() as broken:
-        broken.setattr(of_switches, "cut", full)
+        broken.setattr(of_arrivals, "cut", full)
         with pytest.raises(hf.CannotMove, match="could not be kept"):
             await system.set_isolation(ref, there)
     assert await ref.ask(Seen()) == ["kept"]

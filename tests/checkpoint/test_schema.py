@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.journal import Saved
-from tests.checkpoint.fixture_player import FOLDER, Record, Show, expected
+from tests.checkpoint.fixture_player import CHECKED, FOLDER, Die, Record, Show, expected
 from tests.checkpoint.strikes import NEVER
 
 
@@ -117,18 +117,38 @@ async def look(store: str) -> tuple[bytes | None, int]:
 async def test_what_an_earlier_holdfast_has_recorded_is_read(
     tmp_path: Path, name: str, cells: int, isolation: Any
 ) -> None:
-    for part in ("", "-snapshots", "-packs"):
-        source = FOLDER / f"{name}{part}"
-        if source.is_dir():
-            shutil.copytree(source, tmp_path / source.name)
-        elif source.exists():
-            shutil.copy(source, tmp_path / source.name)
+    copied(name, tmp_path)
     recovery = hf.hybrid(interval=NEVER)
     async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / name}", log=False) as system:
         assert system.homes.journal.load("/app/record").entries, "there is something to replay"
         spec = hf.child("record", hf.start(Record, cells), isolation=isolation, recovery=recovery)
         ref = await system.start(spec)
         assert await ref.ask(Show(), timeout=20.0) == expected(cells)
+
+
+def copied(name: str, folder: Path) -> None:
+    """A fixture to work with."""
+    for part in ("", "-snapshots", "-packs"):
+        source = FOLDER / f"{name}{part}"
+        if source.is_dir():
+            shutil.copytree(source, folder / source.name)
+        elif source.exists():
+            shutil.copy(source, folder / source.name)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_digests_quarantine_and_group_of_an_earlier_holdfast_are_read(tmp_path: Path, isolation: Any) -> None:
+    copied("checked.db", tmp_path)
+    store = f"sqlite:{tmp_path / 'checked.db'}"
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        entries = system.homes.journal.load("/app/record").entries
+        assert any(entry[0] == "end" and len(entry) == 6 for _, entry in entries), "there are digests to compare"
+        ref = await system.start(hf.child("record", hf.start(Record, 10), isolation=isolation, recovery=CHECKED))
+        assert await ref.ask(Show(), timeout=20.0) == expected(10)
+        assert [(one.message, one.attempts) for one in system.quarantined()] == [(Die(), 1)]
+        assert system.group_snapshots() == ["three"]
+        await system.restore_group("three")
+        assert (await ref.ask(Show(), timeout=20.0))[0] == "[1, 2, 3]"
 
 
 async def test_a_snapshot_of_a_later_holdfast_is_refused(tmp_path: Path) -> None:

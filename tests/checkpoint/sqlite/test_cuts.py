@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import shutil
@@ -239,3 +240,56 @@ def test_a_foreign_lock_is_named_and_passes(store: SqliteJournal, path: Path) ->
             store.append(inputs(1))
         rival.execute("ROLLBACK")
     assert store.append(inputs(1)) == [1]
+
+
+@pytest.mark.parametrize("what", ["cut", "forget_blocks", "erase"])
+def test_a_failed_sync_of_the_rows_before_files_are_removed_stops_the_store(
+    path: Path, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the WAL has on the disk is unknown then, and so is what was appended before (T13)."""
+    large = b"x" * (2 << 20)
+    with closing(SqliteJournal(path)) as journal:
+        journal.cut("/a", large, [], turn=1, keep=1)
+        journal.keep_blocks("/a", 1, [(0, memoryview(b"block"))], False)
+        fsync = os.fsync
+
+        def fail(fd: int) -> None:
+            if os.readlink(f"/proc/self/fd/{fd}").endswith("-wal"):
+                raise OSError(errno.EIO, "the disk is gone")
+            fsync(fd)
+
+        monkeypatch.setattr(os, "fsync", fail)
+        calls = {
+            "cut": lambda: journal.cut("/a", large, [], turn=2, keep=1),
+            "erase": lambda: journal.erase("/a"),
+            "forget_blocks": lambda: journal.forget_blocks("/a", []),
+        }
+        with pytest.raises(StoreFailed, match="the disk is gone"):
+            calls[what]()
+        assert journal.has_failed()
+        for refused in (lambda: journal.append([("/a", ("in", 1))]), journal.sync):
+            with pytest.raises(StoreFailed, match="the disk is gone"):
+                refused()
+        monkeypatch.undo()
+    if what != "erase":
+        with closing(SqliteJournal(path)) as journal:
+            assert journal.load("/a").snapshot == large
+            journal.read_blocks("/a", 1, [(0, 5)]).close()
+
+
+def test_what_was_erased_is_on_the_disk_before_its_blocks_are_gone(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with closing(SqliteJournal(path)) as journal:
+        journal.cut("/a", b"names the blocks", [], turn=1)
+        journal.keep_blocks("/a", 1, [(0, memoryview(b"block"))], False)
+        there: list[bool] = []
+        fsync = os.fsync
+
+        def note(fd: int) -> None:
+            if os.readlink(f"/proc/self/fd/{fd}").endswith("-wal"):
+                there.append(any(Path(f"{path}-packs").rglob("*.pack")))
+            fsync(fd)
+
+        monkeypatch.setattr(os, "fsync", note)
+        journal.erase("/a")
+        assert there == [True]
+        assert not any(Path(f"{path}-packs").rglob("*.pack"))

@@ -1,0 +1,57 @@
+"""Snapshots as they come home, in pieces or as an image: kept, or tried again when they could not be."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..actors.errors import HoldfastError
+from ..actors.events import SnapshotTaken
+from .records import Snapshot, SnapshotNow
+from .saved import cut
+
+if TYPE_CHECKING:
+    from .switch import Switch
+
+
+class Arrival:
+    """The snapshot that is on its way to one home."""
+
+    def __init__(self, home: Switch) -> None:
+        self._home = home
+        self._pieces: list[bytes] = []
+
+    def cancel(self) -> None:
+        """The life is over: what has come of it will not be complete."""
+        self._pieces.clear()
+        self._home.images.cancel()
+
+    def take(self, record: Snapshot) -> None:
+        """One more piece, or an image; the last piece completes it."""
+        home = self._home
+        if record.image is not None:
+            home.images.take(record, record.image)
+            return
+        self._pieces.append(record.data)
+        if not record.is_last:
+            return
+        state = b"".join(self._pieces)
+        self._pieces.clear()
+        try:
+            cut(home, state, record)
+        except HoldfastError as error:
+            self._refused(record, error)
+            return
+        home.limit.cut()
+        home.due.kept(record.turn)
+        if home.node.watched:
+            home.node.emit(SnapshotTaken(home.path, record.turn, len(state), record.pause, len(state)))
+
+    def _refused(self, record: Snapshot, error: HoldfastError) -> None:
+        """It could not be kept: the older snapshot and the whole journal are still there."""
+        home = self._home
+        home.due.failed(str(error))
+        if home.port is not None:
+            home.port.to_life(SnapshotNow(at_once=False))
+        if record.is_replaced and home.cell is not None:
+            home.is_void, home.unsaved = True, [*home.unsaved, str(error)]
+            home.cell.kill()

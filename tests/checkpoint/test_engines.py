@@ -1,0 +1,51 @@
+"""The engines there are, and one of a user's own, keep to the store protocol."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import holdfast as hf
+from holdfast.checkpoint.journal import Journal, MemoryJournal
+from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.sqlite.rows import crc_of
+from holdfast.testing.stores import conformance
+from tests.checkpoint.players import Doer, Note, Seen
+
+
+def killed(journal: Journal, folder: Path) -> Path:
+    """The files as they are now, with an owner that is dead."""
+    copy = folder.with_name(str(int(folder.name) + 1))
+    shutil.copytree(folder, copy)
+    with closing(sqlite3.connect(copy / "app.db", isolation_level=None)) as db:
+        row = db.execute("SELECT epoch, pid, start, floor, live FROM store").fetchone()
+        dead = (row[0], 0, "", row[3], row[4])
+        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc_of(*dead),))
+    return copy
+
+
+class TestSqlite(conformance(lambda path: SqliteJournal(path / "app.db"), crash=killed)):  # type: ignore[misc]
+    """The store of `store="sqlite:PATH"`."""
+
+
+def synced(path: Path) -> Journal:
+    return SqliteJournal(path / "app.db", synchronous="fsync")
+
+
+class TestSqliteSynced(conformance(synced, crash=killed)):  # type: ignore[misc]
+    """The same, when each append is synced."""
+
+
+class TestMemory(conformance(lambda path: MemoryJournal())):  # type: ignore[misc]
+    """No store."""
+
+
+async def test_a_system_takes_an_engine_that_is_open(tmp_path: Path) -> None:
+    for life in range(2):
+        engine = SqliteJournal(tmp_path / "app.db")
+        async with hf.ActorSystem("app", log=False, store=engine) as system:
+            doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid()))
+            await doer.ask(Note(str(life)))
+            assert await doer.ask(Seen()) == ["0", "1"][: life + 1]
