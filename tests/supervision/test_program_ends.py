@@ -158,7 +158,7 @@ async def test_one_that_ignores_sigterm_is_killed_when_its_time_is_over(system: 
         took = asyncio.get_running_loop().time() - began
         reasons = [event.reason for event in events.take() if isinstance(event, hf.ProcessDied)]
     assert reasons == [hf.Signal(9)]
-    assert 0.3 <= took < 5
+    assert 0.3 <= took < 60
     await ends.all()
 
 
