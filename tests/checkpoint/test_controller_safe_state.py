@@ -34,7 +34,7 @@ async def test_a_receiver_is_safe_from_the_crash_to_the_release(store: str | Non
     async def look(step: hf.RecoveryStep) -> None:
         seen.append((f"{step.when} {step.phase}", await words(ref)))
 
-    hooks = hf.recovery_hooks(before={"restart": look, "release": look}, after={"release": look}, timeout=8.0)
+    hooks = hf.recovery_hooks(before={"restart": look, "release": look}, after={"release": look}, timeout=30.0)
     async with running(store, recovery_hooks=hooks) as system:
         ref = await wheels(system)
         robot = await planner(system, isolation)
@@ -162,7 +162,7 @@ async def test_it_stays_when_the_recovery_fails_and_ends_when_the_actor_is_back(
         top = hf.supervisor("top", children=[child], intensity=2, period=60.0, restart="temporary", isolation=top_kind)
         await system.start(top)
         robot = system.ref("/app/top/planner", hf.Actor)
-        await robot.ask(Do([f"replayed {tmp_path / 'marker'}"]), timeout=8.0)
+        await robot.ask(Do([f"replayed {tmp_path / 'marker'}"]), timeout=30.0)
         with system.events() as stream:
             strike(system, robot)
             kept = await event(stream, hf.SafeStateKept)
