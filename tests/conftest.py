@@ -51,20 +51,33 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     """Leave each test the loops that it shall run under."""
     if os.environ.get("HOLDFAST_LOOPS") == "both":
         return
-    runs: defaultdict[tuple[str, tuple[int, ...]], list[pytest.Item]] = defaultdict(list)
+    places = Places()
+    runs: defaultdict[tuple[object, ...], defaultdict[int, list[pytest.Item]]] = defaultdict(lambda: defaultdict(list))
     for item in items:
         callspec = getattr(item, "callspec", None)
         if callspec is not None and LOOP in callspec.params and not _chooses_loops(item):
-            others = tuple(index for name, index in sorted(callspec.indices.items()) if name != LOOP)
-            runs[item.nodeid.partition("[")[0], others].append(item)
+            params = dict(callspec.params)
+            loop, test = id(params.pop(LOOP)), item.nodeid.partition("[")[0]
+            runs[(test, *(places.of(test, name, value) for name, value in params.items()))][loop].append(item)
     dropped: set[pytest.Item] = set()
-    for (test, others), under in runs.items():
+    for (test, *parameters), under in runs.items():
         # In turn along each parameter. The name, or all tests without parameters would run under the same loop.
-        chosen = (zlib.crc32(test.encode()) + sum(others)) % len(under)
-        dropped.update(item for number, item in enumerate(under) if number != chosen)
+        chosen = (zlib.crc32(str(test).encode()) + sum(map(int, parameters))) % len(under)
+        dropped.update(item for number, some in enumerate(under.values()) if number != chosen for item in some)
     if dropped:
         config.hook.pytest_deselected(items=list(dropped))
         items[:] = [item for item in items if item not in dropped]
+
+
+class Places:
+    """The values of each parameter by number: the very objects, for they need not be comparable."""
+
+    def __init__(self) -> None:
+        self._places: defaultdict[tuple[str, str], dict[int, int]] = defaultdict(dict)
+
+    def of(self, test: str, name: str, value: object) -> int:
+        known = self._places[test, name]
+        return known.setdefault(id(value), len(known))
 
 
 def _chooses_loops(item: pytest.Item) -> bool:
