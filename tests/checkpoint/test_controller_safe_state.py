@@ -229,8 +229,12 @@ async def event_on(stream: hf.EventStream, kind: type[hf.Event]) -> None:
             return
 
 
-async def test_what_is_restarted_in_good_order_makes_nobody_safe(isolation: str) -> None:
-    async with running() as system:
+@pytest.mark.parametrize("hooked", [False, True])
+async def test_what_is_restarted_in_good_order_makes_nobody_safe(isolation: str, hooked: bool) -> None:
+    """Neither on its quick way nor on the one past the points at which the hooks of a recovery are called."""
+    called: list[str] = []
+    hooks = hf.recovery_hooks(after={"safe_state": lambda step: called.append(step.phase)}) if hooked else None
+    async with running(recovery_hooks=hooks) as system:
         ref = await wheels(system)
         robot = await planner(system, isolation)
         with system.events() as stream:
@@ -239,6 +243,7 @@ async def test_what_is_restarted_in_good_order_makes_nobody_safe(isolation: str)
         await over(system)
         assert await words(ref) == []
         assert await robot.ask(Seen()) == ["one"]
+        assert bool(called) == hooked
 
 
 async def test_nobody_to_tell_holds_nothing_up(isolation: str) -> None:
