@@ -381,6 +381,8 @@ class HomeHost:
         assert switch is not None
         try:
             restore_seconds = await live
+            if switch.port is None:  # It was over before anybody came to look.
+                raise StartFailed(cell.path, ENDED)
             clock.mark("replay", switch.live_at)
             await self._let_at(switch, clock, restore_seconds)
         except HoldfastError as error:

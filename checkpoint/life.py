@@ -13,7 +13,7 @@ from typing import Any, Protocol
 from ..actors import lives, mailbox
 from ..actors.actor import Actor, Start
 from ..actors.cell import RUNNING, Cell
-from ..actors.errors import BadMessage, ControlFailed, HoldfastError, StartFailed, remote_crash
+from ..actors.errors import ActorStopped, BadMessage, ControlFailed, HoldfastError, StartFailed, remote_crash
 from ..actors.exits import ExitReason
 from ..actors.mail import Item
 from ..actors.message import Message, message_name
@@ -286,7 +286,15 @@ class Life:
                 queue[index] = mailbox.NOTHING
 
     def release(self) -> None:
-        """What this turn has sent so far leaves now."""
+        """What this turn has sent so far leaves now.
+
+        Raises:
+            ActorStopped: the life was killed in this turn, which will be handled again: what it says while it is
+                cancelled, the next life will not say.
+        """
+        more = self.cell.more
+        if more is not None and more.turn is not None and more.turn.killed:
+            raise ActorStopped(self.cell.path, "this life was killed; it may not send any more")
         feed = self.feed
         if feed is not None and self.outs:
             self.port.to_home(Released(self.turn, feed.id, self.outs))

@@ -52,17 +52,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if os.environ.get("HOLDFAST_LOOPS") == "both":
         return
     places = Places()
-    runs: defaultdict[tuple[object, ...], defaultdict[int, list[pytest.Item]]] = defaultdict(lambda: defaultdict(list))
+    runs: dict[tuple[str, tuple[int, ...]], dict[int, list[pytest.Item]]] = {}
     for item in items:
         callspec = getattr(item, "callspec", None)
         if callspec is not None and LOOP in callspec.params and not _chooses_loops(item):
             params = dict(callspec.params)
             loop, test = id(params.pop(LOOP)), item.nodeid.partition("[")[0]
-            runs[(test, *(places.of(test, name, value) for name, value in params.items()))][loop].append(item)
+            others = tuple(places.of(test, name, value) for name, value in params.items())
+            runs.setdefault((test, others), {}).setdefault(loop, []).append(item)
     dropped: set[pytest.Item] = set()
-    for (test, *parameters), under in runs.items():
+    for (test, others), under in runs.items():
         # In turn along each parameter. The name, or all tests without parameters would run under the same loop.
-        chosen = (zlib.crc32(str(test).encode()) + sum(map(int, parameters))) % len(under)
+        chosen = (zlib.crc32(test.encode()) + sum(others)) % len(under)
         dropped.update(item for number, some in enumerate(under.values()) if number != chosen for item in some)
     if dropped:
         config.hook.pytest_deselected(items=list(dropped))
