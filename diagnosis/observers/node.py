@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, Final
+import asyncio
+from collections.abc import Awaitable, Mapping
+from typing import Final
 
 from ...actors.cell import RUNNING, Cell
 from ...actors.control.calls import ask_status
-from ...actors.control.orders import status_of
+from ...actors.control.orders import Status, status_of
 from ...actors.errors import HoldfastError, SpecError
-from ...actors.process.relay import OutsideHost
+from ...actors.process.relay import OutsideHost, Peer
 from ...actors.process.remote import ProcessHost
-from ..literals import running
+from ..literals import Literal, running
 from .observer import Manner, Observer
 
 PATIENCE: Final = 1.0
@@ -41,26 +42,43 @@ class NodeObserver(Observer):
         super().on_start(restored)
 
     async def look(self) -> None:
-        """Look them all up."""
+        """Look them all up; those that have to be asked are asked at the same time."""
+        asked: list[Literal] = []
+        answers: list[Awaitable[bool | None]] = []
         for atom, path in self._actors.items():
-            cell = self.ctx.cell.node.find(path)
-            self.verdict(atom, False if cell is None else await self._runs(cell))
+            seen = self._runs(self.ctx.cell.node.find(path))
+            if seen is None or isinstance(seen, bool):
+                self.verdict(atom, seen)
+            else:
+                asked.append(atom)
+                answers.append(seen)
+        if asked:
+            for atom, answer in zip(asked, await asyncio.gather(*answers), strict=True):
+                self.verdict(atom, answer)
 
-    async def _runs(self, cell: Cell) -> bool | None:
-        host, limit = cell.host, self._hung_after
-        peer: Any = host.worker_of(cell) if isinstance(host, ProcessHost) else getattr(host, "peer", None)
-        if not isinstance(host, OutsideHost) and (cell.state is not RUNNING or not host.is_up(cell)):
+    def _runs(self, cell: Cell | None) -> bool | Awaitable[bool | None] | None:
+        if cell is None:
             return False
-        if peer is None or (limit is None and isinstance(host, ProcessHost)):
-            status = status_of(cell)
-        else:
-            try:
-                status = await ask_status(peer, cell, PATIENCE if limit is None else limit)
-            except HoldfastError:  # It has ended, or its process does not answer.
-                return False
+        host = cell.host
+        if isinstance(host, OutsideHost):
+            return self._answers(host.peer, cell, PATIENCE if self._hung_after is None else self._hung_after)
+        if cell.state is not RUNNING or not host.is_up(cell):
+            return False
+        worker = host.worker_of(cell) if isinstance(host, ProcessHost) else None
+        if worker is None or self._hung_after is None:
+            return self._judged(status_of(cell))
+        return self._answers(worker, cell, self._hung_after)
+
+    async def _answers(self, peer: Peer, cell: Cell, timeout: float) -> bool | None:
+        try:
+            return self._judged(await ask_status(peer, cell, timeout))
+        except HoldfastError:  # It has ended, or its process does not answer.
+            return False
+
+    def _judged(self, status: Status) -> bool | None:
         if status.state == "suspended":
             return None
-        return status.state == "running" and (limit is None or status.turn_seconds <= limit)
+        return status.state == "running" and (self._hung_after is None or status.turn_seconds <= self._hung_after)
 
 
 def at_root(observer: Observer) -> None:

@@ -1,6 +1,7 @@
 """Each kind of observer, in a running system, on the virtual clock."""
 
 import asyncio
+import itertools
 from collections.abc import AsyncIterator, Callable
 from typing import Any
 
@@ -139,7 +140,7 @@ async def test_literals_are_renewed_within_their_time_to_live_and_carry_time_and
     said = seen.heard()
     assert {str(one.literal) for one in said} == {"not ok(/t)"}
     assert {one.source for one in said} == {"/t/o"}
-    gaps = [later.time - earlier.time for earlier, later in zip(said, said[1:], strict=False)]
+    gaps = [later.time - earlier.time for earlier, later in itertools.pairwise(said)]
     assert max(gaps) <= 1.5
     assert len(said) <= 20  # renewed, not repeated with each look
 
