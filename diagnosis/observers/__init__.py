@@ -12,9 +12,9 @@ from .node import NodeObserver
 from .observer import Look, Manner, Observer
 from .property import Bound, Property, PropertyObserver
 from .qualitative import QualitativeObserver, trend
+from .regression import Fit, Regression
 from .score import ScoreObserver
 from .timeout import TimeoutObserver
-from .trend import Fit, Regression
 from .verdicts import Agreement, Debounce, Limits, Median, Smooth
 
 __all__ = [

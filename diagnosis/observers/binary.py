@@ -8,7 +8,7 @@ import msgspec
 
 from ..literals import matched
 from .observer import Manner, Observer
-from .trend import Regression
+from .regression import Regression
 from .verdicts import Read, reader
 
 

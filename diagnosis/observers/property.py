@@ -24,7 +24,7 @@ from ...actors.process.remote import ProcessHost
 from ..literals import Literal
 from .node import at_root
 from .observer import Manner, Observer, atom_of
-from .trend import Regression
+from .regression import Regression
 from .verdicts import Filter, Limits
 
 PATIENCE: Final = 1.0

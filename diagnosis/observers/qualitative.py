@@ -7,7 +7,7 @@ from typing import Any
 
 from ..literals import Literal, const, dec, inc
 from .observer import Manner, Observer
-from .trend import Fit, Regression
+from .regression import Fit, Regression
 from .verdicts import Filter, Read, reader
 
 

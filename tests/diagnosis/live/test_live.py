@@ -63,7 +63,10 @@ class Matcher(hf.Actor):
     @hf.subscribe("/prices")
     @hf.on(Price)
     async def _match(self, message: Price) -> None:
-        await self.ledger.ask(Book(message.cents))
+        try:
+            await self.ledger.ask(Book(message.cents))
+        except hf.HoldfastError:  # There is no trade that is not booked.
+            return
         await self.ctx.publish("/trades", Trade(message.cents))
 
 
