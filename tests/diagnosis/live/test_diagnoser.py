@@ -90,10 +90,10 @@ async def test_changes_that_come_together_are_one_diagnosis_and_what_is_the_same
     await advance(10.0)
     assert len(heard.waiting) == 1
     await observe(system, *POWERED_DOWN)  # renewed
-    await observe(system, "not ok(/joy)")  # new, and the diagnosis is the same
+    await observe(system, "running(rviz)")  # new, and changes nothing
     await advance(10.0)
-    assert [bad(one) for one in heard.waiting if isinstance(one, Diagnosis)][1:] in ([], [[ELEVEN]])
-    await observe(system, *(one.removeprefix("not ") for one in POWERED_DOWN), "ok(/joy)")
+    assert len(heard.waiting) == 1
+    await observe(system, *(one.removeprefix("not ") for one in POWERED_DOWN))
     await advance(1.0)
     last = heard.waiting[-1]
     assert isinstance(last, Diagnosis)
@@ -107,7 +107,7 @@ async def test_a_diagnosis_says_why_and_what_to_look_at_next(system: hf.ActorSys
     found = await diagnoser.ask(GetDiagnosis())
     assert bad(found) == [{"jn"}, {"ja"}]
     why = await diagnoser.ask(GetExplanation())
-    assert why.conflicts == ("not ok(/odom): at least one of ja and jn is faulty",) or "ja" in why.text
+    assert why.conflicts == ("not ok(/odom): at least one of ja and jn is faulty",)
     await observe(system, "not ok(/map)", "running(hn)", "running(hm)", "on(hu)")
     await diagnoser.ask(GetDiagnosis())
     why = await diagnoser.ask(GetExplanation())
