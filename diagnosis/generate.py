@@ -23,10 +23,15 @@ from .model import Component, Declaration, Expectation, Kind
 from .observers.general import GeneralObserver
 from .observers.hearing import Heard, listen
 from .observers.node import NodeObserver
-from .observers.observer import Manner
+from .observers.observer import Manner, Observer
+from .observers.verdicts import Agreement
 
 OURS = frozenset({DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS})
 """Topics of diagnosis itself."""
+
+
+BASE = (f"{__package__}.", f"{(__package__ or '').rpartition('.')[0]}.checkpoint.")
+"""Packages whose actors look after the system and are no part of it."""
 
 
 class Wired(msgspec.Struct, frozen=True, kw_only=True):
@@ -111,24 +116,23 @@ def _wiring(node: Node, heard: dict[str, set[str]], out: Collection[str]) -> dic
 
 
 def _below(cell: Cell, out: Collection[str]) -> Iterator[Cell]:
-    """Supervised actors; supervisors are no components: what they supervise is."""
+    """Actors that somebody restarts. Supervisors are no components: what they supervise is."""
     for child in (cell.children or {}).values():
         if child.path in out or child.is_dead:
             continue
-        kind = cell_kind(child)
-        if child.spec is not None and not getattr(kind, "_supervises", False):
+        spec = child.spec
+        if spec is not None and not spec.is_supervisor and spec.restart != "temporary":
             yield child
         yield from _below(child, out)
 
 
 def _is_ours(cell: Cell) -> bool:
+    """Whether an actor belongs to diagnosis or recovery; the power board belongs to the system."""
     kind = cell_kind(cell)
-    return kind is not None and kind.__module__.startswith(f"{__package__}.") and not _is_device(kind)
-
-
-def _is_device(kind: type[Actor]) -> bool:
-    """The power board is observed, and belongs to the system."""
-    return kind.__module__.startswith(f"{__package__}.board")
+    if kind is None or issubclass(kind, Observer):
+        return True
+    module = f"{kind.__module__}."
+    return module.startswith(BASE) and not module.startswith(f"{__package__}.board.")
 
 
 def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]]) -> Wired:
@@ -219,8 +223,9 @@ def observers_for(
         generated: what was found.
         window: seconds over which messages are counted; several should come within it.
         hung_after: see `NodeObserver`.
-        manner: of all of them.
+        manner: of all of them; by default two of three looks must agree, so that a restart is no fault yet.
     """
+    manner = manner or Manner(agreement=Agreement(2, 3))
     topics = dict.fromkeys(topic for wired in generated.wiring.values() for topic in wired.publishes)
     nodes = observer("nodes", Start(NodeObserver, (generated.addresses,), {"hung_after": hung_after, "manner": manner}))
     rates = (

@@ -5,11 +5,11 @@ from collections.abc import AsyncIterator
 import pytest
 
 import holdfast as hf
-from holdfast.diagnosis import DiagnoserActor, GetDiagnosis, generate, observers_for, tree
+from holdfast.diagnosis import DIAGNOSIS, DiagnoserActor, GetDiagnosis, generate, observer, observers_for, tree
 from holdfast.diagnosis.engine import Diagnosis, State
 from holdfast.diagnosis.model import Model
-from holdfast.diagnosis.observers import Manner
-from holdfast.testing import advance
+from holdfast.diagnosis.observers import Manner, Observer
+from holdfast.testing import advance, probe
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -124,6 +124,33 @@ async def test_to_look_leaves_nothing_behind_and_a_second_look_finds_no_diagnosi
     again = await generate(system.node)
     assert set(again.addresses) == {"desk/ledger", "desk/matcher", "gateway", "feed"}
     assert set(system.node.root.children or ()) == before  # type: ignore[union-attr]
+
+
+class Mine(Observer):
+    """A user's own observer."""
+
+
+async def test_who_looks_after_the_system_and_who_comes_and_goes_is_no_component(system: hf.ActorSystem) -> None:
+    await system.start(observer("mine", hf.start(Mine)))
+    await system.start(hf.child("recorded", hf.start(Ledger), recovery=hf.hybrid()))
+    await system.start(hf.child("job", hf.start(Ledger), restart="temporary"))
+    system.spawn(hf.start(Ledger), "unsupervised")
+    found = await generate(system.node, seconds=0.5, leave_out=["/shop/desk"])
+    assert set(found.addresses) == {"gateway", "feed", "recorded"}
+
+
+async def test_a_restart_is_no_fault(system: hf.ActorSystem) -> None:
+    found = await generate(system.node)
+    await system.start(tree(found.declaration, observers_for(found)))
+    await advance(15.0)
+    heard = probe(system)
+    heard.subscribe(DIAGNOSIS)
+    for _ in range(2):
+        system.ref("/shop/feed", Feed)._cell.kill()
+        await advance(10.0)
+    await heard.expect_no_message()
+    diagnoser = system.ref("/shop/diagnosis/diagnoser", DiagnoserActor)
+    assert (await diagnoser.ask(GetDiagnosis())).state is State.HEALTHY
 
 
 async def test_a_system_that_works_stays_healthy(system: hf.ActorSystem) -> None:

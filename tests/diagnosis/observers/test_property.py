@@ -172,3 +172,11 @@ async def test_an_actor_whose_process_does_not_answer_is_not_running(system: hf.
     worker.tell(Burn(1.5))
     await said(heard, "not running(w)")
     await said(heard, "running(w)")
+
+
+@pytest.mark.parametrize("kind", [hf.start(NodeObserver, {}), hf.start(PropertyObserver, "/t/w", ())])
+async def test_who_can_see_only_its_own_process_is_refused_in_another(
+    system: hf.ActorSystem, kind: hf.Start[Any]
+) -> None:
+    with pytest.raises(hf.StartFailed, match="own process"):
+        await system.start(hf.child("o", kind, isolation="process"))
