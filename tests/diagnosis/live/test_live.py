@@ -84,7 +84,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
         matcher = hf.child("matcher", hf.start(Matcher), bindings={"ledger": "/shop/desk/ledger"})
         await running.start(hf.supervisor("desk", children=[ledger, matcher]))
         await running.start(hf.child("gateway", hf.start(Gateway)))
-        await running.start(hf.child("feed", hf.start(Feed)))
+        await running.start(hf.child("feed", hf.start(Feed), backoff=hf.Backoff(initial=0.7, maximum=0.7, jitter=0.0)))
         yield running
 
 
@@ -142,12 +142,12 @@ async def test_who_looks_after_the_system_and_who_comes_and_goes_is_no_component
 async def test_a_restart_is_no_fault(system: hf.ActorSystem) -> None:
     found = await generate(system.node)
     await system.start(tree(found.declaration, observers_for(found)))
-    await advance(15.0)
+    await advance(15.5)
     heard = probe(system)
     heard.subscribe(DIAGNOSIS)
     for _ in range(2):
         system.ref("/shop/feed", Feed)._cell.kill()
-        await advance(10.0)
+        await advance(10.0)  # it is down when it is looked at, once
     await heard.expect_no_message()
     diagnoser = system.ref("/shop/diagnosis/diagnoser", DiagnoserActor)
     assert (await diagnoser.ask(GetDiagnosis())).state is State.HEALTHY
