@@ -12,7 +12,7 @@ import holdfast as hf
 from holdfast.diagnosis import OBSERVATIONS, observer
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Bound, Limits, Manner, NodeObserver, Property, PropertyObserver
-from holdfast.testing import Probe, probe
+from holdfast.testing import Probe, Unexpected, probe
 
 LONG = 20.0  # seconds that nothing here takes, unless something is wrong
 QUICK = Manner(every=0.05, time_to_live=1.0)
@@ -70,9 +70,10 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 
 
 async def said(heard: Probe, text: str) -> Observation:
-    found = await heard.fish(lambda one: isinstance(one, Observation) and str(one.literal) == text, timeout=LONG)
-    assert isinstance(found, Observation)
-    return found
+    while True:
+        found = await heard.fish(Observation, timeout=LONG)
+        if str(found.literal) == text:
+            return found
 
 
 async def measured(system: hf.ActorSystem, *bounds: Bound) -> Probe:
@@ -127,10 +128,11 @@ async def test_turns_that_take_long(system: hf.ActorSystem) -> None:
         while True:
             worker.tell(Burn(seconds))
             try:
-                await heard.fish(lambda one, text=text: str(one.literal) == text, timeout=0.1)
-                break
-            except AssertionError:
+                seen = await heard.fish(Observation, timeout=0.1)
+            except Unexpected:  # Not yet: another turn.
                 continue
+            if str(seen.literal) == text:
+                break
 
 
 async def test_restarts_are_counted(system: hf.ActorSystem) -> None:
@@ -148,7 +150,8 @@ async def test_of_an_actor_that_is_gone_nothing_is_known(system: hf.ActorSystem)
     heard = await measured(system, Bound("ok(queue)", Property.MAILBOX, Limits(high=10.0)))
     await said(heard, "ok(queue)")
     await system.stop(worker)
-    taken_back = await heard.fish(lambda one: one.time_to_live == 0.0, timeout=LONG)
+    while (taken_back := await heard.fish(Observation, timeout=LONG)).time_to_live > 0:
+        pass
     assert str(taken_back.literal) == "ok(queue)"
 
 
