@@ -118,3 +118,8 @@ def _is_gone(symptom: Literal, observed: Observed) -> bool:
     if symptom.positive:  # A trend gives way to another one: that it is not said any more is all that is to be seen.
         return symptom not in observed.positive
     return symptom.atom in observed.positive
+
+
+def symptoms_held(symptoms: Collection[Literal], observed: Observed) -> bool:
+    """Whether at least one of the symptoms is still observed: a diagnosis is no newer than its observations."""
+    return any(one in observed.positive if one.positive else one.atom in observed.negative for one in symptoms)

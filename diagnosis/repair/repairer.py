@@ -24,7 +24,7 @@ from ..planning import ClingoPlanner, Plan, Planner, Step, TimedOut, Unsolvable,
 from . import messages as say
 from .actions import Act, RepairAction, Repertoire
 from .case import Case, base_of, reached
-from .choice import Situation, choose, components_of, problem_for, remaining
+from .choice import Situation, choose, components_of, problem_for, remaining, symptoms_held
 from .executor import DENIED, DONE, SKIPPED, Executor, Result
 from .ledger import Ledger
 from .policy import NORMAL, Policy
@@ -179,7 +179,7 @@ class Repairer(Actor):
         diagnosis = self._diagnosis
         if diagnosis.state is State.HEALTHY:
             return await self._finish(case)
-        if diagnosis.state is not State.FAULTY:
+        if self._why_unknown():
             return await self._unknown(case)
         case.add_symptoms(diagnosis.symptoms)
         bad = self._chosen(case)
@@ -278,14 +278,25 @@ class Repairer(Actor):
 
     async def _unknown(self, case: Case) -> bool:
         """No repair starts from observations that say nothing or cannot all be true (T49, T50)."""
-        why = f"the observations are {self._diagnosis.state.value}"
+        why = self._why_unknown()
         await self._tell(say.Held(case.number, why))
         ends = self.now() + self._policy.unknown
-        while self._diagnosis.state in (State.BLIND, State.CONTRADICTORY):
+        while self._why_unknown():
             if self.now() >= ends:
                 return await self._give_up(case, (), f"{why} for {self._policy.unknown:g} s")
             await self._sleep(ends - self.now(), wakes=True)
         return False
+
+    def _why_unknown(self) -> str:
+        """Why it is not known what there is to repair; empty if it is."""
+        diagnosis = self._diagnosis
+        if diagnosis.state in (State.BLIND, State.CONTRADICTORY):
+            return f"the observations are {diagnosis.state.value}"
+        if diagnosis.state is State.FAULTY and not symptoms_held(
+            diagnosis.symptoms, self._observations.current(self.now())
+        ):
+            return "nobody observes any more what was diagnosed"
+        return ""
 
     async def _nothing_left(self, case: Case) -> bool:
         """No candidate is open: what is left was given up before, cannot be planned for, or is not ours to touch."""
