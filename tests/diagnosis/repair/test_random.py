@@ -65,9 +65,11 @@ async def test_random_faults(count: int, seed: int) -> None:
             assert here.all(Repaired), (faults, here.told)
             assert given_up == set(), (faults, here.told)
             assert here.world.is_healthy(), faults
-        # What is lost for good takes nobody else with it, but for those that need it.
-        for name in (*here.world.hardware, *here.world.nodes):
-            if beyond.isdisjoint((name, *here.world.drives.get(name, ()))) and name not in given_up:
+        # What is lost for good takes nobody else with it, but for those that need it: whether they work nobody can tell.
+        for name, component in here.world.model.components.items():
+            needs = {name, *component.on}
+            fed = all(here.world.is_ok(topic) for inputs in component.out.values() for topic in inputs)
+            if component.kind.value != "H" and fed and beyond.isdisjoint(needs) and name not in given_up:
                 assert here.world.serves(name), (name, faults)
 
 
