@@ -62,7 +62,7 @@ class World:
             return name in self.on and name not in self.hung
         if name not in self.running or name in self.hung:
             return False
-        # A driver loses its device when that loses its power; one that publishes nothing finds it again: nobody would see.
+        # A driver loses its device when that loses its power; one that publishes nothing finds it again by itself.
         is_lasting = not self.model.components[name].out
         needed = self.drives.get(name, ())
         return all(self.serves(h) and (is_lasting or self.started[name] > self.powered[h]) for h in needed)

@@ -7,7 +7,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.diagnosis.literals import ok
-from holdfast.diagnosis.messages import OBSERVATIONS, MODEL, ModelChanged
+from holdfast.diagnosis.messages import MODEL, OBSERVATIONS, ModelChanged
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.repair import (
     DENIED,
@@ -39,7 +39,7 @@ from tests.diagnosis.repair.simulated import Scene, World, scene
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
-QUICK = dict(verify=6.0, settle=1.0, cool_down=0.5)
+QUICK = {"verify": 6.0, "settle": 1.0, "cool_down": 0.5}
 
 
 @pytest.fixture

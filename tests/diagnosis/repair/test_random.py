@@ -1,4 +1,4 @@
-"""Random faults, one to three at a time: each run ends in time, repaired or given up loudly, and nobody else is touched."""
+"""Random faults, one to three at a time: each run ends in time, repaired or given up, and nobody else is touched."""
 
 import random
 
@@ -65,7 +65,7 @@ async def test_random_faults(count: int, seed: int) -> None:
             assert here.all(Repaired), (faults, here.told)
             assert given_up == set(), (faults, here.told)
             assert here.world.is_healthy(), faults
-        # What is lost for good takes nobody else with it, but for those that need it: whether they work nobody can tell.
+        # What is lost for good takes nobody else with it, but for those that need it: nobody can tell how they are.
         for name, component in here.world.model.components.items():
             needs = {name, *component.on}
             fed = all(here.world.is_ok(topic) for inputs in component.out.values() for topic in inputs)

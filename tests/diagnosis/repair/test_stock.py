@@ -52,6 +52,29 @@ class Node(hf.Actor):
         return self.provider.path
 
 
+class Note(hf.Message):
+    """One more."""
+
+    text: str
+
+
+class Read(hf.Message[list[str]]):
+    """All of them."""
+
+
+class Notes(hf.Actor):
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    @hf.on(Note)
+    def _note(self, message: Note) -> None:
+        self.notes.append(message.text)
+
+    @hf.on(Read)
+    def _read(self, message: Read) -> list[str]:
+        return self.notes
+
+
 class Caller(hf.Actor):
     """Carries actions out, as the repairer does."""
 
@@ -150,6 +173,22 @@ async def test_roll_back_stops_goes_back_and_starts(system: hf.ActorSystem) -> N
     await do(system, roll_back(addresses, back), "a")
     assert seen == [("/t/s/low/a", "stopped")]
     assert (await states(system))["a"] == "running"
+
+
+async def test_roll_back_to_an_older_snapshot(system: hf.ActorSystem) -> None:
+    path = "/t/s/notes"
+    spec = hf.child("notes", hf.start(Notes), recovery=hf.hybrid(interval=1000.0))
+    await system.start(hf.supervisor("s", children=[spec]))
+    notes = system.ref(path, Notes)
+    for text in ("a", "b", "c"):
+        await notes.ask(Note(text))
+        if text != "c":
+            await system.checkpoint(notes)
+    await do(system, roll_back({"n": path}, system.roll_back), "n")
+    # The stop in good order has taken one more snapshot, with all three.
+    assert await system.ref(path, Notes).ask(Read()) == ["a", "b"]
+    with pytest.raises(hf.ControlFailed, match="stop it first"):
+        system.roll_back(path)
 
 
 async def test_if_there_is_nothing_to_go_back_to_the_actor_runs_again(system: hf.ActorSystem) -> None:
