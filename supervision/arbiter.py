@@ -12,7 +12,7 @@ import dataclasses
 import enum
 import itertools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 
 from ..actors.cell import Cell
 from ..actors.errors import HoldfastError
@@ -119,7 +119,7 @@ class Arbiter:
     @contextlib.contextmanager
     def held(
         self, address: str, hand: Hand, reason: str, *, lost: Callable[[str], None] | None = None
-    ) -> Iterator[Grant]:
+    ) -> Generator[Grant]:
         """A grant for a block. Raises InOtherHands."""
         grant = self.claim(address, hand, reason, lost=lost)
         try:

@@ -14,10 +14,11 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 
 from ...actors.actor import Actor, on, subscribe
+from ...actors.errors import HoldfastError
 from ...supervision.arbiter import Arbiter, arbiter_of
 from ..engine import Diagnosis, State
 from ..literals import BadLiteral, Literal
-from ..messages import DIAGNOSIS, MODEL, OBSERVATIONS, ModelChanged
+from ..messages import DIAGNOSIS, MODEL, OBSERVATIONS, GetDiagnosis, ModelChanged
 from ..model import Model
 from ..observations import Observation, ObservationSet
 from ..planning import ClingoPlanner, Plan, Planner, Step, TimedOut, Unsolvable, find_plan
@@ -41,6 +42,8 @@ class Repairer(Actor):
         base: addresses besides its own without which there is no repair: they and what is above or below them are
             never touched (T64).
         planner: finds plans.
+        diagnoser: the address of who is asked for the present diagnosis at the start: diagnoses are published when
+            they change, and a life that begins later would not know of one.
     """
 
     deterministic = False
@@ -54,11 +57,13 @@ class Repairer(Actor):
         addresses: Mapping[str, str] | None = None,
         base: Iterable[str] = (),
         planner: Planner | None = None,
+        diagnoser: str | None = None,
     ) -> None:
         self._model, self._policy = model, policy or Policy()
         self._actions = actions if isinstance(actions, Repertoire) else Repertoire(actions)
         self._addresses, self._base = dict(addresses or {}), tuple(base)
         self._planner = planner or ClingoPlanner()
+        self._diagnoser = diagnoser
         self._ledger = Ledger(self._policy)
         self._observations = ObservationSet(model.vocabulary)
         self._diagnosis = Diagnosis(State.BLIND)
@@ -75,12 +80,23 @@ class Repairer(Actor):
         self._count = 0
         self._graced = -math.inf
 
+    def on_start(self, restored: bool) -> None:
+        """Ask for the present diagnosis."""
+        if self._diagnoser is not None:
+            self.ctx.create_task(self._catch_up(self._diagnoser))
+
+    async def _catch_up(self, diagnoser: str) -> None:
+        with contextlib.suppress(HoldfastError):  # It publishes its first one when it is there.
+            found = await self.ctx.find(diagnoser, Actor).ask(GetDiagnosis())
+            if self._diagnosed == -math.inf:
+                self._diagnose(found)
+
     # -- what comes in ----------------------------------------------------------------------------------------------
 
     @subscribe(OBSERVATIONS)
     @on(Observation)
     def _observe(self, message: Observation) -> None:
-        with contextlib.suppress(BadLiteral):  # The diagnoser tells of words that the model does not have.
+        with contextlib.suppress(BadLiteral, ValueError):  # The diagnoser tells of what cannot be used.
             self._observations.add(message)
             self._wake()
 
@@ -213,7 +229,9 @@ class Repairer(Actor):
         if any(result.outcome == DONE for result in results):
             await self._settled(case, {name for step in outcome.steps for name in step.args[:1]})
         elif all(result.outcome == SKIPPED for result in results):
-            await self._sleep(max(self._policy.cool_down, 0.1), wakes=True)  # Somebody else is at it.
+            case.rounds -= 1  # Somebody else is at it, or the world has moved on: nothing was tried.
+            case.tried[bad] -= 1
+            await self._sleep(max(self._policy.cool_down, 1.0))
         return False
 
     def _executor(self, bad: Iterable[str]) -> Executor:

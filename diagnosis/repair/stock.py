@@ -117,7 +117,7 @@ def bind_port(
 def _action(
     name: str, run: Run, addresses: Mapping[str, str], options: Mapping[str, Any], *, pddl: str = ""
 ) -> RepairAction:
-    known = {"takes": addresses.__contains__, "reach": addresses.get}
+    known: dict[str, Any] = {"takes": addresses.__contains__, "reach": addresses.get}
     return RepairAction(name, run, pddl, **(known | dict(options)))
 
 

@@ -5,9 +5,9 @@ import dataclasses
 from collections.abc import Iterable
 
 import holdfast as hf
-from holdfast.diagnosis.engine import Diagnoser, Diagnosis
+from holdfast.diagnosis.engine import Diagnoser, Diagnosis, State
 from holdfast.diagnosis.literals import Literal, ok, on, running
-from holdfast.diagnosis.messages import DIAGNOSIS, OBSERVATIONS, REPAIR, Touched
+from holdfast.diagnosis.messages import DIAGNOSIS, OBSERVATIONS, REPAIR, GetDiagnosis, Touched
 from holdfast.diagnosis.model import Model, System
 from holdfast.diagnosis.observations import Observation, ObservationSet
 from holdfast.diagnosis.planning import Step
@@ -174,6 +174,7 @@ class Doctor(hf.Actor):
         self._engine, self._set = Diagnoser(model), ObservationSet(model.vocabulary)
         self._ranks, self._touched, self._last = ranks, dict[str, float](), None
         self._due = False
+        self._found = Diagnosis(State.BLIND)
 
     @hf.subscribe(OBSERVATIONS)
     @hf.on(Observation)
@@ -187,12 +188,17 @@ class Doctor(hf.Actor):
     def _repaired(self, message: Touched) -> None:
         self._touched |= dict.fromkeys(message.components, message.time)
 
+    @hf.on(GetDiagnosis)
+    def _present(self, message: GetDiagnosis) -> Diagnosis:
+        return self._found
+
     @hf.on(Think)
     async def _think(self, message: Think) -> None:
         self._due = False
         now = asyncio.get_running_loop().time()
         recent = [name for name, when in self._touched.items() if self._ranks and now - when < 30]
         found = await self._engine.diagnose(self._set.current(now), repaired=recent)
+        self._found = found
         said = (found.state, found.candidates, found.symptoms)
         if said != self._last:
             self._last = said

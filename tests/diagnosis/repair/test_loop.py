@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 
@@ -13,6 +14,7 @@ from holdfast.diagnosis.repair import (
     DENIED,
     DONE,
     FAILED,
+    LOST,
     SKIPPED,
     UNVERIFIED,
     ActionBegan,
@@ -29,17 +31,19 @@ from holdfast.diagnosis.repair import (
     RepairAction,
     RepairBegan,
     Repaired,
+    Repairer,
     RepairGaveUp,
     Repertoire,
     RetryRepair,
     SetMode,
     action,
 )
+from holdfast.supervision.arbiter import Hand, arbiter_of
 from tests.diagnosis.repair.simulated import Scene, World, scene
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
-QUICK = {"verify": 6.0, "settle": 1.0, "cool_down": 0.5}
+QUICK: dict[str, Any] = {"verify": 6.0, "settle": 1.0, "cool_down": 0.5}
 
 
 @pytest.fixture
@@ -366,3 +370,46 @@ async def test_each_case_begins_and_ends(system: hf.ActorSystem) -> None:
     await here.hear(Repaired, 2)
     assert [(one.case, one.bad) for one in here.all(RepairBegan)] == [(1, ("hm",)), (2, ("lac",))]
     assert [one.case for one in here.all(Repaired)] == [1, 2]
+
+
+async def test_a_repairer_that_is_restarted_in_the_middle_goes_on(system: hf.ActorSystem) -> None:
+    # T61: what its last life held is free again.
+    here = await scene(system, Policy(**QUICK))
+    spec = hf.child(
+        "second", hf.start(Repairer, here.world.model, here.world.actions(), Policy(**QUICK), diagnoser="/t/doctor")
+    )
+    await system.stop(here.repairer)
+    here.change(off("hu"))
+    await asyncio.sleep(5.0)
+    repairer = await system.start(spec)
+    await here.hear(ActionBegan)
+    repairer.kill()
+    await here.hear(Repaired)
+    assert here.done()[:2] == ["power_up(hu)", "power_up(hu)"]
+    assert here.world.is_healthy()
+
+
+async def test_repair_keeps_away_from_what_others_hold(system: hf.ActorSystem) -> None:
+    # T63
+    here = await scene(system, Policy(**QUICK), addresses={"hm": "/t/robot/hm"})
+    grant = arbiter_of(system.node).claim("/t/robot/hm", Hand.FAILOVER, "its node is gone")
+    here.change(stopped("hm"))
+    ended = await here.hear(ActionEnded)
+    assert (ended.outcome, ended.why) == (SKIPPED, "/t/robot/hm is in the hands of failover: its node is gone")
+    assert here.done() == []
+    arbiter_of(system.node).release(grant)
+    await here.hear(Repaired)
+
+
+async def test_an_action_ends_at_once_when_failover_takes_the_actor(system: hf.ActorSystem) -> None:
+    # T63
+    here = await scene(system, Policy(**QUICK), addresses={"hm": "/t/robot/hm"})
+    here.change(stopped("hm"))
+    began = await here.hear(ActionBegan)
+    grant = arbiter_of(system.node).claim("/t/robot/hm", Hand.FAILOVER, "its node is gone")
+    assert grant.epoch > began.epoch
+    ended = await here.hear(ActionEnded)
+    assert (ended.outcome, ended.why) == (LOST, "failover has it now: its node is gone")
+    assert "hm" not in here.world.running
+    arbiter_of(system.node).release(grant)
+    await here.hear(Repaired)

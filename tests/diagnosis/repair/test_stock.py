@@ -91,7 +91,9 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 async def do(system: hf.ActorSystem, one: RepairAction, *names: str, check=lambda: None) -> None:
     caller = system.spawn(hf.start(Caller))
     await system.node.settled()
-    act = Act(Step(one.name, names), 1, "a test", caller._cell.actor.ctx, check)
+    actor = caller._cell.actor
+    assert actor is not None
+    act = Act(Step(one.name, names), 1, "a test", actor.ctx, check)
     async with asyncio.timeout(LONG):
         await one(act, *names)
 
