@@ -5,7 +5,9 @@ from collections.abc import AsyncIterator
 import pytest
 
 import holdfast as hf
-from holdfast.diagnosis.repair import GaveUp, Policy, Repaired
+from holdfast.diagnosis.engine import Diagnosis
+from holdfast.diagnosis.model import System
+from holdfast.diagnosis.repair import GaveUp, Planned, Policy, Repaired
 from tests.diagnosis.repair.simulated import POWER, START, World, scene
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
@@ -63,3 +65,19 @@ async def test_shut_down_in_one_plan(system: hf.ActorSystem) -> None:
     await here.hear(Repaired)
     assert here.planned() == [[["power_up(ja)", "stop_node(jn)"], ["start_node(jn)"]]]
     assert here.world.is_healthy()
+
+
+async def test_a_diagnosis_that_did_not_help_is_not_acted_upon_again_before_the_others(
+    system: hf.ActorSystem,
+) -> None:
+    # O3: a base that often fails is listed first each time. "Take the first" would switch it off and on for ever.
+    robot = System()
+    robot.hardware("ja", prior=0.4)
+    robot.driver("jn", on=["ja"], out=["/odom"])
+    here = await scene(system, ranks=False, robot=robot)
+    here.change(base_off)
+    await here.hear(Repaired)
+    ambiguous = next(one for one in here.all(Diagnosis) if len(one.candidates) == 2)
+    assert [one.bad for one in ambiguous.candidates] == [("ja",), ("jn",)]
+    assert [one.bad for one in here.all(Planned)] == [("ja",), ("jn",)]
+    assert here.done() == ["power_up(ja)", "stop_node(jn)", "start_node(jn)"]
