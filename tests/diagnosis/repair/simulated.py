@@ -31,7 +31,6 @@ from holdfast.diagnosis.repair import (
 from tests.diagnosis.robot import paper_robot
 
 PERIOD = 0.5
-UNSEEN = {"/joy"}
 POWER, START, STOP = 1.0, 0.5, 0.2
 
 
@@ -53,6 +52,7 @@ class World:
         self.hung: set[str] = set()  # on or running, and of no use until it is switched off or stopped
         self.flaky: set[str] = set()  # its next start does not work
         self.mute = False
+        self.unseen = {"/joy"}
         self.news = asyncio.Event()
         self.log: list[tuple[float, str]] = []
 
@@ -86,7 +86,7 @@ class World:
             yield running(n) if n in self.running else ~running(n)
         for one in self.model.components.values():
             for topic in one.out:
-                if topic not in UNSEEN:
+                if topic not in self.unseen:
                     yield ok(topic) if self.is_ok(topic) else ~ok(topic)
 
     # -- what can be done

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.diagnosis.literals import ok
+from holdfast.diagnosis.literals import ok, running
 from holdfast.diagnosis.messages import MODEL, OBSERVATIONS, ModelChanged
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.repair import (
@@ -249,6 +249,20 @@ async def test_blind_is_not_healthy(system: hf.ActorSystem) -> None:
     assert "nobody observes any more" in over.why
     assert here.all(Repaired) == []
     assert here.done() == ["power_up(hu)"]
+
+
+async def test_a_symptom_that_nobody_looks_at_any_more_is_not_repaired(system: hf.ActorSystem) -> None:
+    # T50: nothing is blamed any more, but only because the observer of /map has fallen silent.
+    here = await scene(system, Policy(**QUICK))
+    here.change(lambda world: world.hung.add("hm"))
+    await here.hear(ActionBegan, 2)
+    here.world.unseen.add("/map")
+    await asyncio.sleep(4.0)
+    await system.publish(OBSERVATIONS, Observation(running("lac"), asyncio.get_running_loop().time(), "other", 100.0))
+    over = await here.hear(GaveUp)
+    assert over.components == ()
+    assert over.why == "nothing is blamed any more, but not ok(/map) was not seen to have gone"
+    assert here.all(Repaired) == []
 
 
 # -- who decides ----------------------------------------------------------------------------------------------------
