@@ -172,7 +172,8 @@ class Doctor(hf.Actor):
 
     def __init__(self, model: Model, ranks: bool) -> None:
         self._engine, self._set = Diagnoser(model), ObservationSet(model.vocabulary)
-        self._ranks, self._touched, self._last = ranks, dict[str, float](), None
+        self._ranks, self._touched = ranks, dict[str, float]()
+        self._last: object = None
         self._due = False
         self._found = Diagnosis(State.BLIND)
 
