@@ -6,8 +6,11 @@ to here. Names are case-sensitive.
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Iterable, Mapping
+import sys
+import threading
+from collections.abc import Generator, Iterable, Mapping
 from typing import Any
 
 from .language import (
@@ -31,6 +34,8 @@ from .language import (
 
 LARGEST_TEXT = 4_000_000
 """Characters of a domain or a problem."""
+_PARSING = threading.Lock()
+"""Held while the library has its way with `sys.tracebacklimit`, which is the whole process's."""
 MERGED = (":requirements", ":types", ":constants", ":predicates", ":functions")
 """Sections of a domain whose contents an extension adds to."""
 
@@ -150,7 +155,8 @@ def _parse(parser: Any, text: str, what: str) -> Any:
     if len(text) > LARGEST_TEXT:
         raise PlanningError(what, f"it has {len(text)} characters, and {LARGEST_TEXT} are allowed")
     try:
-        return parser()(text)
+        with _with_tracebacks():
+            return parser()(text)
     except RecursionError as error:
         raise PlanningError(what, "its forms are nested too deeply") from error
     except (TypeError, AttributeError) as error:
@@ -160,6 +166,20 @@ def _parse(parser: Any, text: str, what: str) -> Any:
         ) from error
     except Exception as error:  # The library raises what its parser and its checks happen to raise: all mean the text.
         raise PlanningError(what, " ".join(str(error).split())[:500] or type(error).__name__) from error
+
+
+@contextlib.contextmanager
+def _with_tracebacks() -> Generator[None, None, None]:
+    """The library sets `sys.tracebacklimit` to 0, and leaves it so when it fails: no crash would be traced any more."""
+    with _PARSING:
+        before = getattr(sys, "tracebacklimit", None)
+        try:
+            yield
+        finally:
+            if before is not None:
+                sys.tracebacklimit = before
+            elif hasattr(sys, "tracebacklimit"):
+                del sys.tracebacklimit
 
 
 def _types(term: Any) -> tuple[str, ...]:

@@ -1,5 +1,8 @@
 """PDDL text: what is wrong with it is said, and where."""
 
+import contextlib
+import sys
+
 import pytest
 
 from holdfast.diagnosis.planning import (
@@ -136,3 +139,17 @@ def test_costs_forall_when_exists_and_equality_are_understood() -> None:
     problem = Problem(problem.domain, problem.objects, problem.init | {("good", "mains")}, problem.goals)
     outcome = ClingoPlanner().solve(problem, Budget(60))
     assert told(outcome) == [["power_all()"]]
+
+
+@pytest.mark.parametrize("limit", [None, 7])
+@pytest.mark.parametrize("text", ["(define (domain d) (:predicates (on ?x)))", "(define (domain d"])
+def test_reading_leaves_the_tracebacks_of_others_alone(
+    monkeypatch: pytest.MonkeyPatch, text: str, limit: int | None
+) -> None:
+    """The library sets `sys.tracebacklimit` to 0 while it parses, and leaves it so after an error."""
+    monkeypatch.delattr(sys, "tracebacklimit", raising=False)
+    if limit is not None:
+        monkeypatch.setattr(sys, "tracebacklimit", limit, raising=False)
+    with contextlib.suppress(PlanningError):
+        read_domain(f"; {limit}\n{text}")  # Not one that was read before.
+    assert getattr(sys, "tracebacklimit", None) == limit
