@@ -2,29 +2,19 @@
 
 A gateway takes orders, a matcher matches them at the prices of a feed, a ledger books them through a connection to a
 database. None of the five knows of diagnosis. What a user adds is in `look_after`: the model is that of the running
-system, with two expectations that nobody can see from outside.
+system, with one expectation that nobody can see from outside.
 """
 
 import asyncio
 
-import msgspec
-
 import holdfast as hf
-from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR, generate, observer, observers_for, tree
+from holdfast import diagnosis
+from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR
 from holdfast.diagnosis.engine import Diagnosis
-from holdfast.diagnosis.model import Expectation, Model
+from holdfast.diagnosis.model import Expect, Expectation
 from holdfast.diagnosis.observations import Observation
-from holdfast.diagnosis.observers import (
-    Agreement,
-    Bound,
-    Check,
-    DiagnosticObserver,
-    Limits,
-    Manner,
-    Property,
-    PropertyObserver,
-)
-from holdfast.diagnosis.repair import ActionBegan, GaveUp, Policy, Repaired, Repairer, restart_child
+from holdfast.diagnosis.observers import Agreement, Check, DiagnosticObserver, Limits, Manner, Property
+from holdfast.diagnosis.repair import ActionBegan, GaveUp, Policy, Repaired
 
 # -- the service -----------------------------------------------------------------------------------------------------
 
@@ -187,46 +177,24 @@ shop = hf.supervisor(
 
 
 async def look_after(system: hf.ActorSystem) -> None:
-    """Diagnosis and repair of whatever runs in the system."""
-    found = await generate(system.node, seconds=1.0)
-    memory = Expectation("ok(ledger.memory)", of=("shop/ledger",))
-    latency = Expectation(
-        "ok(latency)", of=("shop/gateway", "shop/matcher"), given=("ok(/prices)", "ok(shop/ledger:replies)")
-    )
-    model = msgspec.structs.replace(found.declaration, expectations=(*found.declaration.expectations, memory, latency))
+    """Diagnosis and repair of what runs in the system: who publishes, subscribes and is bound to whom is found out."""
     # Steady rather than quick: four of five looks have to agree, and what comes within a second is one finding.
     manner = Manner(every=0.1, time_to_live=2.0, agreement=Agreement(4, 5))
-    observers = [
-        *observers_for(found, window=1.0, manner=manner),
-        observer(
-            "memory",
-            hf.start(
-                PropertyObserver,
-                "/app/shop/ledger",
-                [Bound("ok(ledger.memory)", Property.MEMORY, Limits(high=200e6))],
-                manner=manner,
-            ),
-        ),
-        observer(
-            "latency",
-            hf.start(
-                DiagnosticObserver,
-                "/confirmations",
-                [Check("ok(latency)", "seconds", Limits(high=0.05))],
-                manner=manner,
-            ),
-        ),
-    ]
-    repairer = hf.start(
-        Repairer,
-        Model(model),
-        [restart_child(found.addresses, grace=3.0)],
-        Policy(settle=1.0),
-        addresses=found.addresses,
-        base=["/app/diagnosis"],
-        diagnoser="/app/diagnosis/diagnoser",
+    fast = Check("ok(latency)", "seconds", Limits(high=0.05))
+    await diagnosis.watch(
+        system,
+        observers=[
+            diagnosis.observer("latency", hf.start(DiagnosticObserver, "/confirmations", [fast], manner=manner))
+        ],
+        limits={"shop/ledger": {Property.MEMORY: Limits(high=200e6)}},
+        repair=Policy(settle=1.0),
+        manner=manner,
+        seconds=1.0,
+        quiet=1.0,
     )
-    await system.start(tree(model, observers, quiet=1.0, repairer=hf.child("repairer", repairer)))
+    # What nobody can see from outside: orders are quick while the gateway and the matcher work and prices are fresh.
+    expected = Expectation("ok(latency)", of=("shop/gateway", "shop/matcher"), given=("ok(/prices)",))
+    await system.ref("/app/diagnosis/model", diagnosis.ModelServer).ask(diagnosis.ChangeModel((Expect(expected),)))
 
 
 # -- who watches all of it -------------------------------------------------------------------------------------------
@@ -302,12 +270,10 @@ async def main() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         await system.start(shop)
         operator = system.spawn(hf.start(Operator), name="operator")
-        learned = operator.ask(
-            WhenSeen(tuple(f"ok({name})" for name in ("/prices", "/trades", "/confirmations", "/database", "latency"))),
-            timeout=50.0,
-        )
+        names = ("/prices", "/trades", "/confirmations", "/database", "latency", "shop/ledger.memory")
+        known = operator.ask(WhenSeen(tuple(f"ok({name})" for name in names)), timeout=50.0)
         await look_after(system)
-        await learned
+        await known
 
         async def broken(name: str, kind: type[hf.Actor]) -> Case:
             case = operator.ask(NextCase(), timeout=50.0)

@@ -19,35 +19,12 @@ from typing import Any, Final
 import msgspec
 
 import holdfast as hf
-from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR, observer, tree
+from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR, observer, repair, tree
 from holdfast.diagnosis.board import TOPIC, Board, BoardActor, BoardMeasured, BoardSimulator, GetBoard
 from holdfast.diagnosis.engine import Diagnosis
-from holdfast.diagnosis.model import Model, System
+from holdfast.diagnosis.model import System
 from holdfast.diagnosis.observations import Observation
-from holdfast.diagnosis.observers import (
-    Agreement,
-    Channel,
-    GeneralObserver,
-    HardwareObserver,
-    Manner,
-    NodeObserver,
-)
-from holdfast.diagnosis.repair import (
-    NORMAL,
-    SAFE,
-    ActionBegan,
-    ActionEnded,
-    GaveUp,
-    Planned,
-    Policy,
-    Repaired,
-    Repairer,
-    SetMode,
-    power_up,
-    shutdown,
-    start_node,
-    stop_node,
-)
+from holdfast.diagnosis.observers import Agreement, Channel, GeneralObserver, HardwareObserver, Manner, NodeObserver
 from holdfast.supervision.admin import TerminateChild
 
 BOOT: Final = {"ja": 1.5, "hu": 1.0, "la": 0.5, "imu": 0.0, "js": 0.0}
@@ -245,25 +222,16 @@ def care(url: str) -> hf.ChildSpec:
     ]
     board = "/robot/diagnosis/board"
     actions = [
-        power_up(board, CHANNELS, grace=GRACE),
-        shutdown(board, CHANNELS),
-        start_node(addresses, grace=GRACE),
-        stop_node(addresses),
+        repair.power_up(board, CHANNELS, grace=GRACE),
+        repair.shutdown(board, CHANNELS),
+        repair.start_node(addresses, grace=GRACE),
+        repair.stop_node(addresses),
     ]
-    repairer = hf.start(
-        Repairer,
-        Model(model()),
-        actions,
-        Policy(settle=0.5),
-        addresses=addresses,
-        base=["/robot/diagnosis"],
-        diagnoser="/robot/diagnosis/diagnoser",
-    )
     return tree(
         model(),
         observers,
         others=[hf.child("board", hf.start(BoardActor, url, interval=0.02))],
-        repairer=hf.child("repairer", repairer),
+        repairer=repair.repairer(model(), actions, repair.Policy(settle=0.5), addresses=addresses),
     )
 
 
@@ -323,23 +291,25 @@ class Recorder(hf.Actor):
         self._add("diagnosed", message.sets())
 
     @hf.subscribe(REPAIR)
-    @hf.on(Planned)
-    @hf.on(ActionBegan)
-    @hf.on(ActionEnded)
-    @hf.on(Repaired)
-    @hf.on(GaveUp)
-    def _repairs_it(self, message: Planned | ActionBegan | ActionEnded | Repaired | GaveUp) -> None:
+    @hf.on(repair.Planned)
+    @hf.on(repair.ActionBegan)
+    @hf.on(repair.ActionEnded)
+    @hf.on(repair.Repaired)
+    @hf.on(repair.GaveUp)
+    def _repairs_it(
+        self, message: repair.Planned | repair.ActionBegan | repair.ActionEnded | repair.Repaired | repair.GaveUp
+    ) -> None:
         match message:
-            case Planned():
+            case repair.Planned():
                 self._add("planned", [[str(step) for step in stage] for stage in message.stages])
-            case ActionBegan():
+            case repair.ActionBegan():
                 self._add("began", str(message.step), message.time)
-            case ActionEnded():
+            case repair.ActionEnded():
                 self._add(message.outcome, str(message.step), message.time)
-            case Repaired():
+            case repair.Repaired():
                 self._repairs += 1
                 self._add("repaired", [str(step) for step in message.actions])
-            case GaveUp():
+            case repair.GaveUp():
                 self._repairs += 1
                 self._add("gave up", [*message.components, message.why])
 
@@ -411,11 +381,11 @@ async def play(scenario: str, board: str | None) -> Told:
                     if name != "rviz":  # It runs on the operator's computer.
                         await supervisor.ask(TerminateChild(name), LONG)
             await system.start(care(board))
-            repairer = system.ref("/robot/diagnosis/repairer", Repairer)
-            repairer.tell(SetMode(SAFE))  # Nothing is repaired before the whole robot is known.
+            mending = system.ref("/robot/diagnosis/repairer", repair.Repairer)
+            mending.tell(repair.SetMode(repair.SAFE))  # Nothing is repaired before the whole robot is known.
             await recorder.ask(Until(ALL_DOWN if is_off else ALL_WELL), LONG)
             began = asyncio.get_running_loop().time()
-            repairer.tell(SetMode(NORMAL))
+            mending.tell(repair.SetMode(repair.NORMAL))
             if not is_off:
                 await hand.switch(CHANNELS["ja"], False)
             await recorder.ask(Until(ALL_WELL, repairs=1), LONG)

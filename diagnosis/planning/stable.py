@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any, Final
 
+from .alike import one_of_each
 from .answers import Budget, Outcome, OutOfTime, Plan, TimedOut, Unsolvable
 from .grounding import GroundAction, Grounder
 from .language import Atom, Problem
@@ -68,16 +69,17 @@ class ClingoPlanner:
     def _search(self, task: Task, budget: Budget) -> Outcome:
         if not task.least:
             return Plan(())
+        small, twins = one_of_each(task)
         for horizon in range(task.least, self._longest + 1):
             budget.check()
-            actions = [one for one in task.useful if one.earliest + one.after <= horizon]
-            found = _solve("".join(_facts(task, actions)), horizon, budget)
+            actions = [one for one in small.useful if one.earliest + one.after <= horizon]
+            found = _solve("".join(_facts(small, actions)), horizon, budget)
             if found is not None:
                 sequence, is_optimal = found
-                return self._plan([actions[index].action for index in sequence], is_optimal)
+                return self._plan([twin for index in sequence for twin in twins[actions[index].action]], is_optimal)
             if horizon == task.least:
                 # The bound says that so many stages suffice if nothing is in the way: now it is time to doubt.
-                proof = prove_unsolvable(task, budget)
+                proof = prove_unsolvable(small, budget)
                 if proof is not None:
                     return _unsolvable(proof)
         return TimedOut(budget.seconds, f"there is no plan of up to {self._longest} stages")
