@@ -18,7 +18,7 @@ from ...actors.errors import HoldfastError
 from ...supervision.arbiter import Arbiter, arbiter_of
 from ..engine import Diagnosis, State
 from ..literals import BadLiteral, Literal
-from ..messages import DIAGNOSER, DIAGNOSIS, MODEL, OBSERVATIONS, GetDiagnosis, ModelChanged
+from ..messages import DIAGNOSER, DIAGNOSIS, MODEL, OBSERVATIONS, GetDiagnosis, GetObserved, ModelChanged
 from ..model import Model
 from ..observations import Observation, ObservationSet
 from ..planning import ClingoPlanner, Plan, Planner, Step, TimedOut, Unsolvable, find_plan
@@ -79,7 +79,7 @@ class Repairer(Actor):
         self._blamed: frozenset[str] = frozenset()
         self._midway: set[str] = set()
         self._dry: tuple[str, ...] | None = None
-        self._graced = -math.inf
+        self._graced = self._looks_until = -math.inf
 
     def on_start(self, restored: bool) -> None:
         """Ask for the present diagnosis."""
@@ -87,13 +87,22 @@ class Repairer(Actor):
         diagnoser = self._diagnoser or f"{above}/{DIAGNOSER}"
         if self._diagnoser is None and self.ctx.cell.node.find(diagnoser) is not None:
             self._base = (*self._base, above)
+        self._looks_until = self.now() + self._policy.look if self.ctx.life == 1 else -math.inf
         self.ctx.create_task(self._catch_up(diagnoser))
 
     async def _catch_up(self, diagnoser: str) -> None:
+        """What is known, and what it means; a later life must not plan as if nothing were known."""
         with contextlib.suppress(HoldfastError):  # It publishes its first one when it is there.
-            found = await self.ctx.find(diagnoser, Actor).ask(GetDiagnosis())
+            ref = self.ctx.find(diagnoser, Actor)
+            known = await ref.ask(GetObserved())
+            for word in (word for words in known.sources.values() for word in words):
+                self._observe(word)
+            found = await ref.ask(GetDiagnosis())
             if self._diagnosed == -math.inf:
                 self._diagnose(found)
+        await self._sleep(max(0.0, self._looks_until - self.now()))
+        self._looks_until = -math.inf
+        self._begin()
 
     # -- what comes in ----------------------------------------------------------------------------------------------
 
@@ -165,6 +174,8 @@ class Repairer(Actor):
 
     def _begin(self) -> None:
         """Open a case, if there is something to repair and none is open."""
+        if self.now() < self._looks_until:
+            return
         if self._case is None and self._chosen(Case(0, 0.0)) is not None:
             self._memory.cases += 1
             self._case = Case(self._memory.cases, self.now())

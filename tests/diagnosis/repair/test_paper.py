@@ -34,7 +34,7 @@ def base_off(world: World) -> None:
 
 async def test_power_up_is_two_stages_and_takes_the_devices_own_time(system: hf.ActorSystem) -> None:
     # D52, D53: the paper took 30.2 s.
-    here = await scene(system, before=all_off)
+    here = await scene(system, before=all_off, pace=0.25)
     over = await here.hear(Repaired)
     assert here.planned() == [
         [[f"power_up({h})" for h in sorted(HARDWARE)], [f"start_node({n})" for n in sorted(NODES)]],
