@@ -1,6 +1,11 @@
 """Diagnosis: what observers see and a model of the system, put together, name what is faulty; repair acts on it.
 
-`tree(...)` is the supervision tree that a user adds to a system; the parts are in the folders.
+    from holdfast import diagnosis
+
+    watching = await diagnosis.watch(system, repair=True)
+    print(await watching.diagnosis())
+
+`tree(...)` is the same in single parts, as the supervision tree that a user adds to a system.
 """
 
 from .assembly import observer, tree
@@ -34,6 +39,7 @@ from .server import (
     RollBackModel,
     ValidateModel,
 )
+from .watching import Watch, expecting, property_observers, watch
 
 __all__ = [
     "ChangeModel",
@@ -62,9 +68,13 @@ __all__ = [
     "RosDiagnostics",
     "Touched",
     "ValidateModel",
+    "Watch",
     "Wired",
+    "expecting",
     "generate",
     "observer",
     "observers_for",
+    "property_observers",
     "tree",
+    "watch",
 ]

@@ -11,6 +11,7 @@ from ..supervision.backoff import Backoff
 from ..supervision.spec import ChildSpec, child
 from ..supervision.tree import supervisor
 from .diagnoser import SERVER, DiagnoserActor
+from .messages import DIAGNOSER
 from .model import Declaration, History, System
 from .observers import Observer
 from .server import ModelServer
@@ -45,6 +46,7 @@ def tree(
     quiet: float = 0.05,
     limit: int = 1000,
     seconds: float = 1.0,
+    recent: float = 30.0,
     trust: Mapping[str, float] | None = None,
     repairer: ChildSpec | None = None,
     others: Iterable[ChildSpec] = (),
@@ -55,15 +57,15 @@ def tree(
         model: checked here; it, and what it becomes, outlives restarts of its server.
         observers: from `observer(...)`.
         name: of the supervisor, the last part of its address.
-        quiet, limit, seconds, trust: see `DiagnoserActor`.
-        repairer: the spec of who repairs; it is started last.
+        quiet, limit, seconds, recent, trust: see `DiagnoserActor`.
+        repairer: from `repair.repairer(...)`; it is started last.
         others: further children, such as `child("board", start(BoardActor, "tcp://..."))`; they are started first.
 
     Raises:
         ModelError: something is wrong with the model.
     """
     history = model if isinstance(model, History) else History(model)
-    options = {"quiet": quiet, "limit": limit, "seconds": seconds, "trust": dict(trust or {})}
+    options = {"quiet": quiet, "limit": limit, "seconds": seconds, "recent": recent, "trust": dict(trust or {})}
     watchers = supervisor("observers", intensity=RESTARTS, period=PERIOD, restart="permanent", children=observers)
     return supervisor(
         name,
@@ -72,7 +74,7 @@ def tree(
         children=[
             *others,
             child(SERVER, Start(ModelServer, (history,))),
-            child("diagnoser", Start(DiagnoserActor, (), options), backoff=Backoff(initial=0.1)),
+            child(DIAGNOSER, Start(DiagnoserActor, (), options), backoff=Backoff(initial=0.1)),
             watchers,
             *([repairer] if repairer is not None else []),
         ],

@@ -302,10 +302,4 @@ def _content(diagnosis: Diagnosis) -> object:
 def _names_below(model: Model, components: Iterable[str]) -> tuple[str, ...]:
     """The components, and the arguments of every atom that depends on them."""
     touched = set(components)
-    atoms = {rule.head for rule in model.rules if rule.head is not None and not touched.isdisjoint(rule.needs)}
-    while True:
-        more = {rule.head for rule in model.rules if rule.head is not None and not atoms.isdisjoint(rule.body)} - atoms
-        if not more:
-            break
-        atoms |= more
-    return tuple(sorted(touched.union(*(atom.args for atom in atoms))))
+    return tuple(sorted(touched.union(*(atom.args for atom in model.dependents(touched)))))

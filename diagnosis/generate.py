@@ -20,7 +20,7 @@ from .assembly import observer
 from .literals import ok
 from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS
 from .model import Component, Declaration, Expectation, Kind
-from .observers.general import GeneralObserver
+from .observers.general import GeneralObserver, Learned
 from .observers.hearing import Heard, listen
 from .observers.node import NodeObserver
 from .observers.observer import Manner, Observer
@@ -229,8 +229,15 @@ def observers_for(
     topics = dict.fromkeys(topic for wired in generated.wiring.values() for topic in wired.publishes)
     nodes = observer("nodes", Start(NodeObserver, (generated.addresses,), {"hung_after": hung_after, "manner": manner}))
     rates = (
-        observer(f"rate of {topic.strip('/').replace('/', '.')}", Start(GeneralObserver, (topic,), kwargs))
+        observer(
+            child_name("rate of", topic),
+            Start(GeneralObserver, (topic,), {"window": window, "learned": Learned(), "manner": manner}),
+        )
         for topic in topics
-        for kwargs in ({"window": window, "manner": manner},)
     )
     return (nodes, *rates)
+
+
+def child_name(what: str, name: str) -> str:
+    """A name for who looks at a topic or a component; an address has no `/` in its parts."""
+    return f"{what} {name.strip('/').replace('/', '.')}"

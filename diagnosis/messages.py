@@ -10,6 +10,8 @@ from .literals import Literal
 from .model import Declaration
 from .observations import Observed
 
+DIAGNOSER: Final = "diagnoser"
+"""The last part of the diagnoser's address."""
 OBSERVATIONS: Final = "/observations"
 """`Observation`, one for each literal (D7)."""
 DIAGNOSIS: Final = "/diagnosis"
@@ -95,6 +97,7 @@ class GetObserved(Message[Observed]):
 
 
 __all__ = [
+    "DIAGNOSER",
     "DIAGNOSIS",
     "EXPLANATION",
     "GRACE",

@@ -89,6 +89,11 @@ class ModelServer(Actor):
     def __init__(self, model: History | Declaration | System) -> None:
         self._history = model if isinstance(model, History) else History(model)
 
+    async def on_start(self, restored: bool) -> None:
+        """In a later life, say what counts: the last life may have ended before it did."""
+        if len(self._history.versions) > 1:
+            await self._tell()
+
     @on(GetModel, readonly=True)
     def _current(self, message: GetModel) -> Version:
         return self._history.versions[-1]

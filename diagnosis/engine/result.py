@@ -49,6 +49,12 @@ class Diagnosis(Message):
     """Of the model."""
     seconds: float = 0.0
 
+    def __str__(self) -> str:
+        """In words: `faulty: ja, or jn`."""
+        words = ", or ".join(" and ".join(one.bad) for one in self.candidates if one.bad)
+        more = f", or others ({' and '.join(self.truncated)} ran out)" if self.truncated else ""
+        return f"{self.state.value}: {words}{more}" if words else self.state.value
+
     @property
     def is_complete(self) -> bool:
         """No minimal diagnosis is missing."""

@@ -5,7 +5,7 @@ A new one is one class: derive from `Observer`, override `hear` or `look`, and c
 
 from .binary import BinaryQualitativeObserver, Source
 from .diagnostic import Check, DiagnosticObserver
-from .general import GeneralObserver
+from .general import GeneralObserver, Learned
 from .hardware import Channel, HardwareObserver
 from .multiple import ConditionedObserver, TriggeredObserver
 from .node import NodeObserver
@@ -29,6 +29,7 @@ __all__ = [
     "Fit",
     "GeneralObserver",
     "HardwareObserver",
+    "Learned",
     "Limits",
     "Look",
     "Manner",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 import statistics
 from collections import deque
@@ -16,6 +17,17 @@ MOST: Final = 100_000
 """Messages of one window that are counted at most."""
 
 
+@dataclasses.dataclass(slots=True)
+class Learned:
+    """The rate that an observer has learned; given to it, it outlives its lives.
+
+    Who had to learn anew in a later life would take a topic that is silent by then for one that nobody knows.
+    """
+
+    mean: float | None = None
+    deviation: float | None = None
+
+
 class GeneralObserver(Observer):
     """Counts what comes on a topic, also nothing. Until the first window is over, nothing is known.
 
@@ -24,6 +36,7 @@ class GeneralObserver(Observer):
         mean: messages per second; None learns it from the first five windows in which there were messages.
         deviation: by how much the rate may differ; half of the mean unless given, or what learning shows to be more.
         window: seconds over which messages are counted.
+        learned: where to keep what was learned.
         atom: what is said; `ok(topic)` unless given.
         manner: see `Observer`.
     """
@@ -35,13 +48,17 @@ class GeneralObserver(Observer):
         deviation: float | None = None,
         *,
         window: float = 2.0,
+        learned: Learned | None = None,
         atom: Literal | str | None = None,
         manner: Manner | None = None,
     ) -> None:
         super().__init__(topic, manner=manner)
         if (mean is not None and not mean > 0) or (deviation is not None and not deviation > 0) or not window > 0:
             raise ValueError(f"mean {mean!r}, deviation {deviation!r} and window {window!r} must be > 0")
-        self._mean, self._deviation, self._window = mean, deviation, window
+        self._memory = learned or Learned()
+        self._mean = self._memory.mean if mean is None else mean
+        self._deviation = self._memory.deviation if deviation is None else deviation
+        self._window = window
         self._atom = ok(topic) if atom is None else atom_of(atom)
         self._learned: list[float] = []
         self._next_lesson = 0.0
@@ -82,4 +99,5 @@ class GeneralObserver(Observer):
             spread = 3 * statistics.pstdev(self._learned)
             if self._deviation is None and spread > self._mean / 2:
                 self._deviation = min(spread, self._mean)  # With more, silence would be fine.
+            self._memory.mean, self._memory.deviation = self._mean, self._deviation
             self._settle_limits()

@@ -4,7 +4,9 @@
 """
 
 from .actions import Act, ActionFailed, RepairAction, Repertoire, action
+from .assembly import repairer
 from .executor import DENIED, DONE, FAILED, LOST, SKIPPED, UNVERIFIED
+from .ledger import Memory
 from .messages import (
     TOPIC,
     ActionBegan,
@@ -61,6 +63,7 @@ __all__ = [
     "GaveUp",
     "GetRepairStatus",
     "Held",
+    "Memory",
     "NobodyWaits",
     "Planned",
     "Policy",
@@ -78,6 +81,7 @@ __all__ = [
     "bind_port",
     "change_mechanism",
     "power_up",
+    "repairer",
     "restart_child",
     "restart_subtree",
     "roll_back",

@@ -21,6 +21,7 @@ class Policy:
         seconds: for one case; its last plan is carried out to its end.
         verify: seconds after a plan in which the symptoms must have gone (topics may need longer than a restart).
         settle: seconds without a new diagnosis after which the present one is believed, when symptoms stay.
+        look: seconds after the start in which repair only looks: observers do not see everything at once.
         unknown: seconds to wait while the observations are contradictory or there are none (T49).
         plan_seconds: for the planner (T58).
         exclude: components that are never touched (T64), besides those in whose hands repair itself is.
@@ -39,6 +40,7 @@ class Policy:
     seconds: float = 300.0
     verify: float = 10.0
     settle: float = 2.0
+    look: float = 1.0
     unknown: float = 30.0
     plan_seconds: float = 5.0
     exclude: frozenset[str] = frozenset()
@@ -56,7 +58,7 @@ class Policy:
         for name in ("window", "seconds", "verify", "unknown", "plan_seconds", "approval"):
             if not 0 < getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be a finite number of seconds > 0, not {getattr(self, name)!r}")
-        for name in ("cool_down", "settle"):
+        for name in ("cool_down", "settle", "look"):
             if not 0 <= getattr(self, name) < float("inf"):
                 raise ValueError(f"{name} must be a finite number of seconds >= 0, not {getattr(self, name)!r}")
         if self.settle > self.verify:

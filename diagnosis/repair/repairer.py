@@ -18,7 +18,7 @@ from ...actors.errors import HoldfastError
 from ...supervision.arbiter import Arbiter, arbiter_of
 from ..engine import Diagnosis, State
 from ..literals import BadLiteral, Literal
-from ..messages import DIAGNOSIS, MODEL, OBSERVATIONS, GetDiagnosis, ModelChanged
+from ..messages import DIAGNOSER, DIAGNOSIS, MODEL, OBSERVATIONS, GetDiagnosis, GetObserved, ModelChanged
 from ..model import Model
 from ..observations import Observation, ObservationSet
 from ..planning import ClingoPlanner, Plan, Planner, Step, TimedOut, Unsolvable, find_plan
@@ -27,8 +27,8 @@ from .actions import Act, RepairAction, Repertoire
 from .case import Case, base_of, reached
 from .choice import Situation, choose, components_of, problem_for, remaining, symptoms_held
 from .executor import DENIED, DONE, SKIPPED, Executor, Result
-from .ledger import Ledger
-from .policy import NORMAL, Policy
+from .ledger import Ledger, Memory
+from .policy import Policy
 
 
 class Repairer(Actor):
@@ -43,7 +43,9 @@ class Repairer(Actor):
             never touched (T64).
         planner: finds plans.
         diagnoser: the address of who is asked for the present diagnosis at the start: diagnoses are published when
-            they change, and a life that begins later would not know of one.
+            they change, and a life that begins later would not know of one. Unless given, it is looked for beside
+            this actor; then all that lives there is part of the base.
+        memory: what outlives this actor's lives; see `repairer`.
     """
 
     deterministic = False
@@ -58,18 +60,18 @@ class Repairer(Actor):
         base: Iterable[str] = (),
         planner: Planner | None = None,
         diagnoser: str | None = None,
+        memory: Memory | None = None,
     ) -> None:
-        self._model, self._policy = model, policy or Policy()
+        self._memory = memory or Memory()
+        self._model, self._policy = self._memory.model or model, policy or Policy()
         self._actions = actions if isinstance(actions, Repertoire) else Repertoire(actions)
         self._addresses, self._base = dict(addresses or {}), tuple(base)
         self._planner = planner or ClingoPlanner()
         self._diagnoser = diagnoser
-        self._ledger = Ledger(self._policy)
-        self._observations = ObservationSet(model.vocabulary)
+        self._ledger = Ledger(self._policy, self._memory)
+        self._observations = ObservationSet(self._model.vocabulary)
         self._diagnosis = Diagnosis(State.BLIND)
         self._diagnosed = -math.inf
-        self._mode = NORMAL
-        self._given_up: dict[str, str] = {}
         self._case: Case | None = None
         self._numbers = itertools.count(1)
         self._waiting: dict[int, asyncio.Future[str]] = {}
@@ -77,19 +79,30 @@ class Repairer(Actor):
         self._blamed: frozenset[str] = frozenset()
         self._midway: set[str] = set()
         self._dry: tuple[str, ...] | None = None
-        self._count = 0
-        self._graced = -math.inf
+        self._graced = self._looks_until = -math.inf
 
     def on_start(self, restored: bool) -> None:
         """Ask for the present diagnosis."""
-        if self._diagnoser is not None:
-            self.ctx.create_task(self._catch_up(self._diagnoser))
+        above = self.ctx.path.rpartition("/")[0]
+        diagnoser = self._diagnoser or f"{above}/{DIAGNOSER}"
+        if self._diagnoser is None and self.ctx.cell.node.find(diagnoser) is not None:
+            self._base = (*self._base, above)
+        self._looks_until = self.now() + self._policy.look if self.ctx.life == 1 else -math.inf
+        self.ctx.create_task(self._catch_up(diagnoser))
 
     async def _catch_up(self, diagnoser: str) -> None:
+        """What is known, and what it means; a later life must not plan as if nothing were known."""
         with contextlib.suppress(HoldfastError):  # It publishes its first one when it is there.
-            found = await self.ctx.find(diagnoser, Actor).ask(GetDiagnosis())
+            ref = self.ctx.find(diagnoser, Actor)
+            known = await ref.ask(GetObserved())
+            for word in (word for words in known.sources.values() for word in words):
+                self._observe(word)
+            found = await ref.ask(GetDiagnosis())
             if self._diagnosed == -math.inf:
                 self._diagnose(found)
+        await self._sleep(max(0.0, self._looks_until - self.now()))
+        self._looks_until = -math.inf
+        self._begin()
 
     # -- what comes in ----------------------------------------------------------------------------------------------
 
@@ -106,20 +119,24 @@ class Repairer(Actor):
         self._diagnosis, self._diagnosed = message, self.now()
         if message.is_complete:
             found_bad = set(message.suspects)
-            self._given_up = {name: why for name, why in self._given_up.items() if name in found_bad}
+            memory = self._memory
+            memory.given_up = {name: why for name, why in memory.given_up.items() if name in found_bad}
         self._wake()
         self._begin()
 
     @on(say.SetMode)
     def _set_mode(self, message: say.SetMode) -> None:
-        self._mode = message.mode
+        self._memory.mode = message.mode
         self._wake()
         self._begin()
 
     @subscribe(MODEL)
     @on(ModelChanged)
-    def _use_model(self, message: ModelChanged) -> None:
-        self._model = model = Model(message.declaration, message.version)
+    async def _use_model(self, message: ModelChanged) -> None:
+        if message.version <= self._model.version:
+            return  # It is said again.
+        model = await asyncio.to_thread(Model, message.declaration, message.version)
+        self._model = self._memory.model = model
         old, self._observations = self._observations, ObservationSet(model.vocabulary)
         for atom in model.vocabulary:
             for word in old.words(atom):
@@ -130,7 +147,7 @@ class Repairer(Actor):
         names = message.components or tuple(self._model.components)
         self._ledger.pardon(names)
         for name in names:
-            self._given_up.pop(name, None)
+            self._memory.given_up.pop(name, None)
         self._dry = None
         self._begin()
 
@@ -150,23 +167,25 @@ class Repairer(Actor):
 
     @on(say.GetRepairStatus)
     def _status(self, message: say.GetRepairStatus) -> say.RepairStatus:
-        given_up = tuple(sorted(self._given_up))
-        return say.RepairStatus(self._mode, self._case is not None, given_up, self._count)
+        given_up = tuple(sorted(self._memory.given_up))
+        return say.RepairStatus(self._memory.mode, self._case is not None, given_up, self._memory.cases)
 
     # -- a case -----------------------------------------------------------------------------------------------------
 
     def _begin(self) -> None:
         """Open a case, if there is something to repair and none is open."""
+        if self.now() < self._looks_until:
+            return
         if self._case is None and self._chosen(Case(0, 0.0)) is not None:
-            self._count += 1
-            self._case = Case(self._count, self.now())
+            self._memory.cases += 1
+            self._case = Case(self._memory.cases, self.now())
             self.ctx.create_task(self._repair(self._case))
 
     def _chosen(self, case: Case) -> tuple[str, ...] | None:
         found = choose(
             self._diagnosis,
             alone=self._alone(),
-            given_up=self._given_up,
+            given_up=self._memory.given_up,
             hopeless=case.hopeless,
             tried=case.tried,
             tries=case.tries,
@@ -176,7 +195,7 @@ class Repairer(Actor):
     def _alone(self) -> set[str]:
         """Whom nobody is to touch."""
         ours = (self.ctx.path, *self._base)
-        return {*self._policy.exclude, *base_of(self._addresses, ours), *self._given_up}
+        return {*self._policy.exclude, *base_of(self._addresses, ours), *self._memory.given_up}
 
     async def _repair(self, case: Case) -> None:
         try:
@@ -204,7 +223,7 @@ class Repairer(Actor):
         if case.rounds >= self._policy.rounds or self.now() - case.began > self._policy.seconds:
             limit = f"{case.rounds} plans in {self.now() - case.began:.3g} s have not helped"
             return await self._give_up(case, diagnosis.suspects, limit)
-        situation = Situation(diagnosis, self._observations.current(self.now()), self._mode, self.now())
+        situation = Situation(diagnosis, self._observations.current(self.now()), self._memory.mode, self.now())
         alone = self._alone()
         problem = problem_for(self._model, self._actions, self._policy, self._ledger, situation, bad, alone)
         outcome = await find_plan(self._planner, problem, timeout=self._policy.plan_seconds, degrade=True)
@@ -282,12 +301,24 @@ class Repairer(Actor):
         ends = self.now() + self._policy.verify
         while self._diagnosis.state is State.HEALTHY:
             left = remaining(case.symptoms, self._observations.current(self.now()))
-            if not left:
+            if not left and (self.now() >= ends or not self._is_withheld(case)):
                 return await self._repaired(case)
             if self.now() >= ends:
                 why = f"nothing is blamed any more, but {', '.join(map(str, left))} was not seen to have gone"
                 return await self._give_up(case, (), why)
             await self._sleep(ends - self.now(), wakes=True)
+        return False
+
+    def _is_withheld(self, case: Case) -> bool:
+        """Whether something that depends on whom we touched was known in this case and is not now (T56).
+
+        Within its grace period a topic that is still silent is neither good nor bad: nobody knows yet.
+        """
+        now = self.now()
+        for atom in self._model.dependents(case.tries):
+            words = self._observations.words(atom)
+            if any(word.time >= case.began for word in words) and not any(word.is_current(now) for word in words):
+                return True
         return False
 
     async def _repaired(self, case: Case) -> bool:
@@ -319,7 +350,7 @@ class Repairer(Actor):
     async def _nothing_left(self, case: Case) -> bool:
         """No candidate is open: what is left was given up before, cannot be planned for, or is not ours to touch."""
         if case.hopeless:
-            suspects = tuple(name for bad in case.hopeless for name in bad if name not in self._given_up)
+            suspects = tuple(name for bad in case.hopeless for name in bad if name not in self._memory.given_up)
             return await self._give_up(case, tuple(dict.fromkeys(suspects)), next(iter(case.hopeless.values())))
         if case.has_told or (case.rounds == 0 and self._dry is not None):
             return True
@@ -329,10 +360,10 @@ class Repairer(Actor):
         if isinstance(outcome, TimedOut):
             case.hopeless[bad] = f"no plan was found: {outcome.why}"
             return False
-        if self._mode in self._policy.modes and not isinstance(outcome, TimedOut):
-            await self._tell(say.Held(case.number, f"in mode {self._mode} nothing can be done for {', '.join(bad)}"))
-            mode = self._mode
-            while self._mode == mode and self._diagnosis.state is State.FAULTY:
+        if self._memory.mode in self._policy.modes and not isinstance(outcome, TimedOut):
+            mode = self._memory.mode
+            await self._tell(say.Held(case.number, f"in mode {mode} nothing can be done for {', '.join(bad)}"))
+            while self._memory.mode == mode and self._diagnosis.state is State.FAULTY:
                 await self._sleep(math.inf, wakes=True)
             case.began = self.now()
             return False
@@ -342,8 +373,8 @@ class Repairer(Actor):
 
     async def _give_up(self, case: Case, components: Iterable[str], why: str) -> bool:
         """Say so to everybody. True: there is nothing else in this case."""
-        names = tuple(name for name in components if name not in self._given_up)
-        self._given_up |= dict.fromkeys(names, why)
+        names = tuple(name for name in components if name not in self._memory.given_up)
+        self._memory.given_up |= dict.fromkeys(names, why)
         case.has_told = True
         told = say.GaveUp(
             case.number, names, self._diagnosis.symptoms, why, tuple(case.actions), self.now() - case.began
@@ -378,8 +409,8 @@ class Repairer(Actor):
     def overtaken(self, step: Step) -> str:
         """See `World`. What was begun is not left halfway: a base that was switched off is switched on again."""
         target = step.args[0] if step.args else ""
-        if not self._policy.may(step.action, self._mode):
-            return f"mode {self._mode} does not allow it"
+        if not self._policy.may(step.action, self._memory.mode):
+            return f"mode {self._memory.mode} does not allow it"
         if target in self._midway:
             return ""
         diagnosis = self._diagnosis

@@ -21,6 +21,7 @@ from holdfast.diagnosis.observers import (
     DiagnosticObserver,
     GeneralObserver,
     HardwareObserver,
+    Learned,
     Limits,
     Manner,
     Median,
@@ -128,6 +129,16 @@ async def test_a_rate_that_is_not_given_is_learned(system: hf.ActorSystem) -> No
     await seen.stream("/t", 8.0, 20)
     assert seen.changes() == ["ok(/t)"]
     await advance(2.0)
+    assert seen.changes()[-1] == "not ok(/t)"
+
+
+async def test_a_learned_rate_outlives_its_observer(system: hf.ActorSystem) -> None:
+    # Else a topic that is silent when its observer is restarted would stay unknown for ever.
+    seen = await watch(system, GeneralObserver, "/t", window=1.0, learned=Learned(), manner=QUICK)
+    await seen.stream("/t", 8.0, 20)
+    assert seen.changes() == ["ok(/t)"]
+    seen.ref.kill()
+    await advance(3.0)
     assert seen.changes()[-1] == "not ok(/t)"
 
 

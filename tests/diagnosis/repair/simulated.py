@@ -1,21 +1,23 @@
-"""A simulated robot: devices, nodes, their observers and their faults; the repairer that is tested is the real one."""
+"""A simulated robot, its faults, and the whole loop around it.
+
+The devices hang on a simulated power board, and the nodes are actors that publish to each other. All else is real: the
+observers that look at them, the diagnoser, the repairer, its planner, its actions, and the supervisors.
+"""
 
 import asyncio
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import holdfast as hf
-from holdfast.diagnosis.engine import Diagnoser, Diagnosis, State
-from holdfast.diagnosis.literals import Literal, ok, on, running
-from holdfast.diagnosis.messages import DIAGNOSIS, OBSERVATIONS, REPAIR, GetDiagnosis, Touched
+from holdfast.diagnosis import DIAGNOSIS, REPAIR, DiagnoserActor, observer, tree
+from holdfast.diagnosis.board import TOPIC, BoardMeasured, Load, SimulatedBoard, SwitchChannel
+from holdfast.diagnosis.engine import Diagnosis
 from holdfast.diagnosis.model import Model, System
-from holdfast.diagnosis.observations import Observation, ObservationSet
-from holdfast.diagnosis.planning import Step
+from holdfast.diagnosis.observers import Channel, GeneralObserver, HardwareObserver, Manner, NodeObserver
 from holdfast.diagnosis.repair import (
-    Act,
     ActionBegan,
     ActionEnded,
-    ActionFailed,
     ApprovalWanted,
     GaveUp,
     GetRepairStatus,
@@ -27,38 +29,101 @@ from holdfast.diagnosis.repair import (
     Repaired,
     Repairer,
     Repertoire,
+    Touched,
+    power_up,
+    repairer,
+    shutdown,
+    start_node,
+    stop_node,
 )
 from tests.diagnosis.robot import paper_robot
 
-PERIOD = 0.5
-POWER, START, STOP = 1.0, 0.5, 0.2
+POWER, START = 1.0, 0.5
+"""Seconds that a device, and a node, takes until it is there."""
+EFFECT = 3.0
+"""Seconds in which it must be seen to be."""
+NEVER = float("-inf")
+DRAWN, IDLE = 1000, 10
+"""Milliamperes of a device that works, and of one that does not yet."""
+BOARD = "/t/board"
+OBSERVERS = "/t/diagnosis/observers"
+SILENT = ("/joy",)
+"""Topics that nobody looks at."""
 
 
 class World:
-    """What is really so."""
+    """What is really so, and what nobody knows but for looking.
 
-    def __init__(self, system: System) -> None:
-        self.model = Model(system)
+    Args:
+        robot: its components.
+        pace: seconds of everything that comes again and again, relative to what is usual.
+        noise: share of a period by which a message comes early or late; one of fifty does not come at all.
+    """
+
+    def __init__(self, robot: System, pace: float = 1.0, noise: float = 0.0) -> None:
+        self.noise = noise
+        self.robot, self.model = robot, Model(robot)
         parts = self.model.components.values()
         self.hardware = [one.name for one in parts if one.kind.value == "SH"]
         self.nodes = [one.name for one in parts if not one.kind.is_hardware]
         self.drives = {one.name: [h for h in one.on if h in self.hardware] for one in parts}
-        now = asyncio.get_running_loop().time()
-        self.on = set(self.hardware)
-        self.powered = dict.fromkeys(self.hardware, now - 2)
-        self.running = set(self.nodes)
-        self.started = dict.fromkeys(self.nodes, now - 1)
+        self.beat, self.every, self.window = 0.2 * pace, 0.25 * pace, 0.8 * pace
+        self.time_to_live = 2.0 * pace
+        self.addresses = {name: f"/t/robot/{name}" for name in self.nodes}
+        self.channels = {name: number for number, name in enumerate(self.hardware)}
+        loads = [Load(name, DRAWN, inrush=0.0) for name in self.hardware]
+        self.board = SimulatedBoard(loads, defaults=range(len(loads)), clock=now)
+        self.powered = dict.fromkeys(self.hardware, NEVER)  # since when it works, if it is on
+        self.started = dict.fromkeys(self.nodes, NEVER)
+        self.is_built = False
+        self.running: set[str] = set()
         self.dead: set[str] = set()  # cannot be switched on, or cannot be started
         self.hung: set[str] = set()  # on or running, and of no use until it is switched off or stopped
         self.flaky: set[str] = set()  # its next start does not work
-        self.mute = False
-        self.unseen = {"/joy"}
-        self.news = asyncio.Event()
-        self.log: list[tuple[float, str]] = []
+
+    @property
+    def on(self) -> set[str]:
+        """The devices that work."""
+        return {h for h, channel in self.channels.items() if channel in self.board.on and self.powered[h] <= now()}
+
+    def switch(self, h: str, on: bool) -> None:
+        """Put a device on, or off."""
+        channel = self.channels[h]
+        was = channel in self.board.on
+        self.board.stuck = {self.channels[name] for name in self.dead & {*self.hardware}}
+        self.board.switch(channel, on)
+        is_on = channel in self.board.on
+        if is_on and not was:
+            self.powered[h] = now() + POWER
+        if not is_on:
+            self.hung.discard(h)
+
+    def measured(self) -> BoardMeasured:
+        """What the board says: a device draws its current when it works."""
+        working = self.on
+        self.board.wrong = {
+            channel: IDLE for h, channel in self.channels.items() if channel in self.board.on and h not in working
+        }
+        return BoardMeasured(now(), self.board.measure())
+
+    def starts(self, n: str) -> None:
+        """A node starts. Raises RuntimeError if it cannot."""
+        if n in self.dead:
+            raise RuntimeError("its program is missing")
+        if n in self.flaky:
+            self.flaky.discard(n)
+            raise RuntimeError("it ended at once")
+        self.running.add(n)
+        self.started[n] = now()
+
+    def ends(self, n: str) -> None:
+        """A node ends, or is killed."""
+        self.running.discard(n)
+        self.hung.discard(n)
 
     def serves(self, name: str) -> bool:
         """Whether a component does what it is for."""
-        if name in self.hardware:
+        if name in self.channels:
             return name in self.on and name not in self.hung
         if name not in self.running or name in self.hung:
             return False
@@ -78,65 +143,107 @@ class World:
         """Whether all of it works."""
         return all(self.serves(name) for name in (*self.hardware, *self.nodes))
 
-    def seen(self) -> Iterable[Literal]:
-        """What the observers say."""
-        for h in self.hardware:
-            yield on(h) if h in self.on else ~on(h)
-        for n in self.nodes:
-            yield running(n) if n in self.running else ~running(n)
-        for one in self.model.components.values():
-            for topic in one.out:
-                if topic not in self.unseen:
-                    yield ok(topic) if self.is_ok(topic) else ~ok(topic)
+    # -- what can be done to it
 
-    # -- what can be done
+    def power_up(self, **options: Any) -> RepairAction:
+        """The action, for this robot."""
+        return power_up(BOARD, self.channels, **({"effect_timeout": EFFECT} | options))
 
-    async def power_up(self, act: Act, h: str) -> None:
-        await self._work(act, POWER)
-        if h not in self.dead:
-            self.on.add(h)
-            self.powered[h] = asyncio.get_running_loop().time()
-        self.news.set()
-
-    async def shutdown(self, act: Act, h: str) -> None:
-        await self._work(act, STOP)
-        self.on.discard(h)
-        self.hung.discard(h)
-        self.news.set()
-
-    async def start_node(self, act: Act, n: str) -> None:
-        await self._work(act, START)
-        if n in self.dead:
-            raise ActionFailed(str(act.step), "its program is missing")
-        if n in self.flaky:
-            self.flaky.discard(n)
-            raise ActionFailed(str(act.step), "it ended at once")
-        self.running.add(n)
-        self.started[n] = asyncio.get_running_loop().time()
-        self.news.set()
-
-    async def stop_node(self, act: Act, n: str) -> None:
-        await self._work(act, STOP)
-        self.running.discard(n)
-        self.hung.discard(n)
-        self.news.set()
-
-    async def _work(self, act: Act, seconds: float) -> None:
-        self.log.append((asyncio.get_running_loop().time(), str(act.step)))
-        await asyncio.sleep(seconds)
+    def start_node(self, **options: Any) -> RepairAction:
+        """The action, for this robot."""
+        return start_node(self.addresses, **({"effect_timeout": EFFECT} | options))
 
     def actions(self) -> Repertoire:
         """The four of the paper."""
-        runs = (self.power_up, self.shutdown, self.start_node, self.stop_node)
-        return Repertoire(RepairAction(run.__name__, run, effect_timeout=3.0) for run in runs)
+        off = shutdown(BOARD, self.channels, effect_timeout=EFFECT)
+        stop = stop_node(self.addresses, effect_timeout=EFFECT)
+        return Repertoire([self.power_up(), off, self.start_node(), stop])
+
+    # -- who looks at it
+
+    def observers(self) -> Iterator[hf.ChildSpec]:
+        """Those of the paper (D51)."""
+        manner = Manner(every=self.every, time_to_live=self.time_to_live)
+        yield observer("nodes", hf.start(NodeObserver, self.addresses, manner=manner))
+        devices = [Channel(name, channel, least=DRAWN // 2) for name, channel in self.channels.items()]
+        yield observer("power", hf.start(HardwareObserver, *devices, manner=manner))
+        for one in self.model.components.values():
+            for topic in one.out:
+                if topic not in SILENT:
+                    rate = hf.start(GeneralObserver, topic, 1 / self.beat, window=self.window, manner=manner)
+                    yield observer(watcher(topic), rate)
 
 
-class Observe(hf.Message):
-    """It is time to look."""
+def now() -> float:
+    """Seconds on the loop clock."""
+    return asyncio.get_running_loop().time()
 
 
-class Observers(hf.Actor):
-    """All observers of the world: they look now and then, and when something changes."""
+def watcher(topic: str) -> str:
+    """The name of who looks at a topic."""
+    return f"rate of {topic.strip('/')}"
+
+
+class Beat(hf.Message):
+    """It is time to do something."""
+
+
+class Late(hf.Message):
+    """It was time a moment ago."""
+
+
+class Data(hf.Message):
+    """What nodes publish."""
+
+    topic: str
+
+
+class Node(hf.Actor):
+    """Publishes, now and then or whenever what it is made from comes, as long as it is of any use."""
+
+    deterministic = False
+
+    def __init__(self, world: World, name: str) -> None:
+        self._world, self._name = world, name
+        self._out = world.model.components[name].out
+
+    async def on_start(self, restored: bool) -> None:
+        if self._world.is_built:
+            await asyncio.sleep(START)
+        self._world.starts(self._name)
+        for topic in {topic for inputs in self._out.values() for topic in inputs}:
+            self.ctx.subscribe(topic)
+        if not all(self._out.values()):
+            self.ctx.every(self._world.beat, Beat())
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        self._world.ends(self._name)
+
+    @hf.on(Beat)
+    async def _beat(self, message: Beat) -> None:
+        noise, beat = self._world.noise, self._world.beat
+        if not noise:
+            await self._publish(lambda inputs: not inputs)
+        elif self.ctx.random.random() > 1 / 50:
+            self.ctx.tell_after(self.ctx.random.uniform(0, 2 * noise) * beat, Late())
+
+    @hf.on(Late)
+    async def _late(self, message: Late) -> None:
+        await self._publish(lambda inputs: not inputs)
+
+    @hf.on(Data)
+    async def _take(self, message: Data) -> None:
+        await self._publish(lambda inputs: message.topic in inputs)
+
+    async def _publish(self, which: Callable[[tuple[str, ...]], bool]) -> None:
+        if self._world.serves(self._name):
+            for topic, inputs in self._out.items():
+                if which(inputs):
+                    await self.ctx.publish(topic, Data(topic))
+
+
+class Devices(hf.Actor):
+    """The power board, as `BoardActor` shows it."""
 
     deterministic = False
 
@@ -144,66 +251,15 @@ class Observers(hf.Actor):
         self._world = world
 
     def on_start(self, restored: bool) -> None:
-        self.ctx.every(PERIOD, Observe())
-        self.ctx.create_task(self._follow())
-        self.ctx.tell_after(0, Observe())
+        self.ctx.every(self._world.every, Beat())
 
-    async def _follow(self) -> None:
-        while True:
-            await self._world.news.wait()
-            self._world.news.clear()
-            self.ctx.tell_after(0, Observe())
+    @hf.on(Beat)
+    async def _measure(self, message: Beat) -> None:
+        await self.ctx.publish(TOPIC, self._world.measured())
 
-    @hf.on(Observe)
-    async def _observe(self, message: Observe) -> None:
-        now = asyncio.get_running_loop().time()
-        for literal in () if self._world.mute else self._world.seen():
-            await self.ctx.publish(OBSERVATIONS, Observation(literal, now, "eyes", 4 * PERIOD))
-
-
-class Think(hf.Message):
-    """It is time to diagnose."""
-
-
-class Doctor(hf.Actor):
-    """Diagnoses on change, the just repaired last."""
-
-    deterministic = False
-
-    def __init__(self, model: Model, ranks: bool) -> None:
-        self._engine, self._set = Diagnoser(model), ObservationSet(model.vocabulary)
-        self._ranks, self._touched = ranks, dict[str, float]()
-        self._last: object = None
-        self._due = False
-        self._found = Diagnosis(State.BLIND)
-
-    @hf.subscribe(OBSERVATIONS)
-    @hf.on(Observation)
-    def _see(self, message: Observation) -> None:
-        if self._set.add(message) and not self._due:
-            self._due = True
-            self.ctx.tell_after(0.02, Think())
-
-    @hf.subscribe(REPAIR)
-    @hf.on(Touched)
-    def _repaired(self, message: Touched) -> None:
-        self._touched |= dict.fromkeys(message.components, message.time)
-
-    @hf.on(GetDiagnosis)
-    def _present(self, message: GetDiagnosis) -> Diagnosis:
-        return self._found
-
-    @hf.on(Think)
-    async def _think(self, message: Think) -> None:
-        self._due = False
-        now = asyncio.get_running_loop().time()
-        recent = [name for name, when in self._touched.items() if self._ranks and now - when < 30]
-        found = await self._engine.diagnose(self._set.current(now), repaired=recent)
-        self._found = found
-        said = (found.state, found.candidates, found.symptoms)
-        if said != self._last:
-            self._last = said
-            await self.ctx.publish(DIAGNOSIS, found)
+    @hf.on(SwitchChannel)
+    def _switch(self, message: SwitchChannel) -> None:
+        self._world.switch(self._world.hardware[message.channel], message.on)
 
 
 class Secretary(hf.Actor):
@@ -211,8 +267,8 @@ class Secretary(hf.Actor):
 
     deterministic = False
 
-    def __init__(self, told: list[hf.Message], news: asyncio.Event) -> None:
-        self._told, self._news = told, news
+    def __init__(self, told: list[hf.Message], times: list[float], news: asyncio.Event) -> None:
+        self._told, self._times, self._news = told, times, news
 
     def on_start(self, restored: bool) -> None:
         self.ctx.subscribe(REPAIR)
@@ -230,6 +286,7 @@ class Secretary(hf.Actor):
     @hf.on(Diagnosis)
     def _write(self, message) -> None:
         self._told.append(message)
+        self._times.append(now())
         self._news.set()
 
 
@@ -239,13 +296,27 @@ class Scene:
 
     system: hf.ActorSystem
     world: World
-    repairer: hf.ActorRef[Repairer]
     told: list[hf.Message]
+    times: list[float]
     news: asyncio.Event
+
+    @property
+    def repairer(self) -> hf.ActorRef[Repairer]:
+        """Whoever lives at its address now."""
+        return self.system.ref("/t/diagnosis/repairer", Repairer)
+
+    @property
+    def diagnoser(self) -> hf.ActorRef[DiagnoserActor]:
+        """Whoever lives at its address now."""
+        return self.system.ref("/t/diagnosis/diagnoser", DiagnoserActor)
 
     def all(self, kind):
         """What was told of this kind."""
         return [one for one in self.told if isinstance(one, kind)]
+
+    def time_of(self, message: hf.Message) -> float:
+        """When it was told."""
+        return next(when for one, when in zip(self.told, self.times, strict=True) if one is message)
 
     def done(self) -> list[str]:
         """The steps that were begun, in order."""
@@ -265,11 +336,10 @@ class Scene:
 
     async def rest(self, quiet: float = 8.0, most: float = 600.0) -> None:
         """Wait until repair is over and stays so; fails when it takes longer than `most` virtual seconds."""
-        began = now = asyncio.get_running_loop().time()
-        while now - began < most:
+        began = now()
+        while now() - began < most:
             count = len(self.told)
             await asyncio.sleep(quiet)
-            now = asyncio.get_running_loop().time()
             status = await self.repairer.ask(GetRepairStatus())
             if not status.is_repairing and len(self.told) == count:
                 return
@@ -283,10 +353,27 @@ class Scene:
         """Whoever was acted upon."""
         return {one.step.args[0] for one in self.all(ActionBegan)}
 
-    def change(self, change) -> None:
+    async def change(self, change: Callable[[World], object]) -> None:
         """Let something happen to the world."""
         change(self.world)
-        self.world.news.set()
+        await settle(self.system, self.world)
+
+    async def blind(self, *names: str) -> None:
+        """End observers for good; all of them, if none are named."""
+        keeper = self.system.ref(OBSERVERS, hf.Supervisor)
+        for name in names or [one.id for one in await keeper.ask(hf.WhichChildren())]:
+            await keeper.ask(hf.TerminateChild(name))
+
+
+async def settle(system: hf.ActorSystem, world: World) -> None:
+    """Have the nodes run that are to, and no others; their supervisor lets those be that end in good order."""
+    keeper = system.ref("/t/robot", hf.Supervisor)
+    up = {one.id for one in await keeper.ask(hf.WhichChildren()) if one.state == "running"}
+    wanted = set(world.running)
+    for name in sorted(up - wanted):
+        await system.stop(system.ref(world.addresses[name], Node), hf.NORMAL)
+    for name in sorted(wanted - up):
+        await keeper.ask(hf.RestartChild(name))
 
 
 async def scene(
@@ -294,25 +381,32 @@ async def scene(
     policy: Policy | None = None,
     *,
     robot: System | None = None,
-    ranks: bool = True,
-    before=lambda world: None,
-    actions=None,
-    **options,
+    recent: float = 30.0,
+    pace: float = 1.0,
+    noise: float = 0.0,
+    before: Callable[[World], object] = lambda world: None,
+    actions: Callable[[World], Repertoire] = World.actions,
+    addresses: dict[str, str] | None = None,
+    base: tuple[str, ...] = (),
 ) -> Scene:
-    """The robot, its observers, the diagnoser and the repairer."""
-    world = World(robot or paper_robot())
+    """The robot, its observers, the diagnoser and the repairer.
+
+    Args:
+        before: what happens to the robot before anybody looks.
+        recent: see `DiagnoserActor`; 0: it does not know what was repaired.
+        addresses, base: see `Repairer`; where the arbiter and the exclusion take components to be.
+    """
+    world = World(robot or paper_robot(), pace, noise)
+    children = [hf.child(n, hf.start(Node, world, n), restart="transient") for n in world.nodes]
+    await system.start(hf.supervisor("robot", children=children))
+    world.is_built = True
+    await system.start(hf.child("board", hf.start(Devices, world)))
     before(world)
-    told, news = list[hf.Message](), asyncio.Event()
-    system.spawn(hf.start(Secretary, told, news), name="secretary")
-    system.spawn(hf.start(Doctor, world.model, ranks), name="doctor")
+    await settle(system, world)
+    told, times, news = list[hf.Message](), list[float](), asyncio.Event()
+    system.spawn(hf.start(Secretary, told, times, news), name="secretary")
     rules = policy or Policy(verify=6.0, settle=1.0, cool_down=0.5)
-    repertoire = actions(world) if actions is not None else world.actions()
-    repairer = system.spawn(hf.start(Repairer, world.model, repertoire, rules, **options), name="repairer")
-    system.spawn(hf.start(Observers, world), name="observers")
-    return Scene(system, world, repairer, told, news)
-
-
-def step(text: str) -> Step:
-    """`start_node(jn)` as a step."""
-    name, _, args = text.rstrip(")").partition("(")
-    return Step(name, tuple(args.split(",")))
+    where = world.addresses | (addresses or {})
+    mend = repairer(world.model, actions(world), rules, addresses=where, base=base)
+    await system.start(tree(world.robot, world.observers(), recent=recent, repairer=mend))
+    return Scene(system, world, told, times, news)
