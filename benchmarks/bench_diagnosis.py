@@ -370,7 +370,7 @@ async def loop_of_the_robot(run: Run) -> None:
         process = await asyncio.create_subprocess_exec(*command, stdout=subprocess.PIPE)
         said, _ = await process.communicate()
         assert process.returncode == 0
-        (one,) = json.loads(said)
+        one: dict[str, float] = json.loads(said)[0]
         return one
 
     ups = [await told("power-up") for _ in range(1 if run.quick else 3)]

@@ -175,7 +175,7 @@ class Filter(hf.Actor):
             await self.ctx.publish(self._topic, message)
 
 
-NODES: Final = {
+NODES: Final[dict[str, hf.Start[Any]]] = {
     "jn": hf.start(Driver, "ja", "/odom"),
     "hn": hf.start(Driver, "hu", "/scan"),
     "lan": hf.start(Driver, "la"),
