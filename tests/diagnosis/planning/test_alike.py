@@ -11,10 +11,14 @@ from holdfast.diagnosis.planning.grounding import Grounder
 from holdfast.diagnosis.planning.relevance import Task, task_of
 
 DEARER = (
-    "(:action replace :parameters (?h - hardware) :precondition (bad ?h)"
-    " :effect (and (on ?h) (good ?h) (not (bad ?h)) (increase (total-cost) 7)))",
-    "(:action mend :parameters (?n - node) :precondition (bad ?n)"
-    " :effect (and (running ?n) (good ?n) (not (bad ?n)) (increase (total-cost) 2)))",
+    (
+        "(:action replace :parameters (?h - hardware) :precondition (bad ?h)"
+        " :effect (and (on ?h) (good ?h) (not (bad ?h)) (increase (total-cost) 7)))"
+    ),
+    (
+        "(:action mend :parameters (?n - node) :precondition (bad ?n)"
+        " :effect (and (running ?n) (good ?n) (not (bad ?n)) (increase (total-cost) 2)))"
+    ),
 )
 
 
