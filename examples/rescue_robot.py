@@ -21,7 +21,7 @@ import msgspec
 import holdfast as hf
 from holdfast.diagnosis import DIAGNOSIS, OBSERVATIONS, REPAIR, observer, repair, tree
 from holdfast.diagnosis.board import TOPIC, Board, BoardActor, BoardMeasured, BoardSimulator, GetBoard
-from holdfast.diagnosis.engine import Diagnosis
+from holdfast.diagnosis.engine import Diagnosis, State
 from holdfast.diagnosis.model import System
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.observers import Agreement, Channel, GeneralObserver, HardwareObserver, Manner, NodeObserver
@@ -212,7 +212,7 @@ def care(url: str) -> hf.ChildSpec:
     """The board, the observers, the diagnoser and the repairer: all that keeps the robot alive."""
     addresses = {name: f"{ON}/{name}" for name in NODES}
     # At first nothing bad is said, until the rates are known too: then all of it is said at once.
-    manner = Manner(every=0.05, time_to_live=2.0, grace=1.5)
+    manner = Manner(every=0.05, time_to_live=2.0, grace=2.5)
     steady = msgspec.structs.replace(manner, agreement=Agreement(2, 3))
     rates = (hf.start(GeneralObserver, topic, RATE, RATE - 1, window=1.0, manner=steady) for topic in OBSERVED)
     observers = [
@@ -231,7 +231,8 @@ def care(url: str) -> hf.ChildSpec:
         model(),
         observers,
         others=[hf.child("board", hf.start(BoardActor, url, interval=0.02))],
-        repairer=repair.repairer(model(), actions, repair.Policy(settle=0.5), addresses=addresses),
+        # Nothing is repaired before the whole robot is known.
+        repairer=repair.repairer(model(), actions, repair.Policy(settle=0.5), addresses=addresses, mode=repair.SAFE),
     )
 
 
@@ -239,9 +240,10 @@ def care(url: str) -> hf.ChildSpec:
 
 
 class Until(hf.Message[None]):
-    """Answered when all of these literals hold, and so many cases of repair are over."""
+    """Answered when all of these literals are so, nothing else was diagnosed, and so many repairs are over."""
 
     literals: tuple[str, ...]
+    state: State
     repairs: int = 0
 
 
@@ -264,13 +266,15 @@ class Recorder(hf.Actor):
 
     def __init__(self) -> None:
         self._lines, self._said, self._repairs = list[Line](), dict[str, str](), 0
+        self._state = State.BLIND
         self._waiting: tuple[Until, hf.ReplyHandle[None]] | None = None
 
     def _add(self, kind: str, what: Any, time: float | None = None) -> None:
         self._lines.append(Line(asyncio.get_running_loop().time() if time is None else time, kind, what))
         if self._waiting is not None:
             wanted, handle = self._waiting
-            if self._repairs >= wanted.repairs and set(wanted.literals) <= set(self._said.values()):
+            is_so = self._state is wanted.state and set(wanted.literals) <= set(self._said.values())
+            if is_so and self._repairs >= wanted.repairs:
                 self._waiting = None
                 handle.reply(None)
 
@@ -288,6 +292,7 @@ class Recorder(hf.Actor):
     @hf.subscribe(DIAGNOSIS)
     @hf.on(Diagnosis)
     def _diagnosed(self, message: Diagnosis) -> None:
+        self._state = message.state
         self._add("diagnosed", message.sets())
 
     @hf.subscribe(REPAIR)
@@ -382,13 +387,13 @@ async def play(scenario: str, board: str | None) -> Told:
                         await supervisor.ask(TerminateChild(name), LONG)
             await system.start(care(board))
             mending = system.ref("/robot/diagnosis/repairer", repair.Repairer)
-            mending.tell(repair.SetMode(repair.SAFE))  # Nothing is repaired before the whole robot is known.
-            await recorder.ask(Until(ALL_DOWN if is_off else ALL_WELL), LONG)
+            first = Until(ALL_DOWN, State.FAULTY) if is_off else Until(ALL_WELL, State.HEALTHY)
+            await recorder.ask(first, LONG)
             began = asyncio.get_running_loop().time()
             mending.tell(repair.SetMode(repair.NORMAL))
             if not is_off:
                 await hand.switch(CHANNELS["ja"], False)
-            await recorder.ask(Until(ALL_WELL, repairs=1), LONG)
+            await recorder.ask(Until(ALL_WELL, State.HEALTHY, repairs=1), LONG)
         seconds = asyncio.get_running_loop().time() - began
         lines = await recorder.ask(GetLines())
     own = max(BOOT[name] for name in (CHANNELS if is_off else ("ja",)))
@@ -466,7 +471,7 @@ def draw(told: Told, path: Path) -> None:
                 open_[row] = line.time, "lightgrey" if line.kind == "unknown" else "indianred" if bad else "seagreen"
         elif line.kind == "began":
             open_[line.what] = line.time, "black"
-        elif line.what in rows and line.what in open_:  # An action has ended.
+        elif isinstance(line.what, str) and line.what in open_:  # An action has ended.
             close(line.what, line.time)
         elif line.kind in ("planned", "repaired"):
             axes.axvline(line.time, color="steelblue", linestyle="--", linewidth=1)
