@@ -12,9 +12,11 @@ import contextlib
 import itertools
 import math
 from collections.abc import Callable, Iterable, Mapping
+from typing import Final
 
 from ...actors.actor import Actor, on, subscribe
 from ...actors.errors import HoldfastError
+from ...actors.message import Message
 from ...supervision.arbiter import Arbiter, arbiter_of
 from ..engine import Diagnosis, State
 from ..literals import BadLiteral, Literal
@@ -29,6 +31,14 @@ from .choice import Situation, choose, components_of, problem_for, remaining, sy
 from .executor import DENIED, DONE, SKIPPED, Executor, Result
 from .ledger import Ledger, Memory
 from .policy import Policy
+
+
+MOMENT: Final = 0.001
+"""Seconds: a timer may come a little early."""
+
+
+class _GraceIsOver(Message):
+    """After the last action there was time enough to see what is bad."""
 
 
 class Repairer(Actor):
@@ -117,11 +127,16 @@ class Repairer(Actor):
     @on(Diagnosis)
     def _diagnose(self, message: Diagnosis) -> None:
         self._diagnosis, self._diagnosed = message, self.now()
-        if message.is_complete:
-            found_bad = set(message.suspects)
-            memory = self._memory
-            memory.given_up = {name: why for name, why in memory.given_up.items() if name in found_bad}
         self._wake()
+        self._reconsider(_GraceIsOver())
+
+    @on(_GraceIsOver)
+    def _reconsider(self, message: _GraceIsOver) -> None:
+        """Who is found good was repaired by somebody; but within a grace period nobody is found bad."""
+        diagnosis, memory = self._diagnosis, self._memory
+        if self.now() >= self._graced and diagnosis.is_complete:
+            found_bad = set(diagnosis.suspects)
+            memory.given_up = {name: why for name, why in memory.given_up.items() if name in found_bad}
         self._begin()
 
     @on(say.SetMode)
@@ -301,7 +316,7 @@ class Repairer(Actor):
         ends = self.now() + self._policy.verify
         while self._diagnosis.state is State.HEALTHY:
             left = remaining(case.symptoms, self._observations.current(self.now()))
-            if not left and (self.now() >= ends or not self._is_withheld(case)):
+            if not left and (self.now() >= ends or not self._is_unsure(case)):
                 return await self._repaired(case)
             if self.now() >= ends:
                 why = f"nothing is blamed any more, but {', '.join(map(str, left))} was not seen to have gone"
@@ -309,15 +324,14 @@ class Repairer(Actor):
             await self._sleep(ends - self.now(), wakes=True)
         return False
 
-    def _is_withheld(self, case: Case) -> bool:
-        """Whether something that depends on whom we touched was known in this case and is not now (T56).
+    def _is_unsure(self, case: Case) -> bool:
+        """Whether something depends on whom we touched, was known in this case, and is not seen to hold now (T56).
 
         Within its grace period a topic that is still silent is neither good nor bad: nobody knows yet.
         """
-        now = self.now()
         for atom in self._model.dependents(case.tries):
-            words = self._observations.words(atom)
-            if any(word.time >= case.began for word in words) and not any(word.is_current(now) for word in words):
+            value, when = self.seen(atom)
+            if when >= case.began and not value:
                 return True
         return False
 
@@ -456,8 +470,10 @@ class Repairer(Actor):
         if result.outcome not in (SKIPPED, DENIED):
             others = reached(self._addresses, self._address(step))
             names = tuple(dict.fromkeys((*step.args[:1], *others)))
-            grace = self._actions[step.action].grace
-            self._graced = max(self._graced, self.now() + grace)
+            grace = self._actions[step.action].grace if result.outcome == DONE else 0.0
+            if grace > 0:
+                self._graced = max(self._graced, self.now() + grace)
+                self.ctx.tell_after(grace + MOMENT, _GraceIsOver())
             await self._tell(say.Touched(names, step.action, self.now(), grace))
         await self._tell(say.ActionEnded(self._case.number, step, result.outcome, result.why, self.now()))
 

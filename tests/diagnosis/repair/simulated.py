@@ -14,7 +14,7 @@ from holdfast.diagnosis import DIAGNOSIS, REPAIR, DiagnoserActor, observer, tree
 from holdfast.diagnosis.board import TOPIC, BoardMeasured, Load, SimulatedBoard, SwitchChannel
 from holdfast.diagnosis.engine import Diagnosis
 from holdfast.diagnosis.model import Model, System
-from holdfast.diagnosis.observers import Channel, GeneralObserver, HardwareObserver, Manner, NodeObserver
+from holdfast.diagnosis.observers import Agreement, Channel, GeneralObserver, HardwareObserver, Manner, NodeObserver
 from holdfast.diagnosis.repair import (
     ActionBegan,
     ActionEnded,
@@ -57,7 +57,8 @@ class World:
     Args:
         robot: its components.
         pace: seconds of everything that comes again and again, relative to what is usual.
-        noise: share of a period by which a message comes early or late; one of fifty does not come at all.
+        noise: share of a period by which a message comes early or late; one of fifty does not come at all. Then the
+            observers look twice before they say anything else than before.
     """
 
     def __init__(self, robot: System, pace: float = 1.0, noise: float = 0.0) -> None:
@@ -67,9 +68,10 @@ class World:
         self.hardware = [one.name for one in parts if one.kind.value == "SH"]
         self.nodes = [one.name for one in parts if not one.kind.is_hardware]
         self.drives = {one.name: [h for h in one.on if h in self.hardware] for one in parts}
-        self.beat, self.every, self.window = 0.2 * pace, 0.25 * pace, 0.8 * pace
+        self.beat, self.every = 0.2 * pace, 0.25 * pace
+        self.window = (1.6 if noise else 0.8) * pace
         self.time_to_live = 2.0 * pace
-        self.addresses = {name: f"/t/robot/{name}" for name in self.nodes}
+        self.addresses = {name: f"{keeper_of(name)}/node" for name in self.nodes}
         self.channels = {name: number for number, name in enumerate(self.hardware)}
         loads = [Load(name, DRAWN, inrush=0.0) for name in self.hardware]
         self.board = SimulatedBoard(loads, defaults=range(len(loads)), clock=now)
@@ -163,7 +165,8 @@ class World:
 
     def observers(self) -> Iterator[hf.ChildSpec]:
         """Those of the paper (D51)."""
-        manner = Manner(every=self.every, time_to_live=self.time_to_live)
+        agreement = Agreement(2, 3) if self.noise else Agreement()
+        manner = Manner(every=self.every, time_to_live=self.time_to_live, agreement=agreement)
         yield observer("nodes", hf.start(NodeObserver, self.addresses, manner=manner))
         devices = [Channel(name, channel, least=DRAWN // 2) for name, channel in self.channels.items()]
         yield observer("power", hf.start(HardwareObserver, *devices, manner=manner))
@@ -177,6 +180,11 @@ class World:
 def now() -> float:
     """Seconds on the loop clock."""
     return asyncio.get_running_loop().time()
+
+
+def keeper_of(node: str) -> str:
+    """The address of its supervisor."""
+    return f"/t/robot/{node}"
 
 
 def watcher(topic: str) -> str:
@@ -366,14 +374,15 @@ class Scene:
 
 
 async def settle(system: hf.ActorSystem, world: World) -> None:
-    """Have the nodes run that are to, and no others; their supervisor lets those be that end in good order."""
-    keeper = system.ref("/t/robot", hf.Supervisor)
-    up = {one.id for one in await keeper.ask(hf.WhichChildren()) if one.state == "running"}
+    """Have the nodes run that are to, and no others; their supervisors let those be that end in good order."""
     wanted = set(world.running)
-    for name in sorted(up - wanted):
-        await system.stop(system.ref(world.addresses[name], Node), hf.NORMAL)
-    for name in sorted(wanted - up):
-        await keeper.ask(hf.RestartChild(name))
+    for name in world.nodes:
+        keeper = system.ref(keeper_of(name), hf.Supervisor)
+        is_up = [one.state for one in await keeper.ask(hf.WhichChildren())] == ["running"]
+        if is_up and name not in wanted:
+            await keeper.ask(hf.TerminateChild("node"))
+        if not is_up and name in wanted:
+            await keeper.ask(hf.RestartChild("node"))
 
 
 async def scene(
@@ -397,7 +406,8 @@ async def scene(
         addresses, base: see `Repairer`; where the arbiter and the exclusion take components to be.
     """
     world = World(robot or paper_robot(), pace, noise)
-    children = [hf.child(n, hf.start(Node, world, n), restart="transient") for n in world.nodes]
+    # Each below a supervisor of its own: one would start them one after another.
+    children = [hf.supervisor(n, children=[hf.child("node", hf.start(Node, world, n))]) for n in world.nodes]
     await system.start(hf.supervisor("robot", children=children))
     world.is_built = True
     await system.start(hf.child("board", hf.start(Devices, world)))

@@ -8,7 +8,7 @@ import pytest
 import holdfast as hf
 from holdfast import diagnosis
 from holdfast.diagnosis.engine import State
-from holdfast.diagnosis.model import Model, System
+from holdfast.diagnosis.model import System
 from holdfast.diagnosis.observers import GeneralObserver, Limits, Property
 from holdfast.diagnosis.repair import ActionBegan, GaveUp, Policy, Repaired
 from tests.diagnosis.repair.simulated import Secretary
@@ -172,11 +172,3 @@ async def test_what_a_restart_does_not_help_is_restarted_with_its_supervisor_and
     assert isinstance(over, GaveUp)
     assert over.components == ("feed",)
     assert shop.done() == ["restart_child(feed)"] * 2 + ["restart_subtree(feed)"] * 2
-
-
-def test_a_model_says_who_depends_on_whom() -> None:
-    model = System()
-    model.node("feed", out=["/prices"])
-    model.node("matcher", out={"/matches": ["/prices"]})
-    assert set(map(str, Model(model).dependents(["matcher"]))) == {"ok(/matches)", "running(matcher)"}
-    assert {"ok(/prices)", "ok(/matches)"} < set(map(str, Model(model).dependents(["feed"])))

@@ -10,7 +10,7 @@ from holdfast.diagnosis import ChangeModel, GetModel, ModelServer
 from holdfast.diagnosis.model import Component, Put
 from holdfast.diagnosis.repair import ActionBegan, GaveUp, GetRepairStatus, Policy, Repaired, SetMode
 from holdfast.supervision.arbiter import arbiter_of
-from tests.diagnosis.repair.simulated import Scene, World, now, scene
+from tests.diagnosis.repair.simulated import Scene, World, scene
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -115,10 +115,8 @@ async def test_an_observer_that_is_killed_does_not_make_anybody_suspect(system: 
     # T50: unknown is not "not ok".
     here = await scene(system, POLICY)
     await here.rest(3.0)
-    began = now()
     for _ in range(5):
         for name in ("nodes", "power", "rate of odom", "rate of map"):
             kill(here, f"observers/{name}")
         await asyncio.sleep(20.0)
-    assert now() - began >= 100.0
     assert here.suspected() == set()

@@ -25,6 +25,8 @@ VISIBLE = ("hm", "hn", "in", "jn", "jtn")
 POLICY = Policy(attempts=3, verify=6.0, settle=1.0, cool_down=0.5, rounds=20, seconds=300.0)
 BUDGET = POLICY.seconds + 30.0
 """Seconds for a case, with its last plan."""
+NOISE = 0.3
+"""Messages come early, late, and now and then not at all (T52)."""
 BEYOND = ("dead", "broken")
 """Faults that nothing can be done about."""
 
@@ -117,7 +119,7 @@ async def test_random_faults(count: int) -> None:
     for seed in range(RUNS // 3 + (count <= RUNS % 3)):
         draw = random.Random(1000 * count + seed)
         async with hf.ActorSystem("t", log=False, seed=seed) as system:
-            here = await scene(system, POLICY)
+            here = await scene(system, POLICY, noise=NOISE)
             faults = drawn(here.world, draw, count)
             began = await struck(here, faults)
             check(here, faults)
@@ -151,9 +153,9 @@ async def test_if_all_is_seen_only_the_faulty_are_touched(seed: int) -> None:
 
 
 async def test_no_false_alarm_in_a_healthy_hour() -> None:
-    # T52: messages come early, late and now and then not at all.
+    # T52
     async with hf.ActorSystem("t", log=False, seed=1) as system:
-        here = await scene(system, POLICY, pace=1.0 if IS_LONG else 8.0, noise=0.3)
+        here = await scene(system, POLICY, pace=1.0 if IS_LONG else 20.0, noise=NOISE)
         began = now()
         await here.rest(3600.0, 3700.0)
         assert now() - began >= 3600.0
