@@ -37,6 +37,8 @@ RATE: Final = 25.0
 OBSERVED: Final = ("/odom", "/map", "/scan", "/imu_data", "/cmd_vel")
 GRACE: Final = 2.0
 """Seconds after power-up in which a silent topic is no news."""
+QUIET: Final = 2.5
+"""Seconds after their start in which observers say nothing bad."""
 ON: Final = "/robot/nodes"
 LONG: Final = 50.0
 """Seconds that nothing here takes, unless something is wrong."""
@@ -212,7 +214,7 @@ def care(url: str) -> hf.ChildSpec:
     """The board, the observers, the diagnoser and the repairer: all that keeps the robot alive."""
     addresses = {name: f"{ON}/{name}" for name in NODES}
     # At first nothing bad is said, until the rates are known too: then all of it is said at once.
-    manner = Manner(every=0.05, time_to_live=2.0, grace=2.5)
+    manner = Manner(every=0.05, time_to_live=2.0, grace=QUIET)
     steady = msgspec.structs.replace(manner, agreement=Agreement(2, 3))
     rates = (hf.start(GeneralObserver, topic, RATE, RATE - 1, window=1.0, manner=steady) for topic in OBSERVED)
     observers = [
@@ -389,6 +391,7 @@ async def play(scenario: str, board: str | None) -> Told:
             mending = system.ref("/robot/diagnosis/repairer", repair.Repairer)
             first = Until(ALL_DOWN, State.FAULTY) if is_off else Until(ALL_WELL, State.HEALTHY)
             await recorder.ask(first, LONG)
+            await asyncio.sleep(0 if is_off else QUIET)
             began = asyncio.get_running_loop().time()
             mending.tell(repair.SetMode(repair.NORMAL))
             if not is_off:

@@ -95,6 +95,7 @@ class GeneralObserver(Observer):
         """What came before somebody acted says nothing of after: it would be counted for a window longer."""
         self._times.clear()
         self._since = self.now
+        self.verdict(self._atom, None)
 
     def _learn(self, rate: float, now: float) -> None:
         if rate == 0 or now < self._next_lesson:
