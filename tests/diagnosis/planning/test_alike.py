@@ -1,14 +1,26 @@
 """Parts that are alike are planned for once, and the plan is as good as without that."""
 
+import dataclasses
 import random
+from collections.abc import Iterable, Sequence
 
 import pytest
 
-from holdfast.diagnosis.planning import Budget, ClingoPlanner, Plan, Problem, check_plan, repair_domain, repair_problem
+from holdfast.diagnosis.planning import (
+    Budget,
+    ClingoPlanner,
+    Domain,
+    Plan,
+    Problem,
+    Unsolvable,
+    check_plan,
+    repair_domain,
+    repair_problem,
+)
 from holdfast.diagnosis.planning import stable as planner_module
-from holdfast.diagnosis.planning.alike import one_of_each
-from holdfast.diagnosis.planning.grounding import Grounder
-from holdfast.diagnosis.planning.relevance import Task, task_of
+from holdfast.diagnosis.planning.alike import OneOfEach
+from holdfast.diagnosis.planning.grounding import GroundAction, Grounder
+from holdfast.diagnosis.planning.language import Literal
 
 DEARER = (
     (
@@ -39,34 +51,56 @@ def damaged(seed: int) -> Problem:
     )
 
 
+class AsItIs(OneOfEach):
+    """All parts, and nobody has twins."""
+
+    def __init__(self, problem: Problem, actions: Sequence[GroundAction]) -> None:
+        self.actions, self.goals = tuple(actions), problem.goals
+
+    def twins(self, action: GroundAction) -> list[GroundAction]:
+        return [action]
+
+    def same(self, goals: Iterable[Literal]) -> tuple[Literal, ...]:
+        return tuple(goals)
+
+
 @pytest.mark.parametrize("seed", range(25))
 def test_the_plan_is_as_short_and_as_cheap_as_without(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     problem = damaged(seed)
     outcome = ClingoPlanner().solve(problem, Budget(60))
-
-    def as_it_is(task: Task) -> tuple[Task, object]:
-        return task, {one.action: [one.action] for one in task.useful}
-
-    monkeypatch.setattr(planner_module, "one_of_each", as_it_is)
+    monkeypatch.setattr(planner_module, "OneOfEach", AsItIs)
     plain = ClingoPlanner().solve(problem, Budget(60))
     assert type(outcome) is type(plain)
     if isinstance(outcome, Plan) and isinstance(plain, Plan):
         check_plan(problem, outcome)
         assert (len(outcome.stages), outcome.cost, outcome.is_optimal) == (len(plain.stages), plain.cost, True)
+    elif isinstance(outcome, Unsolvable) and isinstance(plain, Unsolvable):
+        assert set(outcome.goals) == set(plain.goals)
 
 
-def test_of_many_that_failed_alike_one_is_left() -> None:
-    hardware, nodes = [f"h{i}" for i in range(40)], [f"n{i}" for i in range(80)]
-    problem = repair_problem(
-        repair_domain(),
+def alike(count: int, repertoire: Domain) -> Problem:
+    """Devices with a hung driver each, as many hung nodes, as many that are down."""
+    hardware, nodes = [f"h{i}" for i in range(count)], [f"n{i}" for i in range(3 * count)]
+    return repair_problem(
+        repertoire,
         hardware=hardware,
         nodes=nodes,
         drives={node: [device] for node, device in zip(nodes, hardware, strict=False)},
         bad=[*hardware, *nodes],
-        running=nodes[:60],
+        running=nodes[: 2 * count],
     )
-    task = task_of(problem, Grounder().ground(problem, Budget(60)), Budget(60))
-    small, twins = one_of_each(task)
-    # A device with a hung driver (power up, stop, start), a hung node (stop, start), and one that is down (start).
-    assert len(small.useful) == 3 + 2 + 1
-    assert sum(map(len, twins.values())) == len(task.useful)
+
+
+def test_of_many_that_failed_alike_one_is_left() -> None:
+    def left(count: int) -> int:
+        problem = alike(count, repair_domain())
+        return len(OneOfEach(problem, Grounder().ground(problem, Budget(60))).actions)
+
+    assert left(2) == left(40)
+
+
+def test_all_that_are_beyond_repair_alike_are_told_at_once() -> None:
+    problem = alike(20, dataclasses.replace(repair_domain(), actions=repair_domain().actions[1:]))  # no power_up
+    outcome = ClingoPlanner().solve(problem, Budget(60))
+    assert isinstance(outcome, Unsolvable)
+    assert {goal.atom[1] for goal in outcome.goals} == {*(f"h{i}" for i in range(20)), *(f"n{i}" for i in range(20))}
