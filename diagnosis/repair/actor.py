@@ -32,7 +32,6 @@ from .executor import DENIED, DONE, SKIPPED, Executor, Result
 from .ledger import Ledger, Memory
 from .policy import Policy
 
-
 MOMENT: Final = 0.001
 """Seconds: a timer may come a little early."""
 
