@@ -37,6 +37,8 @@ SERVER: Final = "model"
 """The last part of the model server's address; the rest is that of the diagnoser's supervisor."""
 TICK: Final = 0.001
 """Seconds: a literal is unknown after its last moment, not in it."""
+MOST_QUIET: Final = 4
+"""Times `quiet` that a diagnosis may be put off by further changes."""
 REFUSED: Final = 100
 """Observations without words that are remembered."""
 SUGGESTED: Final = 5
@@ -65,7 +67,8 @@ class DiagnoserActor(Actor):
     what to observe next.
 
     Args:
-        quiet: seconds from a change to the diagnosis: changes that come together are one.
+        quiet: seconds without a change before a diagnosis is made, so that changes that come together are one. While
+            there are changes all the time, one is made after four times as long.
         limit: candidates that are listed at most.
         seconds: for one diagnosis.
         recent: seconds for which what was repaired is suspected last among equals.
@@ -92,6 +95,7 @@ class DiagnoserActor(Actor):
         self._explained = Explained("nothing was observed so far")
         self._waiting: list[ReplyHandle[Any]] = []
         self._is_due = self._is_busy = False
+        self._changed = self._first = float("-inf")
         self._known: object = None
         self._expiry = float("inf")
 
@@ -168,8 +172,9 @@ class DiagnoserActor(Actor):
         return self.ctx.cell.node.loop.time()
 
     def _due(self) -> None:
+        self._changed = self._now
         if not self._is_due:
-            self._is_due = True
+            self._is_due, self._first = True, self._changed
             if not self._is_busy:
                 self.ctx.tell_after(self._quiet, _Think())
 
@@ -192,8 +197,12 @@ class DiagnoserActor(Actor):
 
     @on(_Think)
     def _think(self, message: _Think) -> None:
-        self._is_due = False
         now = self._now
+        wait = min(self._changed + self._quiet, self._first + MOST_QUIET * self._quiet) - now
+        if wait > TICK:
+            self.ctx.tell_after(wait, _Think())
+            return
+        self._is_due = False
         observed = self._believed(now)
         repaired = frozenset(name for name, until in self._repaired.items() if until > now)
         known = (observed.positive, observed.negative, _torn(observed), repaired, self._engine.model.version)

@@ -83,6 +83,7 @@ async def watch(
     actions: Iterable[RepairAction] = (),
     manner: Manner | None = None,
     seconds: float = 3.0,
+    window: float = 2.0,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
@@ -103,6 +104,7 @@ async def watch(
             "restart_subtree" in place of that one.
         manner: of the observers that are made here.
         seconds: see `model`.
+        window: of a generated model: seconds over which rates are counted, and five times as long learned.
         name: of the supervisor that is started.
         options: those of `tree`.
 
@@ -113,7 +115,7 @@ async def watch(
     watchers = [*observers]
     if generated is not None:
         declaration = generated.declaration
-        watchers += observers_for(generated, manner=manner)
+        watchers += observers_for(generated, window=window, manner=manner)
     else:
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model

@@ -62,6 +62,7 @@ class GeneralObserver(Observer):
         self._atom = ok(topic) if atom is None else atom_of(atom)
         self._learned: list[float] = []
         self._next_lesson = 0.0
+        self._since = -math.inf
         self._times: deque[float] = deque(maxlen=MOST)
         self._settle_limits()
 
@@ -79,15 +80,22 @@ class GeneralObserver(Observer):
     def look(self) -> None:
         """Count."""
         now = self.now
-        if self.age < self._window:
-            return
         while self._times and self._times[0] <= now - self._window:
             self._times.popleft()
         rate = len(self._times) / self._window
-        if self._mean is None:
+        is_whole = now - max(self._since, self._began) >= self._window
+        if self._mean is None and is_whole:
             self._learn(rate, now)
         if self._mean is not None:
-            self.verdict(self._atom, abs(rate - self._mean) < self._tolerance)
+            is_good = abs(rate - self._mean) < self._tolerance
+            if is_good or is_whole:  # Of a part of a window enough is enough, but too little is not yet too little.
+                self.verdict(self._atom, is_good)
+
+    def afresh(self) -> None:
+        """What came before somebody acted says nothing of after: it would be counted for a window longer."""
+        self._times.clear()
+        self._since = self.now
+        self.verdict(self._atom, None)
 
     def _learn(self, rate: float, now: float) -> None:
         if rate == 0 or now < self._next_lesson:

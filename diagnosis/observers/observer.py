@@ -88,6 +88,9 @@ class Observer(Actor):
     def look(self) -> Awaitable[None] | None:
         """It is time to look; may be async."""
 
+    def afresh(self) -> None:
+        """Somebody has acted upon what is observed: forget what was gathered before."""
+
     @property
     def now(self) -> float:
         """Seconds on the loop clock (T67)."""
@@ -144,6 +147,8 @@ class Observer(Actor):
         self._grace = {name: until for name, until in self._grace.items() if until > now}
         self._grace |= {name: max(self._grace.get(name, 0.0), now + message.seconds) for name in message.names}
         names = set(message.names)
+        if any(not names.isdisjoint(about.args) for about in self._words):
+            self.afresh()
         for about, word in self._words.items():
             if not names.isdisjoint(about.args):
                 word.debounce.clear()  # samples from before say nothing about after

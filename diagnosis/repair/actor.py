@@ -242,7 +242,7 @@ class Repairer(Actor):
         problem = problem_for(self._model, self._actions, self._policy, self._ledger, situation, bad, alone)
         outcome = await find_plan(self._planner, problem, timeout=self._policy.plan_seconds, degrade=True)
         if not isinstance(outcome, Plan) or not outcome.stages:
-            return await self._no_plan(case, bad, outcome)
+            return await self._no_plan(case, bad, outcome, situation.mode)
         wait = self._ledger.wait(outcome.steps, dict(self._actions.actions), self.now())
         if wait > 0:
             await self._sleep(wait)
@@ -369,12 +369,13 @@ class Repairer(Actor):
             return True
         return await self._repaired(case)
 
-    async def _no_plan(self, case: Case, bad: tuple[str, ...], outcome: Plan | Unsolvable | TimedOut) -> bool:
+    async def _no_plan(
+        self, case: Case, bad: tuple[str, ...], outcome: Plan | Unsolvable | TimedOut, mode: str
+    ) -> bool:
         if isinstance(outcome, TimedOut):
             case.hopeless[bad] = f"no plan was found: {outcome.why}"
             return False
-        if self._memory.mode in self._policy.modes and not isinstance(outcome, TimedOut):
-            mode = self._memory.mode
+        if mode in self._policy.modes:  # That it was planned in: it may be another one by now.
             await self._tell(say.Held(case.number, f"in mode {mode} nothing can be done for {', '.join(bad)}"))
             while self._memory.mode == mode and self._diagnosis.state is State.FAULTY:
                 await self._sleep(math.inf, wakes=True)

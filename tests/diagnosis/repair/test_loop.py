@@ -1,6 +1,7 @@
 """What keeps repair from doing harm: budgets, waits, modes, people, other diagnoses, and who is left alone."""
 
 import asyncio
+import sys
 from collections.abc import AsyncIterator
 from typing import Any
 
@@ -10,6 +11,7 @@ import holdfast as hf
 from holdfast.diagnosis.literals import ok
 from holdfast.diagnosis.messages import MODEL, OBSERVATIONS, ModelChanged
 from holdfast.diagnosis.observations import Observation
+from holdfast.diagnosis.planning import find_plan
 from holdfast.diagnosis.repair import (
     DENIED,
     DONE,
@@ -31,6 +33,7 @@ from holdfast.diagnosis.repair import (
     RepairAction,
     RepairBegan,
     Repaired,
+    Repairer,
     RepairGaveUp,
     Repertoire,
     RetryRepair,
@@ -311,6 +314,26 @@ async def test_in_safe_mode_nothing_is_done_until_it_is_left(system: hf.ActorSys
     assert here.done() == []
     here.repairer.tell(SetMode("normal"))
     await here.hear(Repaired)
+    assert here.world.is_healthy()
+
+
+async def test_a_mode_that_is_left_while_it_is_planned_for_is_no_reason_to_give_up(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # T65
+    here = await scene(system, Policy(**QUICK))
+    here.repairer.tell(SetMode("safe"))
+
+    async def left_meanwhile(*args: Any, **options: Any) -> Any:
+        outcome = await find_plan(*args, **options)
+        here.repairer.tell(SetMode("normal"))
+        await asyncio.sleep(0.1)
+        return outcome
+
+    monkeypatch.setattr(sys.modules[Repairer.__module__], "find_plan", left_meanwhile)
+    await here.change(off("hu"))
+    await here.hear(Repaired)
+    assert here.all(GaveUp) == []
     assert here.world.is_healthy()
 
 
