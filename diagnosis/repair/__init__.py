@@ -4,6 +4,7 @@
 """
 
 from .actions import Act, ActionFailed, RepairAction, Repertoire, action
+from .actor import Repairer
 from .assembly import repairer
 from .executor import DENIED, DONE, FAILED, LOST, SKIPPED, UNVERIFIED
 from .ledger import Memory
@@ -28,7 +29,6 @@ from .messages import (
     Touched,
 )
 from .policy import NORMAL, SAFE, Policy
-from .repairer import Repairer
 from .stock import (
     bind_port,
     change_mechanism,

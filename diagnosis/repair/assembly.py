@@ -10,9 +10,9 @@ from ...supervision.spec import ChildSpec, child
 from ..model import Declaration, Model, System
 from ..planning import Planner
 from .actions import RepairAction, Repertoire
+from .actor import Repairer
 from .ledger import Memory
 from .policy import NORMAL, Policy
-from .repairer import Repairer
 
 
 def repairer(

@@ -7,7 +7,7 @@ observers that look at them, the diagnoser, the repairer, its planner, its actio
 import asyncio
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, TypeVar
 
 import holdfast as hf
 from holdfast.diagnosis import DIAGNOSIS, REPAIR, DiagnoserActor, observer, tree
@@ -37,6 +37,8 @@ from holdfast.diagnosis.repair import (
     stop_node,
 )
 from tests.diagnosis.robot import paper_robot
+
+M = TypeVar("M", bound=hf.Message[Any])
 
 POWER, START = 1.0, 0.5
 """Seconds that a device, and a node, takes until it is there."""
@@ -275,7 +277,7 @@ class Secretary(hf.Actor):
 
     deterministic = False
 
-    def __init__(self, told: list[hf.Message], times: list[float], news: asyncio.Event) -> None:
+    def __init__(self, told: list[hf.Message[Any]], times: list[float], news: asyncio.Event) -> None:
         self._told, self._times, self._news = told, times, news
 
     def on_start(self, restored: bool) -> None:
@@ -292,7 +294,7 @@ class Secretary(hf.Actor):
     @hf.on(Repaired)
     @hf.on(GaveUp)
     @hf.on(Diagnosis)
-    def _write(self, message) -> None:
+    def _write(self, message: hf.Message[Any]) -> None:
         self._told.append(message)
         self._times.append(now())
         self._news.set()
@@ -304,7 +306,7 @@ class Scene:
 
     system: hf.ActorSystem
     world: World
-    told: list[hf.Message]
+    told: list[hf.Message[Any]]
     times: list[float]
     news: asyncio.Event
 
@@ -318,11 +320,11 @@ class Scene:
         """Whoever lives at its address now."""
         return self.system.ref("/t/diagnosis/diagnoser", DiagnoserActor)
 
-    def all(self, kind):
+    def all(self, kind: type[M]) -> list[M]:
         """What was told of this kind."""
         return [one for one in self.told if isinstance(one, kind)]
 
-    def time_of(self, message: hf.Message) -> float:
+    def time_of(self, message: hf.Message[Any]) -> float:
         """When it was told."""
         return next(when for one, when in zip(self.told, self.times, strict=True) if one is message)
 
@@ -334,7 +336,7 @@ class Scene:
         """The stages of each plan."""
         return [[[str(step) for step in stage] for stage in plan.stages] for plan in self.all(Planned)]
 
-    async def hear(self, kind, count: int = 1):
+    async def hear(self, kind: type[M], count: int = 1) -> M:
         """Wait for the `count`-th message of a kind."""
         async with asyncio.timeout(1000):
             while len(self.all(kind)) < count:
@@ -413,7 +415,7 @@ async def scene(
     await system.start(hf.child("board", hf.start(Devices, world)))
     before(world)
     await settle(system, world)
-    told, times, news = list[hf.Message](), list[float](), asyncio.Event()
+    told, times, news = list[hf.Message[Any]](), list[float](), asyncio.Event()
     system.spawn(hf.start(Secretary, told, times, news), name="secretary")
     rules = policy or Policy(verify=6.0, settle=1.0, cool_down=0.5)
     where = world.addresses | (addresses or {})

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pytest
 
@@ -108,7 +109,8 @@ async def test_a_model_that_was_changed_is_the_repairer_s_too_in_its_next_life(s
     assert (await system.ref("/t/diagnosis/model", ModelServer).ask(GetModel())).number == 2
     await here.change(lambda world: world.running.discard("hm"))
     await here.hear(Repaired)
-    assert here.repairer._cell.actor._model.version == 2
+    actor: Any = here.repairer._cell.actor
+    assert actor._model.version == 2
 
 
 async def test_an_observer_that_is_killed_does_not_make_anybody_suspect(system: hf.ActorSystem) -> None:
