@@ -54,6 +54,11 @@ class BinaryQualitativeObserver(Observer):
             if topic == its_topic and (value := read(message)) is not None:
                 line.add(self.now, value)
 
+    def afresh(self) -> None:
+        """A line through before and after would be neither's."""
+        for _, _, line in self._lines:
+            line.clear()
+
     def look(self) -> None:
         """Compare."""
         self.verdict(self._atom, self._are_alike())

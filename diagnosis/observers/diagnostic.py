@@ -31,8 +31,13 @@ class Check(msgspec.Struct, frozen=True):
 class _Checked:
     def __init__(self, check: Check) -> None:
         self.atom, self.read, self.limits = atom_of(check.atom), reader(check.read), check.limits
-        self.filter = check.filter() if check.filter is not None else None
+        self._new_filter = check.filter
         self.time = 0.0
+        self.afresh()
+
+    def afresh(self) -> None:
+        """Begin anew."""
+        self.filter = self._new_filter() if self._new_filter is not None else None
 
 
 class DiagnosticObserver(Observer):
@@ -56,6 +61,11 @@ class DiagnosticObserver(Observer):
                 check.time = self.now
                 filtered = value if check.filter is None else check.filter(value)
                 self.verdict(check.atom, check.limits.holds(filtered, self.said(check.atom)))
+
+    def afresh(self) -> None:
+        """Filters forget what came before."""
+        for check in self._checks:
+            check.afresh()
 
     def look(self) -> None:
         """What has not come within its time to live is unknown."""

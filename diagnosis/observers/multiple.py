@@ -58,6 +58,11 @@ class TriggeredObserver(Observer):
         else:
             self._come(key)
 
+    def afresh(self) -> None:
+        """Nobody answers triggers from before."""
+        self._pending.clear()
+        self._last = None
+
     def _come(self, key: Any) -> None:
         waiting = next((one for one in self._pending if one[1] == key), None)
         if waiting is not None:
@@ -116,6 +121,11 @@ class ConditionedObserver(Observer):
             self.verdict(self._atom, None)
         elif self._since is None:
             self._since = self.now
+
+    def afresh(self) -> None:
+        """The time begins anew."""
+        if self._since is not None:
+            self._since, self._last = self.now, float("-inf")
 
     def look(self) -> None:
         """Whether something is overdue."""

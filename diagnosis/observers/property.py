@@ -110,6 +110,11 @@ class PropertyObserver(Observer):
         at_root(self)
         super().on_start(restored)
 
+    def afresh(self) -> None:
+        """How it grew and how often it was restarted before says nothing of after."""
+        self._growth.clear()
+        self._lives.clear()
+
     async def look(self) -> None:
         """Measure it all."""
         late = self.age % self.manner.every

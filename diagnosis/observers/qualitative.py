@@ -64,6 +64,7 @@ class QualitativeObserver(Observer):
             raise ValueError(f"slope is {slope!r}; a value that is quite constant is never seen: it must be > 0")
         self._value, self._read, self._slope, self._significance = value, reader(read), slope, significance
         self._line = Regression(window)
+        self._new_filter = filter
         self._filter = filter() if filter is not None else None
 
     def hear(self, topic: str, message: Any) -> None:
@@ -71,6 +72,11 @@ class QualitativeObserver(Observer):
         value = self._read(message)
         if value is not None:
             self._line.add(self.now, value if self._filter is None else self._filter(value))
+
+    def afresh(self) -> None:
+        """A line through before and after would be neither's."""
+        self._line.clear()
+        self._filter = self._new_filter() if self._new_filter is not None else None
 
     def look(self) -> None:
         """The trend now."""

@@ -67,12 +67,16 @@ class Regression:
     def forget(self, now: float) -> None:
         """Leave out what is older than the window."""
         if self._samples and now - self._samples[-1][0] > self.window:  # A gap: what comes after it begins anew.
-            self._samples.clear()
-            self._is_full = False
-            self._recentre()
+            self.clear()
         while self._samples and self._samples[0][0] < now - self.window:
             self._is_full = True
             self._slide()
+
+    def clear(self) -> None:
+        """Begin anew."""
+        self._samples.clear()
+        self._is_full = False
+        self._recentre()
 
     def fit(self) -> Fit | None:
         """The line through the window; None if the samples determine none."""

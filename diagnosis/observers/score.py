@@ -35,10 +35,14 @@ class ScoreObserver(Observer):
         manner: Manner | None = None,
     ) -> None:
         super().__init__(topic, manner=manner)
-        self._score, self._limits, self._average, self._least = reader(score), limits, Smooth(weight), least
+        self._score, self._limits, self._weight, self._least = reader(score), limits, weight, least
         self._atom = ok(topic) if atom is None else atom_of(atom)
-        self._count = 0
         self._last = 0.0
+        self.afresh()
+
+    def afresh(self) -> None:
+        """An average begins anew."""
+        self._average, self._count = Smooth(self._weight), 0
 
     def hear(self, topic: str, message: Any) -> None:
         """One more."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from ..literals import Literal, ok
@@ -27,6 +28,7 @@ class TimeoutObserver(Observer):
         self._timeout = timeout
         self._atom = ok(topic) if atom is None else atom_of(atom)
         self._last: float | None = None
+        self._since = -math.inf
 
     def hear(self, topic: str, message: Any) -> None:
         """Something came: that is good at once, if it was not."""
@@ -34,9 +36,13 @@ class TimeoutObserver(Observer):
         if self.said(self._atom) is not True:
             self.verdict(self._atom, True)
 
+    def afresh(self) -> None:
+        """The time begins anew."""
+        self._last, self._since = None, self.now
+
     def look(self) -> None:
         """Whether it has been too long."""
-        since = self.age if self._last is None else self.now - self._last
+        since = self.now - (max(self._began, self._since) if self._last is None else self._last)
         if since > self._timeout:
             self.verdict(self._atom, False)
         elif self._last is not None:

@@ -375,6 +375,39 @@ async def test_nothing_bad_is_said_in_the_grace_after_an_action(system: hf.Actor
     assert seen.changes()[-1] == "ok(/t)"  # what is good is said at once
 
 
+async def test_after_an_action_a_trend_is_looked_for_anew(system: hf.ActorSystem) -> None:
+    # T51: a line through before and after would rise.
+    seen = await watch(system, QualitativeObserver, "v", "/t", "x", slope=0.5, window=2.0, manner=QUICK)
+    await seen.stream("/t", 4.0, 10, lambda t: Value(10 * t))
+    assert seen.changes() == ["inc(v)"]
+    await seen.publish(GRACE, Grace(("v",), 0.5))
+    await seen.stream("/t", 4.0, 10, lambda t: Value(0.0))
+    assert seen.changes() == ["unknown inc(v)", "const(v)"]
+
+
+async def test_after_an_action_an_average_begins_anew(system: hf.ActorSystem) -> None:
+    # T51
+    seen = await watch(system, ScoreObserver, "/t", "x", Limits(low=0.5), weight=0.1, manner=QUICK)
+    await seen.stream("/t", 5.0, 10, lambda t: Value(0.0))
+    assert seen.changes() == ["not ok(/t)"]
+    await seen.publish(GRACE, Grace(("/t",), 0.1))
+    await seen.stream("/t", 0.6, 10, lambda t: Value(1.0))
+    assert seen.changes() == ["unknown ok(/t)", "ok(/t)"]
+
+
+async def test_after_an_action_old_triggers_and_old_times_do_not_count(system: hf.ActorSystem) -> None:
+    # T51
+    seen = await watch(system, TriggeredObserver, "/t", "/u", "ok(u)", within=2.0, manner=QUICK)
+    await seen.publish("/t", Value())
+    await advance(3.0)
+    assert seen.changes() == ["not ok(u)"]
+    await seen.publish("/t", Value())
+    await advance(0.1)
+    await seen.publish(GRACE, Grace(("u",), 1.0))
+    await advance(4.0)
+    assert seen.changes() == ["unknown ok(u)"]
+
+
 async def test_nothing_bad_is_said_in_the_grace_after_its_own_start(system: hf.ActorSystem) -> None:
     # T51
     seen = await watch(system, NodeObserver, {"x": "/t/nobody"}, manner=Manner(every=0.5, grace=3.0))
