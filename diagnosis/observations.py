@@ -16,7 +16,7 @@ from ..actors.message import Message
 from .literals import TRENDS, Literal, Vocabulary
 
 
-class Observation(Message):
+class Observation(Message, gc=False):
     """One literal as seen by one source; what observers publish on `/observations`.
 
     `time` is in seconds on the loop clock (T67); after `time + time_to_live` the literal is unknown again.
@@ -111,6 +111,10 @@ class ObservationSet:
         """Drop what a source said: it has ended."""
         for atom in tuple(self._seen):
             self._drop(atom, source)
+
+    def words(self, atom: Literal) -> tuple[Observation, ...]:
+        """The last word of each source on an atom, also if it has outlived its time to live."""
+        return tuple(self._seen.get(atom.atom, {}).values())
 
     def expire(self, now: float) -> tuple[Observation, ...]:
         """Drop, and return, what has outlived its time to live."""

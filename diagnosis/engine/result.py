@@ -24,7 +24,7 @@ class State(enum.Enum):
     """Nothing is observed: nothing is known, and no repair may start."""
 
 
-class Candidate(Message):
+class Candidate(Message, gc=False):
     """One minimal diagnosis: what is faulty. Everything else works (`Diagnosis.good`)."""
 
     bad: tuple[str, ...]
@@ -48,6 +48,12 @@ class Diagnosis(Message):
     version: int = 1
     """Of the model."""
     seconds: float = 0.0
+
+    def __str__(self) -> str:
+        """In words: `faulty: ja, or jn`."""
+        words = ", or ".join(" and ".join(one.bad) for one in self.candidates if one.bad)
+        more = f", or others ({' and '.join(self.truncated)} ran out)" if self.truncated else ""
+        return f"{self.state.value}: {words}{more}" if words else self.state.value
 
     @property
     def is_complete(self) -> bool:

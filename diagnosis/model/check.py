@@ -62,6 +62,24 @@ class Model:
         self.rules = tuple(dict.fromkeys(rules))
         self.vocabulary = Vocabulary(_atoms(declared, self.rules))
 
+    def dependents(self, components: Iterable[str]) -> frozenset[Literal]:
+        """The atoms that are only sure to hold while all of these components work."""
+        touched, atoms = set(components), set[Literal]()
+        by_input: dict[Literal, list[Literal]] = {}
+        todo: list[Literal] = []
+        for rule in self.rules:
+            if rule.head is not None:
+                for atom in rule.body:
+                    by_input.setdefault(atom, []).append(rule.head)
+                if not touched.isdisjoint(rule.needs):
+                    todo.append(rule.head)
+        while todo:
+            atom = todo.pop()
+            if atom not in atoms:
+                atoms.add(atom)
+                todo += by_input.get(atom, ())
+        return frozenset(atoms)
+
 
 def _names(declared: Declaration) -> Iterator[Problem]:
     """Names that cannot be, are taken, or lead nowhere."""

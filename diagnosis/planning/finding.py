@@ -7,6 +7,7 @@ import contextlib
 
 import msgspec
 
+from ..engine.breath import beside_a_loop
 from .answers import Budget, Outcome, OutOfTime, Plan, Planner, TimedOut, Unsolvable
 from .language import Literal, Problem
 from .simulator import check_plan
@@ -55,10 +56,11 @@ def _forget(work: asyncio.Future[Outcome]) -> None:
 
 
 def _solve(planner: Planner, problem: Problem, budget: Budget, degrade: bool) -> Outcome:
-    outcome = _what_can_be_had(planner, problem, budget) if degrade else planner.solve(problem, budget)
-    if isinstance(outcome, Plan):
-        check_plan(problem, outcome)
-    return outcome
+    with beside_a_loop():
+        outcome = _what_can_be_had(planner, problem, budget) if degrade else planner.solve(problem, budget)
+        if isinstance(outcome, Plan):
+            check_plan(problem, outcome)
+        return outcome
 
 
 def _what_can_be_had(planner: Planner, problem: Problem, budget: Budget) -> Outcome:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from typing import TypeAlias
 
+from ..engine.breath import breathing
 from .answers import Budget, Step
 from .language import (
     Action,
@@ -69,7 +70,7 @@ class GroundAction:
         return (state - deleted) | {literal.atom for literal in fired if literal.value}
 
 
-def holds(term: Term, state: frozenset[Atom]) -> bool:
+def holds(term: Term, state: Set[Atom]) -> bool:
     """Whether a conjunction is true in a state, given as its true atoms."""
     return all((literal.atom in state) is literal.value for literal in term)
 
@@ -110,7 +111,7 @@ def ground(world: World, budget: Budget) -> tuple[GroundAction, ...]:
 
 def _ground_action(world: World, action: Action, budget: Budget) -> Iterator[GroundAction]:
     conditions = Conditions(world, f"action {action.name}")
-    for bound in world.bindings(action.parameters, world.guards(action.precondition), {}):
+    for bound in breathing(world.bindings(action.parameters, world.guards(action.precondition), {}), 64):
         budget.check()
         variants = conditions.terms(action.precondition, bound)
         if variants:
@@ -123,7 +124,7 @@ def _ground_action(world: World, action: Action, budget: Budget) -> Iterator[Gro
 def _effects(world: World, conditions: Conditions, effects: Iterable[Effect], bound: Binding) -> Iterator[GroundEffect]:
     made: dict[tuple[Term, Literal], None] = {}
     for effect in effects:
-        for inner in world.instances(ForAll(effect.variables, Or((Not(effect.condition),))), bound):
+        for inner in world.places(effect, bound):
             literal = Literal(fill(effect.literal.atom, inner), effect.literal.value)
             for condition in conditions.terms(effect.condition, inner):
                 made[condition, literal] = None
@@ -174,7 +175,9 @@ class Conditions:
                 certain |= part[0]
             else:
                 open_parts.append(part)
-        found = _consistent([frozenset(certain)])
+        if any((atom, not value) in certain for atom, value in certain):
+            return FALSE
+        found = [frozenset(certain)]
         for part in open_parts:
             found = self._bounded(_consistent(one | other for one in found for other in part))
         return found

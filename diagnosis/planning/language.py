@@ -171,7 +171,9 @@ class Problem:
                 raise PlanningError(f"object {name!r}", "a name is not empty and does not begin with '?'")
             if kind not in known:
                 raise PlanningError(f"object {name}", f"there is no type {kind}")
-        types = {name: frozenset(self.domain.above(kind)) for name, kind in self.everything().items()}
+        everything = self.everything()
+        above = {kind: frozenset(self.domain.above(kind)) for kind in set(everything.values())}
+        types = {name: above[kind] for name, kind in everything.items()}
         declared = dict(self.domain.predicates)
         for atom in self.init:
             _check_atom(atom, declared, types)

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
-from .grounding import GroundAction
+from .grounding import GroundAction, holds
 from .language import Atom, Literal
 
 
-def predecessors(sequence: Sequence[GroundAction]) -> list[set[int]]:
+def predecessors(sequence: Sequence[GroundAction], init: Iterable[Atom]) -> list[set[int]]:
     """For each action, the earlier ones that must stay before it: they touch what it reads, or it what they read.
 
-    Two actions without such a bond can be swapped; so every order that keeps the bonds leads to the same state.
+    Two actions without such a bond can be swapped; so every order that keeps the bonds leads to the same state. Who
+    makes so what is so already has touched nothing, as long as nobody undoes it before.
     """
+    state = set(init)
     made: dict[Literal, list[int]] = {}
+    touched: dict[Literal, list[int]] = {}
     needed: dict[Literal, list[int]] = {}
     asked: dict[Atom, list[int]] = {}  # conditions of effects: any change of them matters
     found: list[set[int]] = []
@@ -22,7 +25,7 @@ def predecessors(sequence: Sequence[GroundAction]) -> list[set[int]]:
         writes = {effect.literal for effect in action.effects}
         conditions = {literal.atom for effect in action.effects for literal in effect.condition}
         for atom in {literal.atom for literal in action.needs} | conditions:
-            before.update(made.get(Literal(atom, True), ()), made.get(Literal(atom, False), ()))
+            before.update(touched.get(Literal(atom, True), ()), touched.get(Literal(atom, False), ()))
         for atom, value in writes:
             opposite = Literal(atom, not value)
             before.update(made.get(opposite, ()), needed.get(opposite, ()), asked.get(atom, ()))
@@ -33,6 +36,11 @@ def predecessors(sequence: Sequence[GroundAction]) -> list[set[int]]:
             asked.setdefault(atom, []).append(index)
         for literal in writes:
             made.setdefault(literal, []).append(index)
+            if (literal.atom in state) is not literal.value:
+                touched.setdefault(literal, []).append(index)
+        fired = [effect.literal for effect in action.effects if holds(effect.condition, state)]
+        state.difference_update([atom for atom, value in fired if not value])
+        state.update([atom for atom, value in fired if value])
     return found
 
 
@@ -63,12 +71,14 @@ def _contradict(a: GroundAction, b: GroundAction) -> bool:
     return any(Literal(atom, not value) in b.needs for atom, value in a.needs)
 
 
-def stages(sequence: Sequence[GroundAction], late: Collection[str] = ()) -> list[list[GroundAction]]:
+def stages(
+    sequence: Sequence[GroundAction], init: Iterable[Atom], late: Collection[str] = ()
+) -> list[list[GroundAction]]:
     """Stages, as few as the order allows; each action as early as it can be, those named `late` as late as they can.
 
-    The actions of a stage are in the order of their names.
+    The actions of a stage are in the order of their names. `init` is the state in which the sequence begins.
     """
-    before = predecessors(sequence)
+    before = predecessors(sequence, init)
     level: list[int] = []
     for earlier in before:
         level.append(1 + max((level[index] for index in earlier), default=-1))

@@ -9,6 +9,7 @@ import dataclasses
 from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
+from ..engine.breath import breathing
 from .answers import Budget, OutOfTime, Unsolvable
 from .grounding import GroundAction, changing_part, holds
 from .language import Atom, Literal, Problem
@@ -50,13 +51,16 @@ class Task:
     least: int
 
 
-def task_of(problem: Problem, actions: Sequence[GroundAction], budget: Budget) -> Task:
-    """The task of a problem, whose ground actions these are. Raises OutOfTime."""
+def task_of(
+    problem: Problem, actions: Sequence[GroundAction], budget: Budget, goals: Iterable[Literal] | None = None
+) -> Task:
+    """The task of a problem, whose ground actions these are; some of its goals only, if given. Raises OutOfTime."""
     changing = problem.domain.changing()
-    fixed = [goal for goal in problem.goals if goal.atom[0] not in changing]
+    wanted = problem.goals if goals is None else tuple(goals)
+    fixed = [goal for goal in wanted if goal.atom[0] not in changing]
     hopeless = tuple(goal for goal in fixed if (goal.atom in problem.init) is not goal.value)
-    goals = tuple(goal for goal in problem.goals if goal.atom[0] in changing)
-    task = cut_down(actions, changing_part(problem.domain, problem.init), goals, budget)
+    movable = tuple(goal for goal in wanted if goal.atom[0] in changing)
+    task = cut_down(actions, changing_part(problem.domain, problem.init), movable, budget)
     return dataclasses.replace(task, hopeless=(*hopeless, *task.hopeless))
 
 
@@ -217,36 +221,45 @@ def prove_unsolvable(task: Task, budget: Budget) -> Proof | None:
     return None
 
 
-def parts(task: Task) -> list[tuple[list[GroundAction], tuple[Literal, ...]]]:
+def parts(task: Task) -> list[tuple[Sequence[GroundAction], tuple[Literal, ...]]]:
     """The actions and goals that share no atom with the others."""
-    parent: dict[Atom, Atom] = {}
-
-    def root(atom: Atom) -> Atom:
-        parent.setdefault(atom, atom)
-        while parent[atom] != atom:
-            parent[atom] = parent[parent[atom]]
-            atom = parent[atom]
-        return atom
-
-    actions = [one.action for one in task.useful]
-    for action in actions:
-        first, *rest = atoms(action)
-        for atom in rest:
-            parent[root(atom)] = root(first)
-    groups: dict[Atom, tuple[list[GroundAction], list[Literal]]] = {}
-    for action in actions:
-        groups.setdefault(root(atoms(action)[0]), ([], []))[0].append(action)
+    made = together([one.action for one in task.useful])
+    owner = {atom: number for number, actions in enumerate(made) for action in actions for atom in atoms(action)}
+    goals: dict[int, list[Literal]] = {}
     for goal in task.goals:
-        groups.setdefault(root(goal.atom), ([], []))[1].append(goal)
-    return [(members, tuple(goals)) for members, goals in groups.values() if goals]
+        if goal.atom in owner:
+            goals.setdefault(owner[goal.atom], []).append(goal)
+    return [(made[number], tuple(wanted)) for number, wanted in goals.items()]
 
 
-def atoms(action: GroundAction) -> list[Atom]:
-    """The atoms that an action reads or writes; there is at least one, for it has an effect."""
-    found = dict.fromkeys(effect.literal.atom for effect in action.effects)
-    found.update(dict.fromkeys(literal.atom for effect in action.effects for literal in effect.condition))
-    found.update(dict.fromkeys(literal.atom for literal in action.needs))
-    return list(found)
+def together(actions: Sequence[GroundAction]) -> list[list[GroundAction]]:
+    """The actions in groups that share no atom (union-find), in order."""
+    parent = list(range(len(actions)))
+
+    def root(number: int) -> int:
+        while parent[number] != number:
+            parent[number] = number = parent[parent[number]]
+        return number
+
+    owner: dict[Atom, int] = {}
+    for number, action in enumerate(breathing(actions)):
+        for atom in atoms(action):
+            first = owner.setdefault(atom, number)
+            if first != number:
+                parent[root(number)] = root(first)
+    groups: dict[int, list[GroundAction]] = {}
+    for number, action in enumerate(actions):
+        groups.setdefault(root(number), []).append(action)
+    return list(groups.values())
+
+
+def atoms(action: GroundAction) -> set[Atom]:
+    """The atoms that an action reads or writes."""
+    found = {literal.atom for literal in action.needs}
+    for effect in action.effects:
+        found.add(effect.literal.atom)
+        found.update(literal.atom for literal in effect.condition)
+    return found
 
 
 def _prove_part(

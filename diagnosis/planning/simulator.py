@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Final
 
+from ..engine.breath import breathing
 from .answers import Plan, Step
 from .language import (
     Action,
@@ -22,6 +24,9 @@ from .language import (
 )
 from .world import Binding, World, fill
 
+TRUE: Final = And()
+"""The condition of an effect that has none."""
+
 
 class InvalidPlan(PlanningError):
     """A step that cannot be done where it stands, steps of a stage in each other's way, or a goal that is not met."""
@@ -39,6 +44,7 @@ class Simulator:
         self.state = set(problem.init)
         self._world = World.of(problem)
         self._actions = {action.name: action for action in problem.domain.actions}
+        self._bound: dict[Step, tuple[Action, Binding]] = {}
 
     def missing(self, step: Step) -> str:
         """Why the step cannot be done now; empty if it can be. Raises InvalidPlan: there is no such step."""
@@ -72,7 +78,7 @@ class Simulator:
         return [
             Literal(fill(effect.literal.atom, inner), effect.literal.value)
             for effect in action.effects
-            for inner in self._world.instances(ForAll(effect.variables, Or((Not(effect.condition),))), bound)
+            for inner in self._world.places(effect, bound)
             if self.holds(effect.condition, inner)
         ]
 
@@ -104,7 +110,8 @@ class Simulator:
         found: set[Atom] = set()
         self._collect(action.precondition, bound, found)
         for effect in action.effects:
-            self._collect(ForAll(effect.variables, effect.condition), bound, found)
+            if effect.variables or effect.condition != TRUE:
+                self._collect(ForAll(effect.variables, effect.condition), bound, found)
         return found
 
     def _collect(self, formula: Formula, bound: Binding, found: set[Atom]) -> None:
@@ -140,6 +147,9 @@ class Simulator:
                 return "" if self.holds(formula, bound) else "its precondition is not met"
 
     def _bind(self, step: Step) -> tuple[Action, Binding]:
+        known = self._bound.get(step)
+        if known is not None:
+            return known
         action = self._actions.get(step.action)
         if action is None:
             raise InvalidPlan(str(step), f"there is no action {step.action}")
@@ -148,7 +158,9 @@ class Simulator:
         for variable, name in zip(action.parameters, step.args, strict=True):
             if not self._world.is_of(name, variable.types):
                 raise InvalidPlan(str(step), f"{name} is no {' or '.join(variable.types)}")
-        return action, {variable.name: name for variable, name in zip(action.parameters, step.args, strict=True)}
+        bound = {variable.name: name for variable, name in zip(action.parameters, step.args, strict=True)}
+        self._bound[step] = action, bound
+        return action, bound
 
 
 def check_plan(problem: Problem, plan: Plan) -> Simulator:
@@ -174,7 +186,7 @@ def _check_stage(simulator: Simulator, stage: Iterable[Step]) -> list[Literal]:
     """
     steps = list(stage)
     written: dict[Literal, list[Step]] = {}
-    for step in steps:
+    for step in breathing(steps, 64):
         if missing := simulator.missing(step):
             raise InvalidPlan(str(step), missing)
         effects = simulator.effects(step)
@@ -184,7 +196,7 @@ def _check_stage(simulator: Simulator, stage: Iterable[Step]) -> list[Literal]:
     for (atom, value), writers in written.items():
         if undoing := written.get(Literal(atom, not value)):
             raise InvalidPlan(str(writers[0]), f"{undoing[0]} undoes what it does in the same stage")
-    for step in steps:
+    for step in breathing(steps, 64):
         for atom in simulator.reads(step):
             # To write what is so already changes nothing.
             for other in written.get(Literal(atom, atom not in simulator.state), ()):

@@ -6,9 +6,11 @@ they can be done at the same time (the forall-steps of SATPLAN, the mutexes of G
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any, Final
 
+from .alike import OneOfEach
 from .answers import Budget, Outcome, OutOfTime, Plan, TimedOut, Unsolvable
 from .grounding import GroundAction, Grounder
 from .language import Atom, Problem
@@ -58,14 +60,15 @@ class ClingoPlanner:
         """See `Planner.solve`."""
         try:
             actions = self._grounder.ground(problem, budget)
-            task = task_of(problem, actions, budget)
+            small = OneOfEach(problem, actions)
+            task = task_of(problem, small.actions, budget, small.goals)
             if task.hopeless:
-                return hopeless(task)
-            return self._search(task, budget)
+                return hopeless(dataclasses.replace(task, hopeless=small.same(task.hopeless)))
+            return self._search(task, small, budget)
         except OutOfTime:
             return TimedOut(budget.seconds)
 
-    def _search(self, task: Task, budget: Budget) -> Outcome:
+    def _search(self, task: Task, small: OneOfEach, budget: Budget) -> Outcome:
         if not task.least:
             return Plan(())
         for horizon in range(task.least, self._longest + 1):
@@ -74,22 +77,23 @@ class ClingoPlanner:
             found = _solve("".join(_facts(task, actions)), horizon, budget)
             if found is not None:
                 sequence, is_optimal = found
-                return self._plan([actions[index].action for index in sequence], is_optimal)
+                return self._plan(task, [actions[index].action for index in sequence], small, is_optimal)
             if horizon == task.least:
                 # The bound says that so many stages suffice if nothing is in the way: now it is time to doubt.
                 proof = prove_unsolvable(task, budget)
                 if proof is not None:
-                    return _unsolvable(proof)
+                    return _unsolvable(proof, small)
         return TimedOut(budget.seconds, f"there is no plan of up to {self._longest} stages")
 
-    def _plan(self, sequence: Sequence[GroundAction], is_optimal: bool) -> Plan:
-        made = tuple(tuple(action.step for action in stage) for stage in stages(sequence, self._late))
-        return Plan(made, sum(action.cost for action in sequence), is_optimal)
+    def _plan(self, task: Task, sequence: Sequence[GroundAction], small: OneOfEach, is_optimal: bool) -> Plan:
+        made = [[small.twins(action) for action in stage] for stage in stages(sequence, task.init, self._late)]
+        steps = tuple(tuple(sorted(twin.step for twins in stage for twin in twins)) for stage in made)
+        return Plan(steps, sum(twin.cost for stage in made for twins in stage for twin in twins), is_optimal)
 
 
-def _unsolvable(proof: Proof) -> Unsolvable:
+def _unsolvable(proof: Proof, small: OneOfEach) -> Unsolvable:
     if proof.is_each:
-        return Unsolvable(proof.goals, True, "they are met in no state that can be reached")
+        return Unsolvable(small.same(proof.goals), True, "they are met in no state that can be reached")
     return Unsolvable(proof.goals, False, "they are met together in no state that can be reached")
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-from .language import And, Atom, Domain, Exists, Fact, ForAll, Formula, Not, Or, Problem, Variable
+from .language import And, Atom, Domain, Effect, Exists, Fact, ForAll, Formula, Not, Or, Problem, Variable
 
 Binding = Mapping[str, str]
 """What each variable stands for."""
@@ -22,7 +22,8 @@ class World:
         self.domain, self.statics = domain, statics
         self.changing = domain.changing()
         self._by_type: dict[str, list[str]] = {}
-        self._types = {name: frozenset(domain.above(kind)) for name, kind in objects.items()}
+        above = {kind: frozenset(domain.above(kind)) for kind in set(objects.values())}
+        self._types = {name: above[kind] for name, kind in objects.items()}
         for name in sorted(objects):
             for kind in self._types[name]:
                 self._by_type.setdefault(kind, []).append(name)
@@ -113,6 +114,12 @@ class World:
         # What a quantifier binds hides what is bound outside.
         inner = {name: value for name, value in bound.items() if name not in {v.name for v in formula.variables}}
         yield from self.bindings(formula.variables, [fill(guard, inner) for guard in guards], inner)
+
+    def places(self, effect: Effect, bound: Binding) -> Iterable[Binding]:
+        """The bindings for which an effect may come: with its own variables bound as well."""
+        if not effect.variables:
+            return (bound,)
+        return self.instances(ForAll(effect.variables, Or((Not(effect.condition),))), bound)
 
     def _excuses(self, formula: Formula) -> list[Atom]:
         """Static facts without any one of which the formula is true."""

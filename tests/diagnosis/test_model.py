@@ -186,3 +186,11 @@ def test_a_long_chain_is_no_circle_and_not_too_deep() -> None:
     for i in range(1, 5000):
         system.node(f"n{i}", out={f"/{i}": [f"/{i - 1}"]})
     assert len(Model(system).rules) == 10_000
+
+
+def test_a_model_says_who_depends_on_whom() -> None:
+    model = System()
+    model.node("feed", out=["/prices"])
+    model.node("matcher", out={"/matches": ["/prices"]})
+    assert set(map(str, Model(model).dependents(["matcher"]))) == {"ok(/matches)", "running(matcher)"}
+    assert {"ok(/prices)", "ok(/matches)"} < set(map(str, Model(model).dependents(["feed"])))

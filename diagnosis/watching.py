@@ -1,0 +1,164 @@
+"""Diagnosis of a running system in one line: `watching = await watch(system)`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, Protocol
+
+import msgspec
+
+from ..actors.actor import Start
+from ..actors.node import Node
+from ..actors.ref import ActorRef
+from ..supervision.spec import ChildSpec
+from .assembly import observer, tree
+from .diagnoser import DiagnoserActor
+from .engine import Diagnosis
+from .generate import Generated, child_name, generate, observers_for
+from .literals import ok
+from .messages import DIAGNOSER, Explained, GetDiagnosis, GetExplanation, GetObserved
+from .model import Declaration, Expectation, History, System
+from .observations import Observed
+from .observers import Bound, Limits, Manner, NodeObserver, Property, PropertyObserver
+from .repair import Policy, RepairAction, repairer, restart_child, restart_subtree
+
+LimitsOf = Mapping[str, Mapping[Property, Limits]]
+"""What is good, for each property of some components."""
+
+
+class Host(Protocol):
+    """What is watched: an `ActorSystem`."""
+
+    @property
+    def node(self) -> Node:
+        """Its own process."""
+        ...
+
+    async def start(self, spec: ChildSpec) -> ActorRef[Any]:
+        """Start a child of its root supervisor."""
+        ...
+
+
+class Watch:
+    """A system under diagnosis.
+
+    Attributes:
+        tree: the supervisor of all that watches; stop it to watch no longer.
+        addresses: component to address.
+        generated: what was found, if the model was generated.
+    """
+
+    def __init__(
+        self, tree: ActorRef[Any], node: Node, addresses: Mapping[str, str], generated: Generated | None
+    ) -> None:
+        self.tree, self.addresses, self.generated = tree, dict(addresses), generated
+        self._node = node
+
+    @property
+    def diagnoser(self) -> ActorRef[DiagnoserActor]:
+        """Who diagnoses. Raises NoSuchActor if it does not run."""
+        return self._node.find_ref(f"{self.tree.path}/{DIAGNOSER}", DiagnoserActor)
+
+    async def diagnosis(self) -> Diagnosis:
+        """What is wrong now."""
+        return await self.diagnoser.ask(GetDiagnosis())
+
+    async def why(self) -> Explained:
+        """Why, and what to look at next."""
+        return await self.diagnoser.ask(GetExplanation())
+
+    async def observed(self) -> Observed:
+        """What is known now."""
+        return await self.diagnoser.ask(GetObserved())
+
+
+async def watch(
+    system: Host,
+    model: Declaration | System | None = None,
+    observers: Iterable[ChildSpec] = (),
+    *,
+    addresses: Mapping[str, str] | None = None,
+    limits: LimitsOf | None = None,
+    repair: Policy | bool = False,
+    actions: Iterable[RepairAction] = (),
+    manner: Manner | None = None,
+    seconds: float = 3.0,
+    window: float = 2.0,
+    name: str = "diagnosis",
+    **options: Any,
+) -> Watch:
+    """Diagnose a running system from now on, and repair it too, if that is wanted.
+
+    Args:
+        system: an `ActorSystem`.
+        model: what it is made of. None: it is looked at for `seconds` seconds, and a model is generated, with
+            observers of all its actors and topics.
+        observers: further ones, from `observer(...)`.
+        addresses: of components that are actors: whether they run is observed, and repair can restart them. Of a
+            generated model they are known.
+        limits: what is good of their properties, such as `{"ledger": {Property.GROWTH: Limits(high=1e6)}}`; the atom
+            `ok(ledger.growth)` is added to the model.
+        repair: True or a policy: what is faulty is repaired by `actions` and, for actors that are supervised, by a
+            restart of the actor, or if that does not help of the supervisor above it.
+        actions: what else can be done, such as `repair.run_command(...)`; with the name "restart_child" or
+            "restart_subtree" in place of that one.
+        manner: of the observers that are made here.
+        seconds: see `model`.
+        window: of a generated model: seconds over which rates are counted, and five times as long learned.
+        name: of the supervisor that is started.
+        options: those of `tree`.
+
+    Raises:
+        ModelError: something is wrong with the model. StartFailed, AlreadyStarted: see `ActorSystem.start`.
+    """
+    generated = await generate(system.node, seconds=seconds) if model is None else None
+    watchers = [*observers]
+    if generated is not None:
+        declaration = generated.declaration
+        watchers += observers_for(generated, window=window, manner=manner)
+    else:
+        assert model is not None
+        declaration = model.declaration() if isinstance(model, System) else model
+    where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
+    if generated is None and where:
+        watchers.append(observer("nodes", Start(NodeObserver, (where,), {"manner": manner})))
+    if limits:
+        declaration = expecting(declaration, limits)
+        watchers += property_observers(limits, where, manner)
+    mend = None
+    if repair is not False:
+        policy = None if repair is True else repair
+        mend = repairer(declaration, _actions(system.node, where, actions), policy, addresses=where)
+    started = await system.start(tree(History(declaration), watchers, name=name, repairer=mend, **options))
+    return Watch(started, system.node, where, generated)
+
+
+def expecting(declaration: Declaration, limits: LimitsOf) -> Declaration:
+    """The declaration, where properties of components are expected to be within limits."""
+    atoms = [(component, str(ok(_property(component, one)))) for component, some in limits.items() for one in some]
+    more = tuple(Expectation(atom, (component,)) for component, atom in atoms)
+    return msgspec.structs.replace(declaration, expectations=(*declaration.expectations, *more))
+
+
+def property_observers(
+    limits: LimitsOf, addresses: Mapping[str, str], manner: Manner | None = None
+) -> Iterable[ChildSpec]:
+    """An observer for each component with limits. Raises KeyError: a component without an address."""
+    for component, some in limits.items():
+        bounds = tuple(Bound(ok(_property(component, one)), one, good) for one, good in some.items())
+        start = Start(PropertyObserver, (addresses[component], bounds), {"manner": manner})
+        yield observer(child_name("properties of", component), start)
+
+
+def _property(component: str, one: Property) -> str:
+    return f"{component}.{one.value}"
+
+
+def _actions(node: Node, addresses: Mapping[str, str], more: Iterable[RepairAction]) -> list[RepairAction]:
+    """What a person gave, and restarts for whoever has a supervisor."""
+    given = {action.name: action for action in more}
+    root = "" if node.root is None else node.root.path
+    above = {component: path.rpartition("/")[0] for component, path in addresses.items()}
+    subtrees = {component: path for component, path in above.items() if path not in ("", root)}
+    ours = {action.name: action for action in (restart_child(addresses), restart_subtree(subtrees))}
+    return list((ours | given).values())
