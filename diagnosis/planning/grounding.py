@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Set
 from typing import TypeAlias
 
 from ..engine.breath import breathing
@@ -70,7 +70,7 @@ class GroundAction:
         return (state - deleted) | {literal.atom for literal in fired if literal.value}
 
 
-def holds(term: Term, state: frozenset[Atom]) -> bool:
+def holds(term: Term, state: Set[Atom]) -> bool:
     """Whether a conjunction is true in a state, given as its true atoms."""
     return all((literal.atom in state) is literal.value for literal in term)
 

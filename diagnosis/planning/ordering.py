@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 
-from .grounding import GroundAction
+from .grounding import GroundAction, holds
 from .language import Atom, Literal
 
 
-def predecessors(sequence: Sequence[GroundAction]) -> list[set[int]]:
+def predecessors(sequence: Sequence[GroundAction], init: Collection[Atom]) -> list[set[int]]:
     """For each action, the earlier ones that must stay before it: they touch what it reads, or it what they read.
 
-    Two actions without such a bond can be swapped; so every order that keeps the bonds leads to the same state.
+    Two actions without such a bond can be swapped; so every order that keeps the bonds leads to the same state. Who
+    makes so what was so already is no reason why somebody who needs it must wait.
     """
+    state = set(init)
     made: dict[Literal, list[int]] = {}
+    brought: dict[Literal, list[int]] = {}  # made, and it was not so before
     needed: dict[Literal, list[int]] = {}
     asked: dict[Atom, list[int]] = {}  # conditions of effects: any change of them matters
     found: list[set[int]] = []
@@ -21,7 +24,9 @@ def predecessors(sequence: Sequence[GroundAction]) -> list[set[int]]:
         before: set[int] = set()
         writes = {effect.literal for effect in action.effects}
         conditions = {literal.atom for effect in action.effects for literal in effect.condition}
-        for atom in {literal.atom for literal in action.needs} | conditions:
+        for literal in action.needs:
+            before.update(brought.get(literal, ()), made.get(Literal(literal.atom, not literal.value), ()))
+        for atom in conditions:
             before.update(made.get(Literal(atom, True), ()), made.get(Literal(atom, False), ()))
         for atom, value in writes:
             opposite = Literal(atom, not value)
@@ -33,6 +38,11 @@ def predecessors(sequence: Sequence[GroundAction]) -> list[set[int]]:
             asked.setdefault(atom, []).append(index)
         for literal in writes:
             made.setdefault(literal, []).append(index)
+            if (literal.atom in state) is not literal.value:
+                brought.setdefault(literal, []).append(index)
+        fired = [effect.literal for effect in action.effects if holds(effect.condition, state)]
+        state.difference_update([literal.atom for literal in fired if not literal.value])
+        state.update([literal.atom for literal in fired if literal.value])
     return found
 
 
@@ -63,12 +73,14 @@ def _contradict(a: GroundAction, b: GroundAction) -> bool:
     return any(Literal(atom, not value) in b.needs for atom, value in a.needs)
 
 
-def stages(sequence: Sequence[GroundAction], late: Collection[str] = ()) -> list[list[GroundAction]]:
+def stages(
+    sequence: Sequence[GroundAction], init: Collection[Atom], late: Collection[str] = ()
+) -> list[list[GroundAction]]:
     """Stages, as few as the order allows; each action as early as it can be, those named `late` as late as they can.
 
     The actions of a stage are in the order of their names.
     """
-    before = predecessors(sequence)
+    before = predecessors(sequence, init)
     level: list[int] = []
     for earlier in before:
         level.append(1 + max((level[index] for index in earlier), default=-1))

@@ -77,7 +77,7 @@ class ClingoPlanner:
             found = _solve("".join(_facts(task, actions)), horizon, budget)
             if found is not None:
                 sequence, is_optimal = found
-                return self._plan([actions[index].action for index in sequence], small, is_optimal)
+                return self._plan(task, [actions[index].action for index in sequence], small, is_optimal)
             if horizon == task.least:
                 # The bound says that so many stages suffice if nothing is in the way: now it is time to doubt.
                 proof = prove_unsolvable(task, budget)
@@ -85,8 +85,8 @@ class ClingoPlanner:
                     return _unsolvable(proof, small)
         return TimedOut(budget.seconds, f"there is no plan of up to {self._longest} stages")
 
-    def _plan(self, sequence: Sequence[GroundAction], small: OneOfEach, is_optimal: bool) -> Plan:
-        made = [[small.twins(action) for action in stage] for stage in stages(sequence, self._late)]
+    def _plan(self, task: Task, sequence: Sequence[GroundAction], small: OneOfEach, is_optimal: bool) -> Plan:
+        made = [[small.twins(action) for action in stage] for stage in stages(sequence, task.init, self._late)]
         steps = tuple(tuple(sorted(twin.step for twins in stage for twin in twins)) for stage in made)
         return Plan(steps, sum(twin.cost for stage in made for twins in stage for twin in twins), is_optimal)
 
