@@ -36,6 +36,7 @@ from holdfast.diagnosis.model import Kind, Model, System
 from holdfast.diagnosis.observations import Observed
 from holdfast.diagnosis.observers import GeneralObserver, Manner
 from holdfast.diagnosis.repair import Policy, Repaired
+from holdfast.supervision.admin import TerminateChild
 
 OBSERVED = 0.2
 FAULTS = 3
@@ -332,7 +333,7 @@ async def loop_of_repair(run: Run) -> None:
     )
     done: asyncio.Queue[Repaired] = asyncio.Queue()
     async with hf.ActorSystem("app", log=False) as system:
-        await system.start(desk)
+        keeper = await system.start(desk)
         system.spawn(hf.start(Listener, done.put_nowait))
         policy = Policy(settle=0.2, cool_down=0.05, attempts=1000, window=1.0)
         watching = await diagnosis.watch(system, model, rates, addresses=addresses, repair=policy, manner=manner)
@@ -354,7 +355,7 @@ async def loop_of_repair(run: Run) -> None:
         faults: dict[str, Callable[[], Awaitable[object]]] = {
             "silent": lambda: source.send(Fail()),
             "hangs in a turn": lambda: source.send(Fail(hangs=True)),
-            "stopped by hand": lambda: system.stop(source),
+            "stopped by hand": lambda: keeper.ask(TerminateChild("source")),
         }
         for name, fault in faults.items():
             times = [await seconds(fault) for _ in range(1 if run.quick else 3)]

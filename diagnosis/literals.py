@@ -41,7 +41,7 @@ class BadLiteral(HoldfastError):
         return f"{self.text!r}: {self.problem}"
 
 
-class Literal(msgspec.Struct, frozen=True, order=True, array_like=True, cache_hash=True):
+class Literal(msgspec.Struct, frozen=True, order=True, array_like=True, cache_hash=True, gc=False):
     """An atom, or its negation: `positive` says which.
 
     >>> str(~ok("/odom")), ok("/odom").positive

@@ -16,7 +16,7 @@ from ..actors.message import Message
 from .literals import TRENDS, Literal, Vocabulary
 
 
-class Observation(Message):
+class Observation(Message, gc=False):
     """One literal as seen by one source; what observers publish on `/observations`.
 
     `time` is in seconds on the loop clock (T67); after `time + time_to_live` the literal is unknown again.

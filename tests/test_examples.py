@@ -16,7 +16,7 @@ EXAMPLES = [
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
 def test_an_example_prints_what_its_comments_say(path: Path) -> None:
-    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run([sys.executable, path], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     said = re.findall(r"print\(.*\)\s+# ([^:\n]+)", path.read_text())
     assert done.stdout.splitlines() == [line.strip() for line in said]

@@ -24,7 +24,7 @@ class State(enum.Enum):
     """Nothing is observed: nothing is known, and no repair may start."""
 
 
-class Candidate(Message):
+class Candidate(Message, gc=False):
     """One minimal diagnosis: what is faulty. Everything else works (`Diagnosis.good`)."""
 
     bad: tuple[str, ...]

@@ -27,7 +27,7 @@ _ARROW: Final = re.compile(r"->|→")
 _NOT: Final = re.compile(r"\s*(?:not\s+|¬\s*)")
 
 
-class Rule(msgspec.Struct, frozen=True):
+class Rule(msgspec.Struct, frozen=True, gc=False):
     """While all `needs` work and all of `body` holds, `head` holds; without a head: that cannot be."""
 
     needs: tuple[str, ...]

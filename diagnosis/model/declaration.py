@@ -29,7 +29,7 @@ class Kind(enum.Enum):
         return self in (Kind.SWITCHABLE, Kind.DEVICE)
 
 
-class Component(msgspec.Struct, frozen=True, kw_only=True):
+class Component(msgspec.Struct, frozen=True, kw_only=True, gc=False):
     """One component. `where` says where it was declared, for errors; it takes no part in what the component is."""
 
     name: str

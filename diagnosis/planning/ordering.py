@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from .grounding import GroundAction, holds
 from .language import Atom, Literal
 
 
-def predecessors(sequence: Sequence[GroundAction], init: Collection[Atom]) -> list[set[int]]:
+def predecessors(sequence: Sequence[GroundAction], init: Iterable[Atom]) -> list[set[int]]:
     """For each action, the earlier ones that must stay before it: they touch what it reads, or it what they read.
 
     Two actions without such a bond can be swapped; so every order that keeps the bonds leads to the same state. Who
-    makes so what was so already is no reason why somebody who needs it must wait.
+    makes so what is so already has touched nothing, as long as nobody undoes it before.
     """
     state = set(init)
     made: dict[Literal, list[int]] = {}
-    brought: dict[Literal, list[int]] = {}  # made, and it was not so before
+    touched: dict[Literal, list[int]] = {}
     needed: dict[Literal, list[int]] = {}
     asked: dict[Atom, list[int]] = {}  # conditions of effects: any change of them matters
     found: list[set[int]] = []
@@ -24,10 +24,8 @@ def predecessors(sequence: Sequence[GroundAction], init: Collection[Atom]) -> li
         before: set[int] = set()
         writes = {effect.literal for effect in action.effects}
         conditions = {literal.atom for effect in action.effects for literal in effect.condition}
-        for literal in action.needs:
-            before.update(brought.get(literal, ()), made.get(Literal(literal.atom, not literal.value), ()))
-        for atom in conditions:
-            before.update(made.get(Literal(atom, True), ()), made.get(Literal(atom, False), ()))
+        for atom in {literal.atom for literal in action.needs} | conditions:
+            before.update(touched.get(Literal(atom, True), ()), touched.get(Literal(atom, False), ()))
         for atom, value in writes:
             opposite = Literal(atom, not value)
             before.update(made.get(opposite, ()), needed.get(opposite, ()), asked.get(atom, ()))
@@ -39,10 +37,10 @@ def predecessors(sequence: Sequence[GroundAction], init: Collection[Atom]) -> li
         for literal in writes:
             made.setdefault(literal, []).append(index)
             if (literal.atom in state) is not literal.value:
-                brought.setdefault(literal, []).append(index)
+                touched.setdefault(literal, []).append(index)
         fired = [effect.literal for effect in action.effects if holds(effect.condition, state)]
-        state.difference_update([literal.atom for literal in fired if not literal.value])
-        state.update([literal.atom for literal in fired if literal.value])
+        state.difference_update([atom for atom, value in fired if not value])
+        state.update([atom for atom, value in fired if value])
     return found
 
 
@@ -74,11 +72,11 @@ def _contradict(a: GroundAction, b: GroundAction) -> bool:
 
 
 def stages(
-    sequence: Sequence[GroundAction], init: Collection[Atom], late: Collection[str] = ()
+    sequence: Sequence[GroundAction], init: Iterable[Atom], late: Collection[str] = ()
 ) -> list[list[GroundAction]]:
     """Stages, as few as the order allows; each action as early as it can be, those named `late` as late as they can.
 
-    The actions of a stage are in the order of their names.
+    The actions of a stage are in the order of their names. `init` is the state in which the sequence begins.
     """
     before = predecessors(sequence, init)
     level: list[int] = []

@@ -48,7 +48,8 @@ class UnifiedPlanner:
             sequence = _grounded(problem, steps, actions)
         except OutOfTime:
             return TimedOut(budget.seconds)
-        made = tuple(tuple(action.step for action in stage) for stage in stages(sequence, task.init, self._late))
+        init = changing_part(problem.domain, problem.init)
+        made = tuple(tuple(action.step for action in stage) for stage in stages(sequence, init, self._late))
         return Plan(made, sum(action.cost for action in sequence), is_optimal=False)
 
     def _solve(self, domain: str, problem: str, budget: Budget) -> Any:

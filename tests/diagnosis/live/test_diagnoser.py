@@ -100,6 +100,27 @@ async def test_changes_that_come_together_are_one_diagnosis_and_what_is_the_same
     assert last.state is State.HEALTHY
 
 
+async def test_a_diagnosis_waits_until_changes_have_come_to_rest_but_not_for_ever(system: hf.ActorSystem) -> None:
+    # D42, T52: a symptom that is seen a moment before its cause is not diagnosed without it.
+    await diagnosing(system, quiet=1.0)
+    heard = probe(system)
+    heard.subscribe(DIAGNOSIS)
+    await observe(system, "on(la)")
+    await advance(0.9)
+    await observe(system, "not ok(/map)")
+    await advance(0.9)
+    assert not heard.waiting
+    await observe(system, "not ok(/scan)", "on(hu)", "running(hn)")
+    await advance(1.1)
+    (found,) = heard.waiting
+    assert isinstance(found, Diagnosis)
+    assert bad(found) == [{"hn"}, {"hu"}]
+    for number in range(10):
+        await observe(system, ("not " if number % 2 else "") + "running(hm)")
+        await advance(0.5)
+    assert len(heard.waiting) > 1
+
+
 async def test_a_diagnosis_says_why_and_what_to_look_at_next(system: hf.ActorSystem) -> None:
     # T54
     diagnoser = await diagnosing(system)

@@ -122,6 +122,22 @@ async def test_a_rate_is_good_silence_is_bad_and_too_much_is_bad(system: hf.Acto
     assert seen.changes()[-1] == "not ok(/t)"
 
 
+async def test_what_was_counted_before_somebody_acted_says_nothing_of_after(system: hf.ActorSystem) -> None:
+    # T51, O3: a base is switched on again, and its driver stays silent: what came before is no proof that it works.
+    manner = Manner(every=0.1, time_to_live=2.0)
+    seen = await watch(system, GeneralObserver, "/t", 10.0, 9.0, window=1.0, manner=manner)
+    await seen.stream("/t", 2.5, 10)
+    assert seen.changes() == ["ok(/t)"]
+    await seen.publish(GRACE, Grace(("/t",), 2.0))
+    await advance(1.9)
+    assert seen.changes() == ["unknown ok(/t)"]
+    await advance(0.5)
+    assert seen.changes() == ["not ok(/t)"]
+    await seen.publish(GRACE, Grace(("/t",), 2.0))
+    await seen.stream("/t", 0.5, 10)
+    assert seen.changes() == ["unknown ok(/t)", "ok(/t)"]  # enough is seen before the window is over
+
+
 async def test_a_rate_that_is_not_given_is_learned(system: hf.ActorSystem) -> None:
     seen = await watch(system, GeneralObserver, "/t", window=1.0, manner=QUICK)
     await advance(20.0)

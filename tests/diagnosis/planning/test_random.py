@@ -162,8 +162,29 @@ def best(problem: Problem, most: int) -> tuple[int, int] | None:
     return None
 
 
+def plain(name: str, needs: list[Literal], makes: list[Literal]) -> Action:
+    effects = tuple(Effect((), And(), literal) for literal in makes)
+    return Action(name, (), And(tuple(map(formula, needs))), effects)
+
+
+P = [Literal(atom) for atom in ATOMS]
+MADE_SO_AGAIN = Problem(
+    Domain(
+        "again",
+        (),
+        tuple((atom[0], ()) for atom in ATOMS),
+        (plain("a0", [], [P[2], P[3]]), plain("a1", [P[2]], [P[0]]), plain("a2", [P[0], P[3]], [P[1]])),
+    ),
+    {},
+    frozenset([P[2].atom]),
+    (P[1],),
+)
+"""What a0 makes so is so already: a1 need not wait for it."""
+
+
 @settings(max_examples=100)
 @given(problems(conditional=False))
+@example(MADE_SO_AGAIN)
 def test_a_plan_has_the_fewest_stages_and_then_the_least_cost(problem: Problem) -> None:
     outcome = ClingoPlanner().solve(problem, Budget(60))
     found = best(problem, 2 ** len(ATOMS))
