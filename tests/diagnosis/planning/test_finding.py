@@ -248,3 +248,17 @@ async def test_what_an_action_takes_away_is_reckoned_with(init: str, goal: str, 
     made = told(plan)
     assert [len(stage) for stage in made] == [1] * len(stages)
     assert all(set(stage) <= allowed for stage, allowed in zip(made, stages, strict=True))
+
+
+async def test_who_makes_so_what_was_so_already_keeps_nobody_waiting() -> None:
+    domain = read_domain("""
+        (define (domain d) (:requirements :adl) (:predicates (p) (q) (r) (done))
+          (:action a :parameters () :precondition (and) :effect (and (p) (r)))
+          (:action b :parameters () :precondition (p) :effect (q))
+          (:action c :parameters () :precondition (and (q) (r)) :effect (done)))
+    """)
+    plan = await find_plan(
+        ClingoPlanner(), read_problem(domain, "(define (problem x) (:domain d) (:init (p)) (:goal (done)))")
+    )
+    assert isinstance(plan, Plan)
+    assert [[step.action for step in stage] for stage in plan.stages] == [["a", "b"], ["c"]]

@@ -91,7 +91,7 @@ async def test_a_mode_outlives_the_repairer(system: hf.ActorSystem) -> None:
     here.repairer.kill()
     await asyncio.sleep(1.0)
     await here.change(lambda world: world.switch("ja", False))
-    await asyncio.sleep(60.0)
+    await asyncio.sleep(12.0)
     assert here.done() == []
     here.repairer.tell(SetMode("normal"))
     await here.hear(Repaired)
@@ -117,8 +117,8 @@ async def test_an_observer_that_is_killed_does_not_make_anybody_suspect(system: 
     # T50: unknown is not "not ok".
     here = await scene(system, POLICY)
     await here.rest(3.0)
-    for _ in range(5):
+    for _ in range(3):
         for name in ("nodes", "power", "rate of odom", "rate of map"):
             kill(here, f"observers/{name}")
-        await asyncio.sleep(20.0)
+        await asyncio.sleep(6.0)
     assert here.suspected() == set()

@@ -145,10 +145,10 @@ async def test_a_component_that_fails_again_and_again_is_given_up(system: hf.Act
 
 
 async def test_attempts_are_counted_within_a_window(system: hf.ActorSystem) -> None:
-    here = await scene(system, Policy(attempts=1, window=100.0, **QUICK))
+    here = await scene(system, Policy(attempts=1, window=20.0, **QUICK))
     await here.change(stopped("hm"))
     await here.hear(Repaired)
-    await asyncio.sleep(100.0)
+    await asyncio.sleep(20.0)
     await here.change(stopped("hm"))
     await here.hear(Repaired, 2)
     assert here.all(GaveUp) == []
@@ -310,7 +310,7 @@ async def test_in_safe_mode_nothing_is_done_until_it_is_left(system: hf.ActorSys
     here.repairer.tell(SetMode("safe"))
     await here.change(off("hu"))
     await here.hear(Held)
-    await asyncio.sleep(50.0)
+    await asyncio.sleep(12.0)
     assert here.done() == []
     here.repairer.tell(SetMode("normal"))
     await here.hear(Repaired)
