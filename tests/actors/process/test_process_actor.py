@@ -41,7 +41,7 @@ from tests.actors.process.players import (
     Withdraw,
     Worker,
 )
-from tests.actors.process.waiting import end_of, in_turn, next_event, until
+from tests.actors.process.waiting import end_of, in_turn, next_event, stop_read, until
 
 
 async def start(system: hf.ActorSystem, what: hf.Start[Any], isolation: str = "process", **options: Any) -> Any:
@@ -377,6 +377,7 @@ async def test_stopped_for_good_the_queue_is_refused(system: hf.ActorSystem, tmp
     await in_turn(system, worker, 1)
     before = system.dead_letters
     stopping = asyncio.ensure_future(system.stop(worker))
+    await stop_read(system, worker)
     (tmp_path / "gate").touch()
     await stopping
     assert await running == 1

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import fcntl
+import struct
+import termios
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import holdfast as hf
+from holdfast.actors.process.remote import ProcessHost
 
 SECONDS = 60.0
 
@@ -35,6 +39,21 @@ async def in_turn(system: hf.ActorSystem, ref: hf.ActorRef[Any], number: int) ->
     assert worker is not None
     page = worker.page
     await until(lambda: page[0] == number)
+
+
+async def stop_read(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    """Wait until an actor's process has read the order to stop."""
+    worker, host = system._workers.of(ref._cell), ref._cell.host
+    assert worker is not None and isinstance(host, ProcessHost)
+    connection, transport = worker.connection, worker.connection._transport
+    assert transport is not None
+    file = transport.get_extra_info("socket").fileno()
+
+    def unread() -> int:
+        (there,) = struct.unpack("i", fcntl.ioctl(file, termios.TIOCOUTQ, bytes(4)))
+        return int(there) + len(connection._out) + transport.get_write_buffer_size()
+
+    await until(lambda: host.stop_sent is not None and not unread())
 
 
 async def end_of(pidfd: int) -> None:
