@@ -44,7 +44,8 @@ async def in_turn(system: hf.ActorSystem, ref: hf.ActorRef[Any], number: int) ->
 async def stop_read(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     """Wait until an actor's process has read the order to stop."""
     worker, host = system._workers.of(ref._cell), ref._cell.host
-    assert worker is not None and isinstance(host, ProcessHost)
+    assert worker is not None
+    assert isinstance(host, ProcessHost)
     connection, transport = worker.connection, worker.connection._transport
     assert transport is not None
     file = transport.get_extra_info("socket").fileno()
