@@ -1,0 +1,79 @@
+"""What the root tells the replicas of a group besides their work, and what they tell it of themselves.
+
+All orders go to the outermost RequestProtocol of a replica. Each can come twice: the manager that gave it may have died
+before it heard the reply, and the next one gives it again. Twice is once.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from ..actors.message import Message
+from .messages import TurnEnd
+
+
+class Setting(msgspec.Struct, array_like=True, frozen=True):
+    """What a replica is made with, besides its layers and the recipe of the protected actor."""
+
+    address: str
+    """That of the protected actor: the proxy is at `ftm/proxy` below it, the detector at `ftm/detector`."""
+    name: str
+    """This replica's: "r1"."""
+    config: int
+    method: dict[str, Any]
+    """What a life has to know of its recovery method (`Method.data`)."""
+    bindings: dict[str, str]
+    """Of the protected actor: port to address."""
+    beat: float
+    """Seconds between two heartbeats."""
+
+
+class Install(Message[None]):
+    """A piece of the state to begin with; then `Lead` comes. Without it the replica begins afresh."""
+
+    epoch: int
+    turn: int
+    data: bytes
+    stash: list[int]
+    is_last: bool
+    log: list[tuple[str, int, int, TurnEnd]]
+
+
+class Peer(Message[None]):
+    """Your other replica is the one at this path from now on; None: you are alone, wait for nobody."""
+
+    epoch: int
+    path: str | None
+
+
+class Join(Message[int]):
+    """Have the replica at `peer` catch up, between two batches, and count it in from the next batch on.
+
+    The reply is the turn whose state it has acknowledged; an error if it cannot.
+    """
+
+    epoch: int
+    peer: str
+
+
+class Finish(Message[None]):
+    """End in good order: a last snapshot (if the method takes any), then `on_stop` of the protected actor."""
+
+    epoch: int
+    reason: dict[str, Any]
+
+
+class Beat(Message):
+    """This replica's bricks are running."""
+
+    name: str
+    epoch: int
+
+
+class Over(Message):
+    """The protected actor has ended itself (`ctx.stop`) with this reason, packed; its turns are reported already."""
+
+    epoch: int
+    reason: dict[str, Any]
