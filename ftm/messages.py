@@ -4,13 +4,51 @@ from __future__ import annotations
 
 import msgspec
 
-from ..actors.errors import HoldfastError
-from ..actors.message import Message
-from ..checkpoint.records import Feed, Go, Live, Outcome, PipeDone, Released, Snapshot, SnapshotNow, TurnEnd, Unsaved
+from ..actors.message import Message, Refusal
+from ..checkpoint.records import (
+    Closed,
+    Feed,
+    Go,
+    Ignored,
+    Live,
+    Outcome,
+    PipeDone,
+    Released,
+    Snapshot,
+    SnapshotNow,
+    TurnEnd,
+    Unsaved,
+)
 
 
-class StaleEpoch(HoldfastError):
-    """Whoever says this has been replaced: a higher epoch has been seen here.  (fields: path, seen, got)"""
+class StaleEpoch(Refusal):
+    """Whoever says this has been replaced: a higher epoch has been seen here."""
+
+    path: str
+    seen: int
+    got: int
+
+
+class ConfigMismatch(Refusal):
+    """The two replicas have different stacks of mechanisms: what one says makes no sense to the other."""
+
+    path: str
+    here: int
+    there: int
+
+
+class CannotJoin(Refusal):
+    """This replica cannot be brought to the state of the one that leads."""
+
+    path: str
+    why: str
+
+
+class ReplyEvicted(Refusal):
+    """The request was handled, but its reply is not kept any more: the reply log is bounded."""
+
+    path: str
+    number: int
 
 
 class Request(msgspec.Struct, array_like=True):
@@ -22,7 +60,12 @@ class Request(msgspec.Struct, array_like=True):
 
     @property
     def number(self) -> int:
+        """It counts the inputs of the address."""
         return self.feed.id
+
+
+Logged = tuple[str, int, int, TurnEnd]
+"""An entry of the reply log: client, incarnation, number, outcome."""
 
 
 class Work(Message):
@@ -41,7 +84,11 @@ class Taken(msgspec.Struct, array_like=True):
 
 
 class Done(Message[Taken]):
-    """Outcomes on their way out, in turn order: all of a batch, or a part of it. Asked by Proceed, told by After."""
+    """Outcomes on their way out, in turn order: all of a batch, or a part of it. Asked by Proceed, told to the Proxy.
+
+    `more` goes home behind the ends, `live` behind all. `part` counts what Proceed hands over; with `wait` it waits
+    for `Ended` of it.
+    """
 
     epoch: int
     config: int
@@ -49,6 +96,9 @@ class Done(Message[Taken]):
     ends: list[TurnEnd]
     is_last: bool
     live: Live | None = None
+    more: list[PipeDone | Snapshot | Unsaved | Closed | Ignored] = []
+    part: int = 0
+    wait: bool = False
 
 
 class Inward(Message):
@@ -59,29 +109,34 @@ class Inward(Message):
 
 
 class Outward(Message):
-    """From the life to the home, past the bricks: what is released in the middle of a turn, background results, snapshots."""
+    """From the life to the home, past the bricks: what is released in the middle of a turn that is at the front."""
 
     epoch: int
-    records: list[Released | PipeDone | Snapshot | Unsaved]
+    records: list[Released | PipeDone | Snapshot | Unsaved | Ignored]
 
 
 class Ended(Message):
-    """The home has all outcomes of batch `number` (sent with the next Work or by itself when somebody waits)."""
+    """The home has the outcomes of part `number` and of all before it. Sent only if a `Done` asks for it."""
 
     epoch: int
     number: int
 
 
 class State(msgspec.Struct, array_like=True):
-    """The state of the server after turn `turn`, with what belongs to it. Large ones travel in pieces."""
+    """The state of the server after turn `turn`, with what belongs to it.
 
-    epoch: int
+    Either all of it (`data`, and `deltas` on top of that), or (`base` >= 0) the deltas since turn `base`. `live`: it
+    has caught up with its home. Large ones travel in pieces.
+    """
+
     turn: int
     data: bytes
-    stash: list[int]
-    log: list[tuple[str, int, int, TurnEnd]]  # the reply log: client, incarnation, number, outcome
-    is_delta: bool = False
-    base: int = -1  # the turn a delta is to be applied to
+    deltas: list[bytes]
+    stash: list[Feed]
+    returned: list[Feed]
+    live: bool
+    base: int = -2
+    stash_ids: list[int] = []
 
 
 class Lead(Message[int]):

@@ -1,0 +1,253 @@
+"""What a fault-tolerance mechanism is: roles, what each brick does in them, and what it assumes. One file each.
+
+A mechanism is a frozen dataclass: its fields are its settings. It is found by name (`find`), by an entry point of the
+group `holdfast.mechanisms`, or loaded from a file or module that the system has never seen (`load`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+import msgspec
+
+from ..actors.actor import Actor
+from ..actors.errors import HoldfastError, type_name
+from ..actors.message import message_name
+
+if TYPE_CHECKING:
+    from .bricks import After, Before, Proceed
+
+M = TypeVar("M", bound="Mechanism")
+
+ENTRY_POINTS = "holdfast.mechanisms"
+BUILT_IN = ("pbr", "lfr", "tr")
+
+
+class MechanismRefused(HoldfastError):
+    """The mechanism does not suit the actor, or cannot be had; the text says why."""
+
+    def __init__(self, name: str, problem: str) -> None:
+        super().__init__(name, problem)
+        self.name, self.problem = name, problem
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.problem}"
+
+
+@dataclasses.dataclass(frozen=True)
+class Role:
+    """What the bricks of a replica do in one role; what is left out passes through."""
+
+    before: type[Before] | None = None
+    proceed: type[Proceed] | None = None
+    after: type[After] | None = None
+    computes: bool = True
+    """Whether the protected actor lives there; else its state is only kept, as bytes."""
+
+
+class Description(msgspec.Struct, array_like=True, frozen=True):
+    """A mechanism on its way to another process: its class by name, its settings, and the file if it came from one."""
+
+    kind: str
+    settings: dict[str, Any]
+    file: str = ""
+    sha256: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Mechanism:
+    """Base of all mechanisms. Derive a frozen dataclass, and set the class attributes."""
+
+    name: ClassVar[str] = ""
+    replicas: ClassVar[int] = 1
+    tolerates: ClassVar[frozenset[str]] = frozenset()
+    """Of: crash, transient_value, permanent_value, development, eavesdropping, forgery, replay."""
+    needs: ClassVar[frozenset[str]] = frozenset()
+    """Of: state_access, determinism, assertions, versions, certificates."""
+    bandwidth: ClassVar[str] = "low"
+    cpu: ClassVar[str] = "low"
+    units: ClassVar[int] = 1
+    layer: ClassVar[str] = "replication"
+    """Its place in a composition, outermost first: link, assertion, replication, repetition."""
+    roles: ClassVar[dict[str, Role]] = {}
+    """The first is that of the replica that leads, the second that of the others."""
+
+    def check(self, kind: type[Actor], where: str = "") -> None:
+        """Whether it suits this class.
+
+        Raises:
+            MechanismRefused: naming what is missing.
+        """
+        who, name = where or type_name(kind), self.name or type_name(type(self))
+        if "state_access" in self.needs and not has_state_access(kind):
+            why = "saves and restores the state, and the class says state_access = False"
+            raise MechanismRefused(name, f"{who}: it {why}")
+        if "determinism" in self.needs and not kind.deterministic:
+            raise MechanismRefused(name, f"{who}: it compares two runs, and the class says deterministic = False")
+
+    def role(self, *, leads: bool) -> Role:
+        """What a replica does that leads, or does not."""
+        roles = list(self.roles.values()) or [Role()]
+        return roles[0] if leads else roles[-1]
+
+    def role_name(self, *, leads: bool) -> str:
+        """How that is called."""
+        names = list(self.roles) or ["single"]
+        return names[0] if leads else names[-1]
+
+    def describe(self) -> Description:
+        """For another process."""
+        module = sys.modules.get(type(self).__module__)
+        file, digest = getattr(module, "__holdfast_file__", ("", ""))
+        settings = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.init}
+        return Description(message_name(type(self)), settings, file, digest)
+
+
+def has_state_access(kind: type[Actor]) -> bool:
+    """Whether an actor's state can be saved, as far as its class says."""
+    return bool(getattr(kind, "state_access", True))
+
+
+def compose(*layers: Mechanism | Iterable[Mechanism]) -> tuple[Mechanism, ...]:
+    """Layers of mechanisms, outermost first: `compose(PBR(), TR())`.
+
+    Raises:
+        MechanismRefused: something in it is no mechanism.
+    """
+    flat: list[Mechanism] = []
+    for one in layers:
+        flat.extend([one] if isinstance(one, Mechanism) else one)
+    for one in flat:
+        if not isinstance(one, Mechanism):
+            raise MechanismRefused("compose", f"takes mechanisms such as PBR(), not {one!r}")
+    if not flat:
+        raise MechanismRefused("compose", "takes at least one mechanism")
+    return tuple(flat)
+
+
+def revive(description: Description) -> Mechanism:
+    """The mechanism that another process has described.
+
+    Raises:
+        MechanismRefused: it cannot be loaded, is another than there, or does not take these settings.
+    """
+    name = description.kind
+    try:
+        if description.file:
+            kind: Any = load(description.file, sha256=description.sha256)
+            if message_name(kind) != name:
+                kind = _attribute(sys.modules[kind.__module__], name.partition(":")[2])
+        else:
+            module, _, path = name.partition(":")
+            kind = _attribute(sys.modules.get(module) or importlib.import_module(module), path)
+        made = kind(**description.settings)
+    except MechanismRefused:
+        raise
+    except Exception as error:  # Importing runs the file: anything may be raised.
+        raise MechanismRefused(name, f"it cannot be loaded: {type_name(type(error))}: {error}") from error
+    if not isinstance(made, Mechanism):
+        raise MechanismRefused(name, "it is no Mechanism")
+    return made
+
+
+def _attribute(holder: Any, path: str) -> Any:
+    for part in path.split("."):
+        holder = getattr(holder, part)
+    return holder
+
+
+def find(name: str) -> type[Mechanism]:
+    """A mechanism's class by its name: a built-in one, or that of an entry point of the group `holdfast.mechanisms`.
+
+    Raises:
+        MechanismRefused: there is none of that name, or it cannot be loaded.
+    """
+    if name in BUILT_IN:
+        return only(importlib.import_module(f"{__package__}.mechanisms.{name}"), name)
+    for point in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
+        try:
+            kind = point.load()
+        except Exception as error:  # It may be anything's code.
+            raise MechanismRefused(name, f"its entry point {point.value} cannot be loaded: {error}") from error
+        if isinstance(kind, type) and issubclass(kind, Mechanism):
+            return kind
+        raise MechanismRefused(name, f"its entry point {point.value} is no Mechanism")
+    raise MechanismRefused(name, f"there is no mechanism of that name; built in: {', '.join(BUILT_IN)}")
+
+
+def load(source: str | Path, *, sha256: str = "") -> type[Mechanism]:
+    """The mechanism in a module (`package.module`) or a file that ends in `.py`.
+
+    Args:
+        source: what to load. A file must be ours, and nobody else may be able to write it.
+        sha256: refuse a file that is another one.
+
+    Raises:
+        MechanismRefused: it cannot be loaded, or holds no mechanism, or several.
+    """
+    text = str(source)
+    if not text.endswith(".py"):
+        try:
+            return only(importlib.import_module(text), text)
+        except MechanismRefused:
+            raise
+        except Exception as error:
+            raise MechanismRefused(text, f"it cannot be loaded: {type_name(type(error))}: {error}") from error
+    path = Path(text).resolve()
+    try:
+        about = path.stat()
+        code = path.read_bytes()
+    except OSError as error:
+        raise MechanismRefused(text, f"it cannot be read: {error}") from error
+    if about.st_uid not in (os.getuid(), 0) or about.st_mode & 0o022:
+        raise MechanismRefused(text, "the file must belong to this user, and nobody else may be able to write it")
+    digest = hashlib.sha256(code).hexdigest()
+    if sha256 and sha256 != digest:
+        raise MechanismRefused(text, f"the file has changed: its SHA-256 is {digest}, not {sha256}")
+    return only(_run(path, code, digest), text)
+
+
+def _run(path: Path, code: bytes, digest: str) -> Any:
+    """The module that this very code makes; loaded once."""
+    name = f"holdfast_mechanism_{path.stem}_{digest[:16]}"
+    module = sys.modules.get(name)
+    if module is not None:
+        return module
+    spec = importlib.util.spec_from_loader(name, loader=None, origin=str(path))
+    assert spec is not None
+    module = importlib.util.module_from_spec(spec)
+    module.__file__ = str(path)
+    vars(module)["__holdfast_file__"] = (str(path), digest)
+    sys.modules[name] = module
+    try:
+        exec(compile(code, str(path), "exec"), vars(module))
+    except Exception as error:  # It runs whatever stands there.
+        del sys.modules[name]
+        raise MechanismRefused(str(path), f"it cannot be loaded: {type_name(type(error))}: {error}") from error
+    return module
+
+
+def only(module: Any, where: str) -> type[Mechanism]:
+    """The one mechanism that a module defines.
+
+    Raises:
+        MechanismRefused: there is none, or more than one.
+    """
+    found = [
+        value
+        for value in vars(module).values()
+        if isinstance(value, type) and issubclass(value, Mechanism) and value.__module__ == module.__name__
+    ]
+    if len(found) != 1:
+        names = ", ".join(sorted(kind.__name__ for kind in found)) or "none"
+        raise MechanismRefused(where, f"a mechanism's module defines one Mechanism, this one: {names}")
+    return found[0]
