@@ -50,6 +50,8 @@ A = TypeVar("A", bound=Actor)
 ENTRY = f"{__package__}.guest_main:main"
 BASE = (f"{__package__}.guest_main",)
 
+REPLICA = f"{__package__.rpartition('.')[0]}.ftm.replica"
+"""What the processes of replicas import beforehand."""
 ADMIN_TIMEOUT = 60.0
 """Seconds an admin call of the system may take: starting a child can mean restoring a large state."""
 
@@ -208,6 +210,8 @@ class ActorSystem(Recorded, Controls):
         problem = "" if spec.recovery is None else self._homes.refuses(spec.recovery)
         if problem:
             raise SpecError(spec.id, problem)
+        if spec.mechanism is not None:
+            return self._group_host(spec)
         if spec.isolation == "process":
             self._workers.want(spec.start.kind.__module__)
             if spec.recovery is not None and spec.recovery.records:
@@ -218,6 +222,15 @@ class ActorSystem(Recorded, Controls):
         if spec.recovery is not None and spec.recovery.records:
             return TaskHost(self._homes, spec.recovery)
         return LOCAL
+
+    def _group_host(self, spec: ChildSpec) -> Host:
+        """Where the lives of a protected child are lived."""
+        from ..ftm.host import GroupHost  # Most systems protect nobody.
+
+        self._workers.want(spec.start.kind.__module__)
+        self._workers.want(REPLICA)
+        recovery = spec.recovery
+        return GroupHost(self._homes, recovery if recovery is not None and recovery.records else None, spec.mechanism)
 
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""

@@ -1,0 +1,52 @@
+"""What happens to protected addresses, as events; `address` is the protected actor's."""
+
+from __future__ import annotations
+
+from ..actors.events import Event
+
+
+class MechanismAttached(Event, frozen=True, eq=False):
+    """The actor is protected from now on; `layers` are the mechanisms, outermost first."""
+
+    layers: tuple[str, ...]
+    seconds: float
+
+
+class MechanismDetached(Event, frozen=True, eq=False):
+    """The actor is not protected any more; its life goes on."""
+
+    layers: tuple[str, ...]
+    seconds: float
+
+
+class FailedOver(Event, frozen=True, eq=False):
+    """Another replica leads; `seconds` from when the end of the old one was noticed."""
+
+    replica: str
+    epoch: int
+    seconds: float
+    why: str
+
+
+class ReplicaJoined(Event, frozen=True, eq=False):
+    """A replica has caught up with the one that leads, and can take its place from now on."""
+
+    replica: str
+    epoch: int
+    turn: int
+    seconds: float
+
+
+class ReplicaLost(Event, frozen=True, eq=False):
+    """A replica that counted does not any more."""
+
+    replica: str
+    epoch: int
+    why: str
+
+
+class WrongSuspicion(Event, frozen=True, eq=False):
+    """A replica that was suspected has been heard of again; `wrong` counts these at its address."""
+
+    replica: str
+    wrong: int

@@ -1,0 +1,447 @@
+"""The host of a protected actor: the life at its address is lived by a group of replicas.
+
+Its home feeds, holds, journals and answers as for any recorded actor. An actor without recovery has a home as long as
+it is protected: nothing is kept of what it has handled, and when no replica is left it begins afresh.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from ..actors import lives
+from ..actors.actor import Start
+from ..actors.cell import DOWN, GONE, RUNNING, Cell
+from ..actors.control.calls import Call
+from ..actors.control.orders import ReplaceCode, ReplaceState, Resume, Suspend
+from ..actors.errors import ControlFailed, HoldfastError, StartFailed
+from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
+from ..actors.mail import Item
+from ..checkpoint.homes import HomeHost, Homes, parent_ended, seen
+from ..checkpoint.method import Method
+from ..supervision.backoff import Backoff
+from ..supervision.spec import ChildSpec, Flags, child
+from ..supervision.supervisor import Supervisor
+from .detector import Detection, Detector
+from .events import ReplicaLost
+from .failover import FailoverManager
+from .group import Group, forget_ended
+from .join import Joiner
+from .mechanism import compose
+from .messages import Lead
+from .orders import Finish, Install, Setting
+from .proxy import Proxy, Settle
+
+if TYPE_CHECKING:
+    from ..checkpoint.records import TurnEnd
+    from ..checkpoint.switch import Switch
+
+UNKEPT = Method("protected", durability="memory")
+"""Of a child without recovery, as long as it is protected."""
+LED_WITHIN = 60.0
+"""Seconds that the first replica may take to take up its state."""
+JOINED_WITHIN = 10.0
+"""Seconds that a start waits for another replica to catch up; after that the first one goes on alone."""
+FINISHED_WITHIN = 3600.0
+"""Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
+BRICKS_INTENSITY = 100
+"""Ends of parts and replicas within `BRICKS_PERIOD` seconds after which the whole group is given up."""
+BRICKS_PERIOD = 5.0
+
+
+class GroupHost(HomeHost):
+    """Lives that are lived by replicas, each in a process of its own."""
+
+    def __init__(self, homes: Homes, method: Method | None, mechanism: Any) -> None:
+        super().__init__(homes, method or UNKEPT)
+        self.layers = compose(mechanism)
+        self.group: Group | None = None
+        self.epoch = 0
+        self.config = 1
+        self.detection: Detection = getattr(self.layers[0], "detection", None) or Detection()
+        self.replica: Callable[..., Start[Any]] = replica
+        self.on_step: Callable[[str], None] | None = None  # for tests: called before each step of a failover
+        self._starting: asyncio.Task[None] | None = None
+        self._ending: asyncio.Task[None] | None = None
+        self._stop_wanted: ExitReason | None = None
+        self._careful: set[int] = set()
+        self._joined: asyncio.Future[None] | None = None
+
+    # -- beginning --------------------------------------------------------------------------------------------------
+
+    def start(self, cell: Cell) -> asyncio.Future[None]:
+        start = cell.extra().start
+        assert start is not None
+        cell.table = start.kind._table
+        self._stop_wanted = None
+        task = self._starting = cell.node.loop.create_task(
+            self._recover(cell, *self.enter(cell)), name=f"start of {cell.path}"
+        )
+        task.add_done_callback(seen)
+        return task
+
+    def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
+        opened = super().open(cell)
+        switch = opened[0]
+        if is_unkept(self.method):
+            begin_afresh(switch)
+        return opened
+
+    async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
+        start, clock = cell.extra().start, self.clock
+        assert start is not None
+        assert clock is not None
+        await self.gate("restart")
+        if not self.is_gated:
+            self.isolated()
+        if cell.state is not DOWN:
+            raise StartFailed(cell.path, "it was stopped while it started")
+        cell.life += 1
+        cell.state = RUNNING
+        try:
+            group = await self.build(cell, switch)
+            self.subscribe(cell, start.kind._topics)
+            await self.lead(group, switch)
+            clock.mark("restart")
+            await self.gate("replay")
+            if not live.done():  # Else it has ended meanwhile.
+                switch.attach(group)
+            await self.until_live(cell, live, recovering)
+            await self.protected(group)
+        except BaseException as error:
+            if isinstance(error, asyncio.CancelledError):
+                error = StartFailed(cell.path, "it was stopped while it started")
+            failed = error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error))
+            await asyncio.shield(self._end(cell, cell.extra().reason if cell.state is not RUNNING else KILLED, failed))
+            if not isinstance(error, HoldfastError):
+                raise
+            raise failed from error
+        self.clock = None
+        if self._stop_wanted is not None:
+            self.stop(cell, self._stop_wanted)
+
+    async def build(self, cell: Cell, switch: Switch) -> Group:
+        """Start the parts and the replicas.
+
+        Raises:
+            StartFailed: one of them could not be started.
+        """
+        names = tuple(f"r{number}" for number in range(1, max(layer.replicas for layer in self.layers) + 1))
+        self.epoch += 1
+        group = self.group = Group(
+            cell, switch, names, epoch=self.epoch, config=self.config, detection=self.detection
+        )  # fmt: skip
+        group.careful = {key for key in self._careful if key in switch.open}
+        group.on_over = lambda why: self._fell(cell, group)
+        group.on_start_failed = lambda end: self._start_failed(cell, end)
+        group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
+        group.on_joined = self._has_joined
+        group.is_held = len(names) > 1
+        ftm = cell.node.cell_below(cell, "ftm")
+        ftm.extra()
+        recipe = Start(
+            Supervisor, (Flags(intensity=BRICKS_INTENSITY, period=BRICKS_PERIOD), self._children(cell, group))
+        )
+        try:
+            up = lives.begin(ftm, recipe)
+        except BaseException:
+            lives.retire(ftm, "it could not be started")
+            raise
+        ftm.ended().add_done_callback(lambda done: self._parts_ended(cell, group))
+        if up is not None:
+            await up
+        return group
+
+    def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
+        start = cell.extra().start
+        assert start is not None
+        bindings = {port: target.path for port, target in cell.extra().bindings.items()}
+        parts = (
+            child("proxy", Start(Proxy, (group,))),
+            child("detector", Start(Detector, (group,))),
+            child("failover", Start(FailoverManager, (group, self._step))),
+            child("join", Start(Joiner, (group,))),
+        )
+        replicas = tuple(
+            child(
+                name,
+                self.replica(
+                    Setting(
+                        cell.path, name, self.config, self.method.data(), bindings, self.detection.interval
+                    ),
+                    start,
+                    self.layers,
+                ),
+                isolation="process",
+                backoff=Backoff(initial=0.0, maximum=2.0, reset_after=5.0),
+            )
+            for name in group.names
+        )  # fmt: skip
+        return parts + replicas
+
+    def _step(self, name: str) -> None:
+        if self.on_step is not None:
+            self.on_step(name)
+
+    async def lead(self, group: Group, switch: Switch) -> None:
+        """Give the first replica what there is, and have it lead.
+
+        Raises:
+            StartFailed: it could not.
+        """
+        first = group.names[0]
+        life = group.life_of(first)
+        if not life:
+            raise StartFailed(group.path, f"{first} has ended")
+        protocol = group.protocol(first)
+        try:
+            pieces = switch.restore_records()
+            for index, piece in enumerate(pieces, 1):
+                is_last = index == len(pieces)
+                await protocol.ask(
+                    Install(group.epoch, switch.state_turn, piece.data, switch.stash, is_last, []), LED_WITHIN
+                )
+            await protocol.ask(Lead(group.epoch, group.config), LED_WITHIN)
+        except HoldfastError as error:
+            raise StartFailed(group.path, f"{first} cannot lead: {error}") from error
+        group.members[first] = life
+        group.primary, group.is_begun = first, True
+        group.watch(first)
+        group.wake()
+
+    async def protected(self, group: Group) -> None:
+        """Wait until somebody could take over, but not for ever: then it goes on alone, and says so."""
+        if len(group.names) == 1 or len(group.members) > 1 or group.is_over:
+            group.go_on()
+            return
+        joined = self._joined = group.node.loop.create_future()
+        group.wake()
+        done, _ = await asyncio.wait((joined,), timeout=JOINED_WITHIN)
+        self._joined = None
+        if not done:
+            group.node.emit(ReplicaLost(group.path, group.names[1], group.epoch, "it has not caught up yet"))
+        if group.is_over:
+            raise StartFailed(group.path, group.why)
+        group.go_on()
+
+    def _has_joined(self) -> None:
+        if self._joined is not None and not self._joined.done():
+            self._joined.set_result(None)
+
+    def _start_failed(self, cell: Cell, end: TurnEnd) -> None:
+        error = (
+            cell.node.codec.decode_error(end.answer.kind, end.answer.name, end.answer.body) if end.answer.kind else ""
+        )
+        switch = self.switch
+        if switch is not None and switch.live is not None and not switch.live.done():
+            switch.live.set_exception(
+                StartFailed(cell.path, f"on_start raised {error}" if error else "on_start raised")
+            )
+
+    # -- ending -----------------------------------------------------------------------------------------------------
+
+    def _fell(self, cell: Cell, group: Group) -> None:
+        """No replica is left that could lead: the life is over, and whose fault it was may be known."""
+        self._has_joined()
+        suspect = group.only_suspect_input()
+        self._careful = {one.feed.id for one in group.out.requests} if group.out is not None else set()
+        first = group.cell_of(group.names[0])
+        reason: ExitReason = KILLED if first is None or first.more is None else first.more.reason
+        for name in group.names:
+            one = group.cell_of(name)
+            if one is not None and one.more is not None and not one.more.reason.is_clean:
+                reason = one.more.reason
+        if self._starting is not None and not self._starting.done() and not group.is_live:
+            switch = self.switch
+            if switch is not None and switch.live is not None and not switch.live.done():
+                switch.live.set_exception(StartFailed(cell.path, group.why))
+            return
+        self._begin_end(cell, reason, suspect)
+
+    def _parts_ended(self, cell: Cell, group: Group) -> None:
+        """The mechanism's supervisor has given up."""
+        if group is self.group and not group.is_over:
+            group.is_over, group.why = True, "the supervisor of its mechanism has given up"
+            self._fell(cell, group)
+
+    def _ended_itself(self, cell: Cell, reason: ExitReason) -> None:
+        if cell.state is RUNNING and self._ending is None:
+            self._begin_end(cell, reason, -1)
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        group = self.group
+        if cell.state is not RUNNING or self._ending is not None:
+            return
+        if group is None or not group.is_live or (self._starting is not None and not self._starting.done()):
+            self._stop_wanted = reason
+            return
+        group.is_stopping = True
+        self._ending = cell.node.loop.create_task(self._finish(cell, group, reason), name=f"stop of {cell.path}")
+        self._ending.add_done_callback(seen)
+
+    async def _finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:
+        """A last snapshot, then `on_stop`, by whoever leads; if that one dies of it, so be it."""
+        ended = KILLED
+        while group.primary is not None or group.leading is not None:
+            primary, epoch = group.primary, group.epoch
+            if primary is None:
+                await asyncio.sleep(0.005)  # Another one is being told to lead.
+                continue
+            try:
+                await group.protocol(primary).ask(Finish(epoch, dict(pack_exit(reason))), FINISHED_WITHIN)
+                await self._settled(group)
+                ended = reason
+                break
+            except HoldfastError:
+                if group.is_over or group.is_well(primary):
+                    break
+                await asyncio.sleep(0.005)
+        await self._end(cell, ended, None)
+
+    async def _settled(self, group: Group) -> None:
+        """All that has been told to the proxy has been taken."""
+        proxy = group.cell_of("proxy")
+        if proxy is not None:
+            try:
+                await proxy.ref.ask(Settle(), 5.0)
+            except HoldfastError:
+                return  # It is being restarted; its queue is kept.
+
+    def kill(self, cell: Cell) -> None:
+        if cell.state is DOWN and self._starting is not None:
+            self._starting.cancel()
+        elif cell.state is RUNNING:
+            if self._ending is not None:
+                self._ending.cancel()
+                self._ending = None
+            if self._starting is not None and not self._starting.done():
+                self._starting.cancel()
+            else:
+                self._begin_end(cell, KILLED, -1, ordered=True)
+
+    def _begin_end(self, cell: Cell, reason: ExitReason, running: int, *, ordered: bool = False) -> None:
+        if self._ending is not None and not self._ending.done():
+            return
+        end = self._end(cell, reason, None, running, ordered=ordered)
+        self._ending = cell.node.loop.create_task(end, name=f"end of {cell.path}")
+        self._ending.add_done_callback(seen)
+
+    async def _end(
+        self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int = -1, *, ordered: bool = True
+    ) -> None:
+        """End all replicas, then the life at the address."""
+        noticed = time.monotonic()
+        await self.dismantle(cell)
+        self._ending = None
+        if cell.state is not RUNNING:
+            return
+        if failed is not None:
+            reason = KILLED
+        self.over(
+            cell, running, str(failed or reason), ordered=ordered or running < 0, noticed=noticed, reason=reason
+        )  # fmt: skip
+        if is_unkept(self.method) and self.switch is not None:
+            forget_later(self.switch, str(reason))
+        lives.ended(cell, reason)
+
+    async def dismantle(self, cell: Cell) -> None:
+        """End the mechanism; returns when all of its processes have been reaped."""
+        group, self.group = self.group, None
+        if group is not None:
+            group.is_over = True
+        ftm = (cell.children or {}).get("ftm")
+        if ftm is None:
+            return
+        if ftm.state not in (DOWN, GONE):
+            ended = ftm.ended()
+            ftm.kill()
+            await ended
+        lives.retire(ftm, "the mechanism has ended")
+
+    def retired(self, cell: Cell) -> None:
+        if self._starting is not None and not self._starting.done():
+            self._starting.cancel()
+        ftm = (cell.children or {}).get("ftm")
+        if ftm is not None and ftm.state is not GONE:
+            if self.group is not None:
+                self.group.is_over = True
+            ftm.kill()
+        start = cell.extra().start
+        self.give_up(cell, start.kind._topics if start is not None else (), restarting=parent_ended(cell))
+
+    # -- what else a host does --------------------------------------------------------------------------------------
+
+    def push(self, cell: Cell, item: Item) -> None:
+        if self.switch is not None:
+            self.switch.push(item)
+
+    def is_up(self, cell: Cell) -> bool:
+        return super().is_up(cell) and self.group is not None and not self.group.is_over
+
+    def control(self, cell: Cell, call: Call) -> None:
+        """Orders go to the actor of the replica that leads; what would change one replica alone is refused."""
+        group, ask = self.group, call.ask
+        if isinstance(call.order, (ReplaceState, ReplaceCode)):
+            why = "it is protected: detach its mechanism first, for all replicas have to have the same"
+            ask.fail(ControlFailed(cell.path, call.order.verb, why))
+            return
+        if group is None or group.is_over or group.primary is None:
+            cell.extra().calls.append(call)
+            return
+        if isinstance(call.order, (Suspend, Resume)):
+            self._hold(cell, group, is_suspended=isinstance(call.order, Suspend))
+            call.give(None)
+            return
+        server = group.cell_of(f"{group.primary}/server")
+        if server is None:
+            ask.fail(ControlFailed(cell.path, call.order.verb, "the replica that leads has just ended; try again"))
+            return
+        server.host.control(server, call)
+
+    def _hold(self, cell: Cell, group: Group, *, is_suspended: bool) -> None:
+        group.is_suspended = cell.extra().suspended = is_suspended
+        group.poke()
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """Links and monitors are the home's; a binding is known to the replicas from their next life on."""
+
+    def running(self, cell: Cell) -> int:
+        return -1 if self.group is None else self.group.only_suspect_input()
+
+
+def replica(setting: Setting, start: Start[Any], layers: tuple[Any, ...]) -> Start[Any]:
+    """The recipe of a replica."""
+    from .replica import Replica
+
+    return Start(Replica, (setting, start, layers))
+
+
+def is_unkept(method: Method) -> bool:
+    """Whether the actor has a home for as long as it is protected, and begins afresh."""
+    return method.name == UNKEPT.name
+
+
+def begin_afresh(switch: Switch) -> None:
+    """Between two lives of an actor that is not recorded: timers, subscriptions and the stash end with a life."""
+    if switch.newest is None and not switch.turns:
+        return
+    forget_ended(switch)
+    assert switch.newest is not None
+    newest = switch.newest
+    switch.newest = type(newest)(
+        newest.format, switch.turn, newest.next_id, [], {}, [], newest.epoch, b"", switch.turn
+    )  # fmt: skip
+    switch.stash = []
+    switch.timers.replace({})
+    switch.topics.clear()
+
+
+def forget_later(switch: Switch, why: str) -> None:
+    """Replies that the ended life owed will not come."""
+    from ..actors.errors import AskFailed
+
+    for ask in switch.later.values():
+        ask.fail(AskFailed(switch.path, why))
+    switch.later.clear()

@@ -1,0 +1,79 @@
+"""Joining: a new or repaired replica catches up while requests flow, and counts only then (T8c)."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+from ..actors.actor import Actor, on
+from ..actors.errors import HoldfastError
+from .events import ReplicaJoined
+from .group import Look
+from .messages import Follow
+from .orders import Join
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from .group import Group
+
+FOLLOWED_WITHIN = 2.0
+"""Seconds in which a replica has to say that it follows."""
+JOINED_WITHIN = 60.0
+"""Seconds that the transfer of a state may take."""
+FIRST_RETRY, LONGEST_RETRY = 0.02, 2.0
+"""Seconds until a replica that could not join is tried again; doubled each time."""
+
+
+class Joiner(Actor):
+    """Has replicas that are up, and do not count, catch up with the primary."""
+
+    deterministic = False
+
+    def __init__(self, group: Group) -> None:
+        self._group = group
+        self._timer: asyncio.TimerHandle | None = None
+        self._delay = FIRST_RETRY
+
+    def on_start(self, restored: bool) -> None:
+        """Whoever was about to join begins anew."""
+        self._group.tell("join", Look())
+
+    def on_stop(self, reason: object) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+
+    @on(Look)
+    async def look(self, message: Look) -> None:
+        """Take in who is up."""
+        group = self._group
+        for name in group.names:
+            primary = group.primary
+            if group.is_over or not group.is_live or primary is None or name == primary or name in group.members:
+                continue
+            life = group.life_of(name)
+            if not life or group.up.get(name) != life or group.suspects.get(name) == life or group.dropped:
+                continue
+            try:
+                await self._join(primary, name, life)
+            except HoldfastError:
+                self._later()  # If one of them has died, that is seen elsewhere.
+            else:
+                self._delay = FIRST_RETRY
+
+    async def _join(self, primary: str, name: str, life: int) -> None:
+        group, epoch, begin = self._group, self._group.epoch, time.monotonic()
+        await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
+        turn = await group.protocol(primary).ask(Join(epoch, group.place(name)), JOINED_WITHIN)
+        if group.epoch != epoch or group.primary != primary or group.life_of(name) != life or group.is_over:
+            return  # It has caught up with one that does not lead any more.
+        group.joined(name, life)
+        group.node.emit(ReplicaJoined(group.path, name, epoch, turn, time.monotonic() - begin))
+        group.wake()
+
+    def _later(self) -> None:
+        loop = self.ctx.cell.node.loop
+        if self._timer is not None:
+            self._timer.cancel()
+        self._timer = loop.call_later(self._delay, self._group.tell, "join", Look())
+        self._delay = min(self._delay * 2, LONGEST_RETRY)
