@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from ..actors.message import Message
-from .messages import TurnEnd
+from ..checkpoint.records import TurnEnd
 
 
 class Setting(msgspec.Struct, array_like=True, frozen=True):
@@ -72,8 +72,15 @@ class Beat(Message):
     epoch: int
 
 
-class Over(Message):
-    """The protected actor has ended itself (`ctx.stop`) with this reason, packed; its turns are reported already."""
+class Exported(msgspec.Struct, array_like=True):
+    """The state of the protected actor after turn `turn`, as a snapshot has it."""
+
+    turn: int
+    data: bytes
+    stash: list[int]
+
+
+class Export(Message[Exported]):
+    """Give out the state between two batches: the actor is to live without a mechanism."""
 
     epoch: int
-    reason: dict[str, Any]

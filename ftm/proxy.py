@@ -9,7 +9,6 @@ from ..actors.errors import HoldfastError
 from ..actors.message import Message
 from .group import Flush
 from .messages import Done, Outward
-from .orders import Over
 
 if TYPE_CHECKING:
     from .group import Group
@@ -49,12 +48,6 @@ class Proxy(Actor):
     def outward(self, outward: Outward) -> None:
         """Something leaves in the middle of a turn."""
         self._group.take_outward(outward)
-
-    @on(Over)
-    def over(self, over: Over) -> None:
-        """The protected actor has ended itself."""
-        if over.epoch == self._group.epoch:
-            self._group.on_ended(over.reason)
 
     @on(Settle)
     def settle(self, message: Settle) -> None:

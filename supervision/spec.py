@@ -204,7 +204,8 @@ def child(
             replicas in processes of their own.
 
     Raises:
-        MechanismRefused: the class does not have what the mechanism needs. SpecError: naming the child, the option, and what it may be.
+        MechanismRefused: the class does not have what the mechanism needs.
+        SpecError: naming the child, the option, and what it may be.
     """
     is_supervisor = isinstance(start, Start) and bool(getattr(start.kind, "_supervises", False))
     if shutdown is None:
