@@ -5,6 +5,7 @@ The proxy, the detector and the failover manager act on this; the next life of e
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -23,6 +24,7 @@ from ..checkpoint.records import (
     Closed,
     Feed,
     Go,
+    Live,
     Outcome,
     SnapshotNow,
     ToLife,
@@ -90,7 +92,9 @@ class Group:
         self.is_suspended = self.is_stopping = False
         self.is_poked = False
         self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
+        self._quiet: list[asyncio.Future[None]] = []
         # Whom to tell.
+        self.on_live: Callable[[Live], None] = switch.from_life
         self.on_over: Callable[[str], None] = lambda why: None  # nobody is left who could lead
         self.on_start_failed: Callable[[TurnEnd], None] = lambda end: None
         self.on_ended: Callable[[dict[str, Any]], None] = lambda reason: None
@@ -317,14 +321,29 @@ class Group:
                 self.switch.from_life(record)
         if done.live is not None and not self.is_live:
             self.is_live = True
-            self.switch.from_life(done.live)
+            self.on_live(done.live)
         out = self.out
         if done.is_last and out is not None and out.number == done.number:
             self.out = None
+            self._told_quiet()
             self.careful.difference_update(one.feed.id for one in out.requests)
             self._forget_turns()
         if done.wait:
             self.finished.append(Ended(self.epoch, done.part))
+
+    def quiet(self) -> asyncio.Future[None]:
+        """A future that ends when nothing is inside any more; somebody has seen to it that nothing new goes in."""
+        future: asyncio.Future[None] = self.node.loop.create_future()
+        self._quiet.append(future)
+        if self.out is None and self.primary is not None:
+            self._told_quiet()
+        return future
+
+    def _told_quiet(self) -> None:
+        waiting, self._quiet = self._quiet, []
+        for future in waiting:
+            if not future.done():
+                future.set_result(None)
 
     def take_outward(self, outward: Outward) -> None:
         """What left in the middle of a turn, or beside it."""

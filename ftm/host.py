@@ -134,10 +134,7 @@ class GroupHost(HomeHost):
             cell, switch, names, epoch=self.epoch, config=self.config, detection=self.detection
         )  # fmt: skip
         group.careful = {key for key in self._careful if key in switch.open}
-        group.on_over = lambda why: self._fell(cell, group)
-        group.on_start_failed = lambda end: self._start_failed(cell, end)
-        group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
-        group.on_joined = self._has_joined
+        self.take_over(cell, group)
         group.is_held = len(names) > 1
         ftm = cell.node.cell_below(cell, "ftm")
         ftm.extra()
@@ -153,6 +150,14 @@ class GroupHost(HomeHost):
         if up is not None:
             await up
         return group
+
+    def take_over(self, cell: Cell, group: Group) -> None:
+        """What happens to the group happens to the life at the address."""
+        group.on_live = group.switch.from_life
+        group.on_over = lambda why: self._fell(cell, group)
+        group.on_start_failed = lambda end: self._start_failed(cell, end)
+        group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
+        group.on_joined = self._has_joined
 
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
         start = cell.extra().start

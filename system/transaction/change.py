@@ -11,6 +11,7 @@ from ...actors.control.orders import Migrate
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
+from .mechanisms import Attach, Detach
 from .moving import Move
 from .operation import Operation, Step
 from .structure import Add, Remove, Reorder, SetFlags, named_spec, text_of
@@ -95,6 +96,16 @@ class Change:
     def replace_code(self, target: Target, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
         """Go on as another class; its messages wait until the transaction is over."""
         self.step(living.ReplaceCode(target, new, migrate))
+
+    # -- fault tolerance ----------------------------------------------------------------------------------------------
+
+    def attach(self, target: Target, mechanism: Any) -> None:
+        """Protect an actor by a mechanism such as `PBR()`, or by several, outermost first; its life goes on."""
+        self.step(Attach(target, mechanism))
+
+    def detach(self, target: Target) -> None:
+        """Have it live as its spec says without the mechanism; its life goes on."""
+        self.step(Detach(target))
 
     # -- all of it ----------------------------------------------------------------------------------------------------
 
