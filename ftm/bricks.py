@@ -1,0 +1,374 @@
+"""Bricks: Before, Proceed and After, as a mechanism's file derives them; what it leaves out passes through.
+
+`work -> Before -> Proceed -> After -> done`, each an actor that is joined to the `next` one by a binding. A mechanism's
+brick sets `before`, `after` or `from_peer`, and may use `ask_peer`, `state`, `leads`, `epoch`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import deque
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+from ..actors.actor import Actor, on
+from ..actors.bindings import Binding
+from ..actors.errors import HoldfastError
+from ..actors.mail import ReplyHandle
+from ..actors.message import Message, message_name
+from ..actors.ref import ActorRef
+from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
+from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
+from .standing import PeerLost
+
+if TYPE_CHECKING:
+    from .mechanism import Mechanism
+    from .standing import Standing
+
+R = TypeVar("R")
+
+FOREVER = 10.0 * 86400.0
+"""Seconds: the bricks of one replica wait for each other as long as it takes; a death is told otherwise."""
+AGAIN = 0.02
+"""Seconds after which the other replica is asked again, if it could not be reached and still counts."""
+LETTER_BYTES = 8 * 1024 * 1024
+"""What is said to the other replica in one message; more goes in sheets."""
+
+
+class Letter(Message[bytes]):
+    """What a brick says to the same brick of the other replica; sheets with its number come before it."""
+
+    epoch: int
+    config: int
+    name: str
+    body: bytes
+    sheets: int = 0
+
+
+class Sheet(Message):
+    """A piece of a letter that is too large for one message."""
+
+    sheets: int
+    data: bytes
+
+
+class Where(Message[str]):
+    """The address of a brick of this replica, in this configuration."""
+
+    config: int
+    slot: str
+
+
+class Settle(Message[None]):
+    """Answered when all that came before it was handled."""
+
+
+class Flush(Message[None]):
+    """Answered when all that is ready was handed over."""
+
+
+class Brick(Actor):
+    """What all bricks have in common."""
+
+    deterministic = False
+    peer_messages: ClassVar[tuple[type[Message[Any]], ...]] = ()
+    """What `from_peer` understands."""
+
+    next: Binding[Actor]
+    peer: Binding[Actor]
+    state: Binding[Actor]
+
+    def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
+        self._standing, self.mechanism, self.slot = standing, mechanism, slot
+        self._sheets: dict[int, list[bytes]] = {}
+        self._numbers = itertools.count(1)
+        self._handle: ReplyHandle[Any] | None = None
+
+    @property
+    def leads(self) -> bool:
+        """Whether this replica is the primary (leader)."""
+        return self._standing.leads
+
+    @property
+    def role(self) -> str:
+        """What the mechanism calls this replica's part."""
+        return "" if self.mechanism is None else self.mechanism.role_name(leads=self._standing.leads)
+
+    @property
+    def epoch(self) -> int:
+        """The highest epoch that was seen here."""
+        return self._standing.epoch
+
+    @property
+    def has_peer(self) -> bool:
+        """Whether another replica has all that this one has acknowledged."""
+        return self._standing.peer_state == "live"
+
+    # -- the other replica ------------------------------------------------------------------------------------------
+
+    async def from_peer(self, message: Message[Any]) -> Any:
+        """Take what the same brick of the other replica says; its epoch and configuration are ours."""
+        raise TypeError(f"{type(self).__name__} takes nothing from its peer, and got {type(message).__name__}")
+
+    async def ask_peer(self, message: Message[R]) -> R:
+        """Ask the same brick of the other replica, again and again until it answers or does not count any more.
+
+        Raises:
+            PeerLost: nobody waits for it any longer. StaleEpoch: it is we that do not count.
+        """
+        standing = self._standing
+        codec = standing.node.codec
+        body = codec.encoder.encode(message)
+        peer = standing.peer
+        while True:
+            if peer is None or standing.peer != peer:
+                raise PeerLost("there is none")
+            try:
+                ref = await self._find_peer(peer)
+                asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
+                reply = await standing.wait_for(asked)
+            except (PeerLost, ConfigMismatch):
+                raise
+            except StaleEpoch:
+                standing.fence()
+                raise
+            except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
+                standing.lost(self.slot)
+                await standing.changes(AGAIN)
+                continue
+            return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
+
+    def _letter(self, ref: ActorRef[Any], message: Message[Any], body: bytes) -> Letter:
+        standing, number = self._standing, 0
+        if len(body) > LETTER_BYTES:
+            number = next(self._numbers)
+            for part in pieces(body):
+                ref.tell(Sheet(number, part))
+            body = b""
+        return Letter(standing.epoch, standing.config, message_name(type(message)), body, number)
+
+    async def _find_peer(self, path: str) -> ActorRef[Any]:
+        standing = self._standing
+        ref = standing.brick(self.slot)
+        if ref is None:
+            node = standing.node
+            asked = node.cell_at(f"{path}/protocol").ref.ask(Where(standing.config, self.slot), timeout=FOREVER)
+            cell = node.cell_at(await standing.wait_for(asked))
+            ref = cell.ref
+            standing.found(self.slot, ref)
+            node.bind(self.ctx.cell, "peer", cell)
+        return ref
+
+    @on(Sheet)
+    def _sheet(self, message: Sheet) -> None:
+        self._sheets.setdefault(message.sheets, []).append(message.data)
+
+    @on(Letter)
+    async def _take_letter(self, letter: Letter) -> bytes:
+        sheets = self._sheets.pop(letter.sheets, []) if letter.sheets else []
+        standing = self._standing
+        standing.check(letter.epoch, letter.config)
+        kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
+        if kind is None:
+            raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")
+        codec = standing.node.codec
+        reply = await self.from_peer(codec.decode(kind, b"".join(sheets) if sheets else letter.body))
+        return codec.encode(reply, self.ctx.path)
+
+    @on(Settle)
+    def _settle(self, message: Settle) -> None:
+        """All that came before is done."""
+
+    def _refuses(self, epoch: int) -> bool:
+        """Whether this comes from an earlier epoch, or nothing from here counts any more."""
+        standing = self._standing
+        if epoch < standing.epoch or standing.is_fenced:
+            standing.refused += 1
+            return True
+        return False
+
+
+class Before(Brick):
+    """What is done with a batch before it is computed; without `before` it passes through."""
+
+    async def before(self, work: Work) -> Work | None:
+        """Prepare a batch. None: it goes no further from here."""
+        return work
+
+    @on(Work)
+    async def _work(self, work: Work) -> None:
+        if self._refuses(work.epoch):
+            return
+        out = await self.before(work)
+        if out is not None:
+            self.next.tell(out)
+
+
+class After(Brick):
+    """What is done with outcomes before they leave; without `after` they pass through."""
+
+    async def after(self, done: Done) -> Done | None:
+        """Make outcomes ready to leave. None: they do not.
+
+        Proceed goes on when this has returned, or has said `taken()`: the state is not looked at after that.
+        """
+        return done
+
+    def taken(self) -> None:
+        """The state behind these outcomes has been captured, or is not needed: the next turns may run."""
+        if self._handle is not None:
+            self._handle.reply(Taken())
+
+    @on(Done)
+    async def _done(self, done: Done) -> Any:
+        self._handle = handle = self.ctx.reply_handle()
+        if not self._refuses(done.epoch):
+            try:
+                out = await self.after(done)
+            except StaleEpoch:
+                out = None  # Another one leads: these outcomes never were.
+            if out is not None:
+                await self.next.ask(out, timeout=FOREVER)
+        handle.reply(Taken())
+        return handle
+
+
+class Proceed(Brick):
+    """Has the protected actor compute: one turn for each request of a batch, one batch after the other (A49)."""
+
+    server: Binding[Actor]
+    out: Binding[Actor]
+
+    def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
+        super().__init__(standing, mechanism, slot)
+        self._works: deque[Work] = deque()
+        self._task: asyncio.Task[None] | None = None
+        self._number = -1
+        self._at_home: asyncio.Future[None] | None = None
+        self._flushes: list[ReplyHandle[None]] = []
+        self._work_now: Work | None = None
+
+    def on_start(self, restored: bool) -> None:
+        """The server reports here from now on."""
+        server = self._standing.server
+        server.on_more = self._go_on
+        server.outward = self._outward
+        server.hand_over = self._hand_over_before
+
+    async def heard(self, outcome: Outcome) -> None:
+        """An ask of the protected actor has an outcome; called before it gets it."""
+
+    # -- batches ----------------------------------------------------------------------------------------------------
+
+    @on(Work)
+    def _take(self, work: Work) -> None:
+        if self._refuses(work.epoch):
+            return
+        self._works.append(work)
+        self._go_on()
+
+    @on(Flush)
+    def _flush(self, message: Flush) -> Any:
+        handle: ReplyHandle[None] = self.ctx.reply_handle()
+        self._flushes.append(handle)
+        self._go_on()
+        return handle
+
+    def _go_on(self) -> None:
+        if self._task is None and not self.ctx.closed:
+            self._task = self.ctx.create_task(self._run())
+
+    async def _run(self) -> None:
+        server = self._standing.server
+        try:
+            while True:
+                if self._works:
+                    self._work_now = self._works.popleft()
+                    await self._batch(self._work_now)
+                elif server.more or server._snapshot_wanted:
+                    more = server.take_more()
+                    if not more:
+                        break  # A snapshot that has to wait.
+                    await self._pass(Done(self.epoch, self._standing.config, self._number, [], False, None, more))
+                else:
+                    break
+        finally:
+            self._task = self._work_now = None
+            flushes, self._flushes = self._flushes, []
+            for handle in flushes:
+                handle.reply(None)
+
+    async def _batch(self, work: Work) -> None:
+        server = self._standing.server
+        self._number = work.number
+        if work.number >= 0 and self.leads:
+            server.confirmed = server.handed  # It is sent when home has all that came before.
+        pending = deque(work.requests)
+        while True:
+            ends = await server.part(pending)
+            is_last = not pending or server.is_over
+            live = None
+            if is_last and work.go is not None:
+                is_live = server.life is not None and server.life.is_live
+                live = Live(0.0) if is_live else await server.go(work.go)
+            server.seal(ends)
+            waits = not is_last and server.runs_alone(pending[0])
+            await self._hand(ends, is_last=is_last, live=live, wait=waits)
+            if is_last:
+                return
+
+    async def _hand_over_before(self, ends: list[TurnEnd], wait: bool) -> None:
+        """A turn in hand has to wait until home has what came before it."""
+        await self._hand(ends, is_last=False, live=None, wait=wait)
+
+    async def _hand(self, ends: list[TurnEnd], *, is_last: bool, live: Live | None, wait: bool) -> None:
+        server, standing = self._standing.server, self._standing
+        server.handed = part = server.handed + 1
+        more = server.take_more()
+        while len(more) > 1 and any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more):
+            first, more = more[:1], more[1:]
+            await self._pass(Done(standing.epoch, standing.config, self._number, ends, False, None, first))
+            ends = []
+        done = Done(standing.epoch, standing.config, self._number, ends, is_last, live, more, part, wait)
+        if wait:
+            self._at_home = standing.node.loop.create_future()
+        await self._pass(done)
+        if self._at_home is not None:
+            await self._at_home
+            self._at_home = None
+
+    async def _pass(self, done: Done) -> None:
+        while True:
+            try:
+                await self.next.ask(done, timeout=FOREVER)
+            except HoldfastError:  # It was exchanged in between: the one that is bound now gets it.
+                await asyncio.sleep(0)
+                continue
+            return
+
+    # -- past the bricks --------------------------------------------------------------------------------------------
+
+    @on(Ended)
+    def _ended(self, message: Ended) -> None:
+        server = self._standing.server
+        if self._refuses(message.epoch):
+            return
+        server.confirmed = max(server.confirmed, min(message.number, server.handed))
+        if self._at_home is not None and server.confirmed >= server.handed and not self._at_home.done():
+            self._at_home.set_result(None)
+
+    @on(Inward)
+    async def _inward(self, message: Inward) -> None:
+        if self._refuses(message.epoch):
+            return
+        for record in message.records:
+            if isinstance(record, Outcome):
+                await self.heard(record)
+            self._standing.server.inward(record)
+
+    def _outward(self, record: Released) -> None:
+        standing = self._standing
+        if standing.leads and not standing.is_fenced:
+            self.out.tell(Outward(standing.epoch, [record]))
+
+

@@ -1,0 +1,120 @@
+"""Passive replication (PBR): one computes, the other keeps its state.
+
+Fault model  the crash of a replica: its process, its bricks, a hang that the failure detector sees.
+Guarantee    a reply leaves when the backup has the state behind it and the reply itself: no request is lost or doubled.
+Not covered  value faults: a wrong state is copied. With `acknowledge=False` the replies of the last `window` batches
+             may have left without their state when the primary dies.
+Needs        state access; two units. Determinism is not needed: only the primary computes.
+Cost         bandwidth: a state, or what has changed in it, for each batch. One unit computes.
+Source       Lauer et al. 2018, Tables I and II (A34, A35); A50 to A54.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from typing import Any, ClassVar
+
+from ...actors.message import Message
+from ..bricks import FOREVER, After
+from ..alarms import ProtectionLost
+from ..mechanism import Mechanism, Role
+from ..messages import Done, Logged, State
+from ..standing import PeerLost
+from ..state import Apply, Capture
+
+
+class Checkpoint(Message[int]):
+    """The state behind outcomes, and the outcomes, for the reply log of the backup (A52, A54)."""
+
+    state: State
+    log: list[Logged]
+
+
+class Checkpointing(After):
+    """After of the primary: outcomes leave when the backup has the state behind them (T4)."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._out: set[asyncio.Task[None]] = set()  # checkpoints that nobody waits for
+        self._was_alone: str | None = None
+
+    async def after(self, done: Done) -> Done | None:
+        """Capture, send, and wait for the acknowledgement."""
+        if not done.ends:
+            return done
+        standing = self._standing
+        if standing.peer is None:
+            if self._was_alone != standing.path:
+                self._was_alone = standing.path
+                standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
+            return done
+        self._was_alone = None
+        state = await self.state.ask(Capture(standing.peer_turn), timeout=FOREVER)
+        standing.peer_turn = state.turn
+        checkpoint = Checkpoint(state, standing.entries(done.ends))
+        self.taken()
+        assert isinstance(self.mechanism, PBR)
+        if standing.peer_state == "joining":
+            self._send(checkpoint)  # It does not count yet: what it has not got does not hold up anybody.
+        elif self.mechanism.acknowledge:
+            await self._hand_over(checkpoint)
+        else:
+            while len(self._out) >= self.mechanism.window:
+                await asyncio.wait(self._out, return_when=asyncio.FIRST_COMPLETED)
+            self._send(checkpoint)
+        return done
+
+    async def _hand_over(self, checkpoint: Checkpoint) -> None:
+        try:
+            await self.ask_peer(checkpoint)
+        except PeerLost:
+            return  # The manager has said so: we are alone, or another one is brought to our state.
+
+    def _send(self, checkpoint: Checkpoint) -> None:
+        task = self.ctx.create_task(self._hand_over(checkpoint))
+        self._out.add(task)
+        task.add_done_callback(self._out.discard)
+
+
+class StateUpdate(After):
+    """After of the backup: keeps the state, whole or not at all (T8b)."""
+
+    peer_messages = (Checkpoint,)
+
+    async def from_peer(self, message: Message[Any]) -> int:
+        """Take a checkpoint."""
+        assert isinstance(message, Checkpoint)
+        standing = self._standing
+        await standing.until_ready()
+        if message.state.turn < standing.server.turn:
+            return standing.server.turn  # It was overtaken.
+        turn = await self.state.ask(Apply(message.state), timeout=FOREVER)
+        standing.log.add(message.log)
+        return turn
+
+
+@dataclasses.dataclass(frozen=True)
+class PBR(Mechanism):
+    """Passive replication.
+
+    Args:
+        acknowledge: whether replies wait for the backup; without it the last `window` batches may be lost.
+        window: batches that the backup may be behind, with `acknowledge=False`.
+    """
+
+    name: ClassVar[str] = "pbr"
+    replicas: ClassVar[int] = 2
+    tolerates: ClassVar[frozenset[str]] = frozenset({"crash"})
+    needs: ClassVar[frozenset[str]] = frozenset({"state_access"})
+    bandwidth: ClassVar[str] = "high"
+    cpu: ClassVar[str] = "low"
+    units: ClassVar[int] = 2
+    layer: ClassVar[str] = "replication"
+    roles: ClassVar[dict[str, Role]] = {
+        "primary": Role(after=Checkpointing),
+        "backup": Role(after=StateUpdate, computes=False),
+    }
+
+    acknowledge: bool = True
+    window: int = 16

@@ -1,0 +1,368 @@
+"""RequestProtocol: the entry of a replica. One batch at a time inside, duplicates from the reply log, epochs checked.
+
+Everything the root says to a replica comes here. Between two batches, with nothing inside, another replica is brought
+to our state, or the state is given out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Coroutine
+from typing import TYPE_CHECKING, Any
+
+from ..actors.actor import on
+from ..actors.bindings import Binding
+from ..actors.errors import HoldfastError
+from ..actors.exits import unpack_exit
+from ..actors.mail import ReplyHandle
+from ..actors.message import Message
+from ..checkpoint.keys import save_state
+from ..checkpoint.records import DROPPED, Answer, TurnEnd
+from .bricks import FOREVER, Brick, Flush, Where
+from .messages import (
+    CannotJoin,
+    ConfigMismatch,
+    Done,
+    Ended,
+    Follow,
+    Inward,
+    Lead,
+    Logged,
+    ReplyEvicted,
+    StaleEpoch,
+    State,
+    Taken,
+    Work,
+)
+from .orders import Export, Exported, Finish, Install, Join, Peer
+from .standing import PeerLost
+
+if TYPE_CHECKING:
+    from ..actors.actor import Actor
+    from .mechanism import Mechanism
+    from .standing import Standing
+
+
+class Take(Message[int]):
+    """The state and reply log of the replica that leads, for one that joins; the reply is its turn."""
+
+    leader: str
+    state: State | None
+    log: list[Logged]
+
+
+class Assume(Message[None]):
+    """To the replica: have its bricks play the part of one that leads, or not."""
+
+    leads: bool
+
+
+class Resync(Message[None]):
+    """To the RequestProtocol of the leader: this follower does not have your state any more; bring it there again."""
+
+    path: str
+
+
+class InnerProtocol(Brick):
+    """Where an inner layer begins and ends: its entry for the outer Before, and its exit to the outer After (A64)."""
+
+    before: Binding[Actor]
+
+    @on(Work)
+    def _work(self, work: Work) -> None:
+        if not self._refuses(work.epoch):
+            self.before.tell(work)
+
+    @on(Done)
+    async def _done(self, done: Done) -> Taken:
+        return await self.next.ask(done, timeout=FOREVER)
+
+
+class RequestProtocol(Brick):
+    """The entry and exit of a replica; `next` is the Proxy."""
+
+    peer_messages = (Take, Resync)
+
+    before: Binding[Actor]
+    proceed: Binding[Actor]
+
+    def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
+        super().__init__(standing, mechanism, slot)
+        self._held: deque[Work] = deque()
+        self._current: int | None = None  # the batch that is inside
+        self._holds = 0  # who wants nothing to go in
+        self._idle: list[asyncio.Future[None]] = []
+        self._pieces: list[bytes] = []
+        self._lock = asyncio.Lock()
+        self.paths: dict[str, str] = {}
+
+    # -- requests ---------------------------------------------------------------------------------------------------
+
+    @on(Work)
+    def _work(self, work: Work) -> None:
+        standing = self._standing
+        if work.epoch != standing.epoch or work.config != standing.config or not standing.leads or standing.is_fenced:
+            standing.refused += 1
+            return
+        self._held.append(work)
+        self._go_on()
+
+    def _go_on(self) -> None:
+        while self._held and self._current is None and not self._holds:
+            self._begin(self._held.popleft())
+        if self._current is None:
+            idle, self._idle = self._idle, []
+            for one in idle:
+                if not one.done():
+                    one.set_result(None)
+
+    def _begin(self, work: Work) -> None:
+        log, left, known = self._standing.log, [], list[TurnEnd]()
+        for request in work.requests:
+            number = request.feed.id
+            end = log.find(number)
+            if end is not None:
+                log.duplicates += 1
+                known.append(end)
+            elif request.feed.turn < 0 and log.was_evicted(number):
+                error = ReplyEvicted(path=self._standing.address, number=number)
+                answer = Answer(*self._standing.node.codec.encode_error(error))
+                known.append(TurnEnd(-1, number, DROPPED, [], answer))
+            else:
+                left.append(request)
+        goes_in = bool(left) or work.go is not None
+        if known or not goes_in:
+            known.sort(key=lambda end: end.turn)
+            self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in))
+        if goes_in:
+            self._standing.inside.update((one.feed.id, one) for one in left)
+            self._current = work.number
+            self.before.tell(Work(work.epoch, work.config, work.number, left, work.go, work.again))
+
+    @on(Done)
+    def _done(self, done: Done) -> Taken:
+        standing = self._standing
+        if done.epoch < standing.epoch or standing.is_fenced:
+            standing.refused += 1
+            return Taken()
+        standing.log.add(standing.entries(done.ends))
+        for end in done.ends:
+            standing.inside.pop(end.id, None)
+        if standing.leads and (done.number >= 0 or done.ends or done.more):
+            self.next.tell(done)
+        if done.is_last and done.number == self._current:
+            self._current = None
+            standing.inside.clear()
+            self._go_on()
+        return Taken()
+
+    @on(Inward)
+    def _inward(self, message: Inward) -> None:
+        self.proceed.tell(message)
+
+    @on(Ended)
+    def _ended(self, message: Ended) -> None:
+        self.proceed.tell(message)
+
+    # -- orders -----------------------------------------------------------------------------------------------------
+
+    def _answer(self, work: Coroutine[Any, Any, Any]) -> ReplyHandle[Any]:
+        """Answer when the work is done; the bricks may need us meanwhile. One such work at a time."""
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._answered(handle, work))
+        return handle
+
+    async def _answered(self, handle: ReplyHandle[Any], work: Awaitable[Any]) -> None:
+        async with self._lock:
+            try:
+                handle.reply(await work)
+            except HoldfastError as error:
+                handle.fail(error)
+
+    async def _quiet(self) -> None:
+        """Wait until nothing is inside. Whoever calls has raised `_holds`."""
+        while self._current is not None:
+            idle: asyncio.Future[None] = self._standing.node.loop.create_future()
+            self._idle.append(idle)
+            await idle
+
+    def _check(self, epoch: int, config: int | None = None) -> None:
+        standing = self._standing
+        standing.check(epoch, config)
+        standing.epoch = epoch
+
+    @on(Install)
+    async def _install(self, message: Install) -> None:
+        self._check(message.epoch)
+        self._pieces.append(message.data)
+        if message.is_last:
+            data, self._pieces = b"".join(self._pieces), []
+            server = self._standing.server
+            await server.drop_life()
+            server.install(State(message.turn, data, [], [], [], False, -2, message.stash))
+            self._standing.log.replace(message.log)
+
+    @on(Lead)
+    def _lead(self, message: Lead) -> Any:
+        self._check(message.epoch, message.config)
+        return self._answer(self._begin_to_lead(message.epoch))
+
+    async def _begin_to_lead(self, epoch: int) -> int:
+        standing, server = self._standing, self._standing.server
+        if standing.leads and standing.leading == epoch:
+            return server.turn
+        standing.set_peer(None, "none")
+        standing.is_fenced = False
+        await self._replica().ask(Assume(True), timeout=FOREVER)
+        standing.leading = epoch
+        # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
+        self._current = marker = -2 - epoch
+        self.before.tell(Work(epoch, standing.config, marker, []))
+        server.lead()
+        return server.turn
+
+    @on(Follow)
+    def _follow(self, message: Follow) -> Any:
+        self._check(message.epoch, message.config)
+        return self._answer(self._begin_to_follow())
+
+    async def _begin_to_follow(self) -> int:
+        standing = self._standing
+        standing.set_peer(None, "none")
+        standing.is_fenced, standing.leading = False, -1
+        self._held.clear()
+        self._current = None
+        standing.inside.clear()
+        standing.unready()
+        await self._replica().ask(Assume(False), timeout=FOREVER)
+        return standing.server.turn
+
+    def _replica(self) -> Any:
+        parent = self.ctx.cell.parent
+        assert parent is not None
+        return parent.ref
+
+    # -- the other replica ------------------------------------------------------------------------------------------
+
+    @on(Peer)
+    def _peer(self, message: Peer) -> None:
+        self._check(message.epoch)
+        standing = self._standing
+        if message.path != standing.peer:
+            standing.set_peer(message.path, "live")
+
+    @on(Join)
+    def _join(self, message: Join) -> Any:
+        self._check(message.epoch)
+        return self._answer(self._bring(message.peer))
+
+    async def _bring(self, path: str) -> int:
+        """Bring another replica to our state; requests wait only while that is captured."""
+        standing, server = self._standing, self._standing.server
+        if standing.peer == path and standing.peer_state == "live":
+            return server.turn
+        if not standing.leads:
+            raise CannotJoin(path=path, why=f"{standing.path} does not lead")
+        self._holds += 1
+        try:
+            await self._quiet()
+            await server.ensure()
+            state = None
+            if server.has_access:
+                state = server.capture() if server.point is not None or server.turn >= 0 else None
+            elif server.turn >= 0:
+                why = "the state of the protected actor cannot be read, and it has handled requests already"
+                raise CannotJoin(path=path, why=why)
+            log = standing.log.entries()
+            standing.set_peer(path, "joining", -2 if state is None else state.turn)
+            asked = self.ctx.create_task(self._offer(Take(standing.path, state, log)))
+        finally:
+            self._holds -= 1
+            self._go_on()
+        turn = await asked
+        if isinstance(turn, HoldfastError):
+            if standing.peer == path:
+                standing.set_peer(None, "none")
+            raise CannotJoin(path=path, why=str(turn))
+        if standing.peer == path:
+            standing.peer_state = "live"
+        return turn
+
+    async def _offer(self, take: Take) -> int | HoldfastError:
+        try:
+            return await self.ask_peer(take)
+        except (PeerLost, ConfigMismatch, StaleEpoch, HoldfastError) as error:
+            return error
+
+    async def from_peer(self, message: Message[Any]) -> Any:
+        """We join, or a follower has to join again."""
+        if isinstance(message, Resync):
+            self.ctx.create_task(self._again(message.path))
+            return None
+        assert isinstance(message, Take)
+        return await self._taken(message)
+
+    async def _again(self, path: str) -> None:
+        async with self._lock:
+            try:
+                if self._standing.peer == path:
+                    self._standing.set_peer(path, "joining")
+                await self._bring(path)
+            except HoldfastError:
+                return  # The manager will see that it does not count, and why.
+
+    async def _taken(self, take: Take) -> int:
+        standing, server = self._standing, self._standing.server
+        standing.set_peer(take.leader, "live")
+        await server.drop_life()
+        server.install(take.state)
+        standing.log.replace(take.log)
+        if standing.computes:
+            await server.ensure()
+        standing.ready()
+        return server.turn
+
+    @on(Where)
+    def _where(self, message: Where) -> str:
+        self._standing.check(self._standing.epoch, message.config)
+        path = self._standing.paths.get(message.slot)
+        if path is None:
+            raise ConfigMismatch(self._standing.path, self._standing.config, message.config)
+        return path
+
+    # -- the state --------------------------------------------------------------------------------------------------
+
+    @on(Export)
+    def _export(self, message: Export) -> Any:
+        self._check(message.epoch)
+        return self._answer(self._give_out())
+
+    async def _give_out(self) -> Exported:
+        self._holds += 1
+        try:
+            await self._quiet()
+            server = self._standing.server
+            await server.ensure()
+            life = server.life
+            assert life is not None
+            assert life.cell.actor is not None
+            stash = [fed.feed.id for fed in life.stash]
+            return Exported(life.turn, save_state(life.cell.actor), stash)
+        finally:
+            self._holds -= 1
+            self._go_on()
+
+    @on(Finish)
+    def _finish(self, message: Finish) -> Any:
+        self._check(message.epoch)
+        return self._answer(self._end(message.reason))
+
+    async def _end(self, reason: dict[str, Any]) -> None:
+        self._holds += 1
+        server = self._standing.server
+        if server.life is not None and server.cell is not None:
+            gone = server.cell.ended()
+            server.finish(unpack_exit(reason))
+            await gone
+        await self.proceed.ask(Flush(), timeout=FOREVER)
