@@ -67,6 +67,10 @@ class Flush(Message[None]):
     """Answered when all that is ready was handed over."""
 
 
+class Abandon(Message[None]):
+    """Drop what is being computed, and what waits to be; answered when nothing is."""
+
+
 class Brick(Actor):
     """What all bricks have in common."""
 
@@ -266,6 +270,13 @@ class Proceed(Brick):
             return
         self._works.append(work)
         self._go_on()
+
+    @on(Abandon)
+    def _abandon(self, message: Abandon) -> Any:
+        self._works.clear()
+        if self._work_now is not None:
+            self._standing.server.abandon()
+        return self._flush(Flush())
 
     @on(Flush)
     def _flush(self, message: Flush) -> Any:

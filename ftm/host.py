@@ -177,7 +177,7 @@ class GroupHost(HomeHost):
                         cell.path, name, self.config, self.method.data(), bindings, self.detection.interval
                     ),
                     start,
-                    self.layers,
+                    tuple(layer.describe() for layer in self.layers),
                 ),
                 isolation="process",
                 backoff=Backoff(initial=0.0, maximum=2.0, reset_after=5.0),
@@ -262,6 +262,7 @@ class GroupHost(HomeHost):
             switch = self.switch
             if switch is not None and switch.live is not None and not switch.live.done():
                 switch.live.set_exception(StartFailed(cell.path, group.why))
+                switch.live.exception()  # Nobody may look: the start may have failed before it waited.
             return
         self._begin_end(cell, reason, suspect)
 
@@ -288,7 +289,7 @@ class GroupHost(HomeHost):
 
     async def _finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:
         """A last snapshot, then `on_stop`, by whoever leads; if that one dies of it, so be it."""
-        ended = KILLED
+        ended: ExitReason = KILLED
         while group.primary is not None or group.leading is not None:
             primary, epoch = group.primary, group.epoch
             if primary is None:

@@ -19,7 +19,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
-from .bricks import FOREVER, Brick, Flush, Where
+from .bricks import FOREVER, Abandon, Brick, Flush, Where
 from .messages import (
     CannotJoin,
     ConfigMismatch,
@@ -62,6 +62,10 @@ class Resync(Message[None]):
     """To the RequestProtocol of the leader: this follower does not have your state any more; bring it there again."""
 
     path: str
+
+
+class ResyncPeer(Message[None]):
+    """To the RequestProtocol of a follower: have the leader bring us to its state again; answered when we are there."""
 
 
 class InnerProtocol(Brick):
@@ -214,6 +218,7 @@ class RequestProtocol(Brick):
             return server.turn
         standing.set_peer(None, "none")
         standing.is_fenced = False
+        standing.ready()
         await self._replica().ask(Assume(True), timeout=FOREVER)
         standing.leading = epoch
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
@@ -312,9 +317,26 @@ class RequestProtocol(Brick):
             except HoldfastError:
                 return  # The manager will see that it does not count, and why.
 
+    @on(ResyncPeer)
+    def _resync(self, message: ResyncPeer) -> Any:
+        handle = self.ctx.reply_handle()
+        self._standing.unready()
+        self.ctx.create_task(self._resynced(handle))
+        return handle
+
+    async def _resynced(self, handle: ReplyHandle[Any]) -> None:
+        try:
+            await self.ask_peer(Resync(self._standing.path))
+        except (PeerLost, HoldfastError) as error:
+            handle.fail(error)
+            return
+        await self._standing.until_ready()
+        handle.reply(None)
+
     async def _taken(self, take: Take) -> int:
         standing, server = self._standing, self._standing.server
         standing.set_peer(take.leader, "live")
+        await self.proceed.ask(Abandon(), timeout=FOREVER)
         await server.drop_life()
         server.install(take.state)
         standing.log.replace(take.log)

@@ -13,6 +13,8 @@ from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING, Any, Final
 
+import msgspec
+
 from ..actors import lives, mailbox
 from ..actors.actor import Actor
 from ..actors.cell import DOWN, RUNNING, Cell
@@ -58,6 +60,9 @@ MOST_CRASHES: Final = 8
 """Ends of the life outside any turn, one after another, after which the replica is given up."""
 COMPACT_BYTES: Final = 64 * 1024
 """Deltas that are larger than the state they belong to, and than this, are replaced by a whole state."""
+
+UNKNOWN: Final = -3
+"""In place of the turn that a delta begins after."""
 
 # Why the server came to rest.
 OVER, BLOCKED, ENDED, UNDONE = "over", "blocked", "ended", "undone"
@@ -207,7 +212,7 @@ class Server(lives.LocalHost):
         self._live: Live | None = None
         self._resting: asyncio.Future[str] | None = None
         self._chunk = 8
-        self._is_quiet = self._is_again = self._is_stopping = False
+        self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None
         self._crashes = 0
@@ -271,7 +276,7 @@ class Server(lives.LocalHost):
         self.point, self.marks, self.tail, self.previous = point, [], [], None
         self._point_names = None
         if point is not None:
-            self.marks = [point.turn] * len(point.deltas)
+            self.marks = [UNKNOWN] * len(point.deltas)
 
     @property
     def turn(self) -> int:
@@ -339,6 +344,11 @@ class Server(lives.LocalHost):
         if await self._rest() is not OVER:
             raise StartFailed(self.address, str(cell.extra().reason))
 
+    def abandon(self) -> None:
+        """What is being run does not count: another state takes the place of what it leads to."""
+        self._is_abandoned = True
+        self.at_rest(ENDED)
+
     async def drop_life(self) -> None:
         """End the life without a word: its state is kept as bytes."""
         cell = self.cell
@@ -405,7 +415,7 @@ class Server(lives.LocalHost):
     async def part(self, pending: deque[Request]) -> list[TurnEnd]:
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
         begin = time.perf_counter()
-        self.begun, self.ends = [], []
+        self.begun, self.ends, self._is_abandoned = [], [], False
         while pending and not self.is_over:
             if self.life is None:
                 await self._begin()
@@ -442,6 +452,11 @@ class Server(lives.LocalHost):
     def _after_end(self, pending: deque[Request], chunk: list[Request]) -> bool:
         """The life has ended in the middle of a part. Whether to go on."""
         failed, self._failed = self._failed, None
+        if self._is_abandoned:
+            self._is_abandoned = False
+            pending.clear()
+            self.begun, self.ends = [], []
+            return False
         self.life = None
         if self._is_stopping or self.is_over:
             return False
@@ -478,7 +493,7 @@ class Server(lives.LocalHost):
         """A turn wants its outputs to leave before it ends."""
         if life is not self.life:
             return
-        if self._is_quiet or self._is_again:
+        if self._is_quiet or self._is_again or not self.standing.leads:
             asked = [out for out in life.outs if out.verb in ("ask", "send")]
             known = [self.heard.get((life.turn, out.k)) for out in asked]
             if all(one is not None for one in known):
@@ -554,6 +569,7 @@ class Server(lives.LocalHost):
             return
         if not self.has_access:
             self._start_turn = self.life.turn
+            self._forget_heard(self.life.turn)
             return
         before = self.point
         self._keep_tail(begun, ends)
@@ -564,8 +580,14 @@ class Server(lives.LocalHost):
         if before is not None and tail:
             self.previous = before, [one for one, _ in tail]
         first = before.turn if before is not None else -1
-        self.heard = {key: one for key, one in self.heard.items() if key[0] > first}
-        self.released = {turn: digests for turn, digests in self.released.items() if turn > first}
+        self._forget_heard(first)
+
+    def _forget_heard(self, turn: int) -> None:
+        """Turns up to this one are not run again."""
+        if self.heard:
+            self.heard = {key: one for key, one in self.heard.items() if key[0] > turn}
+        if len(self.released) > 512:
+            self.released = {key: digests for key, digests in self.released.items() if key > turn - 256}
 
     def capture(self) -> State:
         """The state after the last turn, as bytes. Only between two turns.
@@ -661,7 +683,7 @@ class Server(lives.LocalHost):
             for feed in point.stash
         ]
         self.point, self.tail = point, []
-        self.marks = [point.turn] * len(point.deltas)
+        self.marks = [UNKNOWN] * len(point.deltas)
 
     @staticmethod
     def _names_of(point: State) -> list[str]:
@@ -707,6 +729,13 @@ class Server(lives.LocalHost):
         else:
             self.rewind(before)
         return before
+
+    def skip_to(self, turn: int) -> None:
+        """These numbers are used, though no turn has left anything."""
+        if self.life is not None and self.point is not None:
+            self.life.turn = turn
+            self.marks = [UNKNOWN] * len(self.point.deltas)
+            self.point = msgspec.structs.replace(self.point, turn=turn)
 
     # -- as the port home -------------------------------------------------------------------------------------------
 

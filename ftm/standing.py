@@ -40,6 +40,7 @@ class Standing:
         self.computes = False  # whether the protected actor lives here
         self.is_ready = False  # whether it has the state of the one that leads
         self.paths: dict[str, str] = {}  # of its bricks, by slot
+        self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to a follower
         self.refused = 0  # messages of other epochs or configurations
         self.server: Server = None  # type: ignore[assignment]  # made with it, by the replica
         self._bricks: dict[str, ActorRef[Any]] = {}  # of the other replica, by slot
@@ -100,6 +101,7 @@ class Standing:
         """The other replica is this one from now on; nobody waits any longer for another."""
         self.peer, self.peer_state, self.peer_turn = path, state if path is not None else "none", turn
         self._bricks.clear()
+        self.forwarded = []
         waiting, self._waiting = self._waiting, set()
         for one in waiting:
             if not one.done():
