@@ -11,12 +11,13 @@ import itertools
 from collections import deque
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
+from ..actors import lives
 from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message, message_name
-from ..actors.ref import ActorRef
+from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
 from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
 from .standing import PeerLost
@@ -286,8 +287,15 @@ class Proceed(Brick):
         return handle
 
     def _go_on(self) -> None:
-        if self._task is None and not self.ctx.closed:
+        """See to it that what waits is handled. Called from our turns, and from the protected actor's."""
+        if self._task is not None or self.ctx.closed:
+            return
+        cell = self.ctx.cell
+        context = cell.context or lives.open_context(cell)
+        if current.get(None) is self.ctx:
             self._task = self.ctx.create_task(self._run())
+        else:  # What the task sends must not count as sent by somebody else's turn.
+            self._task = context.run(self.ctx.create_task, self._run())
 
     async def _run(self) -> None:
         server = self._standing.server
@@ -380,6 +388,7 @@ class Proceed(Brick):
     def _outward(self, record: Released) -> None:
         standing = self._standing
         if standing.leads and not standing.is_fenced:
-            self.out.tell(Outward(standing.epoch, [record]))
+            # Called in the protected actor's turn: a plain `tell` would be taken for one of its own.
+            self.ctx.tell(self.out._cell, Outward(standing.epoch, [record]))
 
 

@@ -8,6 +8,7 @@ import pytest
 from tests.ftm.driver import Driver
 
 import holdfast as hf
+from holdfast.actors.exits import SHUTDOWN, pack_exit
 from holdfast.ftm.mechanisms.pbr import PBR
 
 
@@ -59,3 +60,13 @@ async def test_a_backup_that_leads_goes_on_where_the_primary_was() -> None:
         await driver.fail_over("r2")
         assert await driver.ask(Add(3)) == 6
         assert await driver.ask(Read()) == [1, 2, 3]
+
+
+async def test_finish_takes_a_last_snapshot() -> None:
+    from holdfast.ftm.orders import Finish
+
+    async with hf.ActorSystem("app") as system:
+        driver = await pair(system)
+        assert await driver.ask(Add(1)) == 1
+        await driver.protocol("r1").ask(Finish(driver.epoch, pack_exit(SHUTDOWN)))
+        assert [type(one).__name__ for one in driver.more] == ["Snapshot"]
