@@ -71,7 +71,7 @@ class Counter(hf.Actor):
 
     @hf.on(Later)
     def later(self, message: Later) -> None:
-        self.ctx.send_after(message.seconds, Add(message.tag))
+        self.ctx.tell_after(message.seconds, Add(message.tag))
 
 
 class Closed(Counter):
