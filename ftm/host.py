@@ -21,6 +21,7 @@ from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
 from ..checkpoint.homes import HomeHost, Homes, parent_ended, seen
 from ..checkpoint.method import Method
+from ..checkpoint.records import Restore
 from ..supervision.backoff import Backoff
 from ..supervision.spec import ChildSpec, Flags, child
 from ..supervision.supervisor import Supervisor
@@ -203,6 +204,8 @@ class GroupHost(HomeHost):
         protocol = group.protocol(first)
         try:
             pieces = switch.restore_records()
+            if not pieces and switch.state_turn >= 0:
+                pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 await protocol.ask(
