@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 from ..actors import lives
 from ..actors.actor import Start
 from ..actors.cell import DOWN, GONE, RUNNING, Cell
-from ..actors.control.calls import Call
+from ..actors.control.calls import Call, send_call
 from ..actors.control.orders import ReplaceCode, ReplaceState, Resume, Suspend
 from ..actors.errors import ControlFailed, HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
+from ..actors.process.remote import ProcessHost
 from ..checkpoint.homes import HomeHost, Homes, parent_ended, seen
 from ..checkpoint.method import Method
 from ..checkpoint.records import Restore
@@ -403,11 +404,12 @@ class GroupHost(HomeHost):
             self._hold(cell, group, is_suspended=isinstance(call.order, Suspend))
             call.give(None)
             return
-        server = group.cell_of(f"{group.primary}/server")
-        if server is None:
+        leads = group.cell_of(group.primary)
+        worker = leads.host.worker_of(leads) if leads is not None and isinstance(leads.host, ProcessHost) else None
+        if worker is None:
             ask.fail(ControlFailed(cell.path, call.order.verb, "the replica that leads has just ended; try again"))
             return
-        server.host.control(server, call)
+        send_call(worker, group.place(f"{group.primary}/server"), call)
 
     def _hold(self, cell: Cell, group: Group, *, is_suspended: bool) -> None:
         group.is_suspended = cell.extra().suspended = is_suspended

@@ -104,8 +104,10 @@ class Transfer(hf.Message[int]):
 class Bank(hf.Actor):
     """Moves money between two accounts, by asks in the middle of its turns; notes what it has done."""
 
-    def __init__(self, one: hf.ActorRef[Account], other: hf.ActorRef[Account]) -> None:
-        self.one, self.other = one, other
+    one: hf.Binding[Account]
+    other: hf.Binding[Account]
+
+    def __init__(self) -> None:
         self.done: list[int] = []
 
     @hf.on(Transfer)

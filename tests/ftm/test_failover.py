@@ -248,7 +248,7 @@ async def test_a_primary_that_wakes_up_before_it_is_killed_was_suspected_wrongly
 async def test_what_asks_in_the_middle_of_its_turns_moves_no_money_twice(system: hf.ActorSystem) -> None:
     one = await system.start(hf.child("one", hf.start(Account, 1000)))
     two = await system.start(hf.child("two", hf.start(Account, 1000)))
-    ref = await started(system, hf.start(Bank, one, two))
+    ref = await started(system, hf.start(Bank), bindings={"one": one.path, "other": two.path})
     load, rng = Load(ref, clients=3, make=Transfer), random.Random(SEED)
     for _ in range(4):
         await load.reached(rng.randrange(1, 40))
@@ -271,7 +271,7 @@ async def test_a_message_that_kills_every_replica_is_quarantined(system: hf.Acto
     with pytest.raises(hf.Quarantined):
         await ref.ask(Die(), timeout=60)
     assert await ref.ask(Add(1), timeout=30) == 2
-    assert [one.name for one in system.quarantined(ref)] != []
+    assert [one.address for one in system.quarantined(ref)] == [ref.path]
 
 
 async def test_an_actor_that_stops_itself_ends_for_good_if_its_spec_says_so(system: hf.ActorSystem) -> None:
