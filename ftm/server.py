@@ -211,6 +211,8 @@ class Server(lives.LocalHost):
         self._failed: int | None = None
         self._live: Live | None = None
         self._missed: str | None = None
+        self._has_released = False
+        self._pending: deque[Request] = deque()
         self._resting: asyncio.Future[str] | None = None
         self._chunk = 8
         self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
@@ -431,7 +433,8 @@ class Server(lives.LocalHost):
     async def part(self, pending: deque[Request]) -> list[TurnEnd]:
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
         begin = time.perf_counter()
-        self.begun, self.ends, self._is_abandoned = [], [], False
+        self.begun, self.ends, self._is_abandoned, self._has_released = [], [], False, False
+        self._pending = pending
         while pending and not self.is_over:
             if self.life is None:
                 await self._begin()
@@ -450,7 +453,7 @@ class Server(lives.LocalHost):
                     self._chunk = min(256, self._chunk * 2)
                 elif now - at > PART and self._chunk > 1:
                     self._chunk //= 2
-                if now - begin > PART and not self._is_again:
+                if (now - begin > PART and not self._is_again) or self._has_released:
                     break
             elif why is UNDONE:
                 self._take_back(pending)
@@ -528,7 +531,18 @@ class Server(lives.LocalHost):
         self.released.setdefault(life.turn, []).extend(out.digest() for out in life.outs)
 
     def _let_out(self, life: ServerLife) -> None:
+        """What has left cannot be undone: the part ends with this turn, whatever was to come after it."""
         self._note_released(life)
+        self._has_released = True
+        queue, feed = mailbox.queue_of(life.cell), life.feed
+        left = set[int]()
+        for index, item in enumerate(queue):
+            if type(item) is Fed and item.life is life:
+                left.add(item.feed.id)
+                queue[index] = mailbox.NOTHING  # Not removed: the run loop has counted them.
+        if left and feed is not None:
+            self._pending.extendleft(reversed([one for one in self.begun if one.feed.id in left]))
+            self.begun = [one for one in self.begun if one.feed.id not in left]
         life.release_now()
 
     def _look(self, life: ServerLife, feed: Feed) -> None:
