@@ -16,7 +16,7 @@ from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.mail import ReplyHandle
-from ..actors.message import Message, message_name
+from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
 from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
@@ -78,6 +78,9 @@ class Brick(Actor):
     deterministic = False
     peer_messages: ClassVar[tuple[type[Message[Any]], ...]] = ()
     """What `from_peer` understands."""
+
+    answers_later: ClassVar[bool] = False
+    """Whether other messages are handled while `from_peer` waits for something."""
 
     next: Binding[Actor]
     peer: Binding[Actor]
@@ -169,7 +172,7 @@ class Brick(Actor):
         self._sheets.setdefault(message.sheets, []).append(message.data)
 
     @on(Letter)
-    async def _take_letter(self, letter: Letter) -> bytes:
+    async def _take_letter(self, letter: Letter) -> bytes | ReplyHandle[bytes]:
         sheets = self._sheets.pop(letter.sheets, []) if letter.sheets else []
         standing = self._standing
         standing.check(letter.epoch, letter.config)
@@ -177,8 +180,18 @@ class Brick(Actor):
         if kind is None:
             raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")
         codec = standing.node.codec
-        reply = await self.from_peer(codec.decode(kind, b"".join(sheets) if sheets else letter.body))
-        return codec.encode(reply, self.ctx.path)
+        message = codec.decode(kind, b"".join(sheets) if sheets else letter.body)
+        if not self.answers_later:
+            return codec.encode(await self.from_peer(message), self.ctx.path)
+        handle: ReplyHandle[bytes] = self.ctx.reply_handle()
+        self.ctx.create_task(self._answer_letter(handle, message))
+        return handle
+
+    async def _answer_letter(self, handle: ReplyHandle[bytes], message: Message[Any]) -> None:
+        try:
+            handle.reply(self._standing.node.codec.encode(await self.from_peer(message), self.ctx.path))
+        except Refusal as no:
+            handle.fail(no)
 
     @on(Settle)
     def _settle(self, message: Settle) -> None:

@@ -35,6 +35,7 @@ from ..checkpoint.records import (
     Go,
     Ignored,
     Live,
+    Out,
     Outcome,
     PipeDone,
     Released,
@@ -212,6 +213,7 @@ class Server(lives.LocalHost):
         self._live: Live | None = None
         self._missed: str | None = None
         self._has_released = False
+        self._withheld: list[Out] = []  # of the turn in hand, on a follower
         self._pending: deque[Request] = deque()
         self._resting: asyncio.Future[str] | None = None
         self._chunk = 8
@@ -465,7 +467,9 @@ class Server(lives.LocalHost):
     def _take_back(self, pending: deque[Request]) -> None:
         """Nothing of this part has happened: the life begins again where it began."""
         pending.extendleft(reversed(self.begun))
-        self.begun, self.ends, self.life = [], [], None
+        self.begun, self.ends, self.life, self._withheld = [], [], None, []
+        last = -1 if self.point is None else self.point.turn
+        self.released = {turn: digests for turn, digests in self.released.items() if turn <= last}
         self.more = [one for one in self.more if not isinstance(one, PipeDone)]
 
     def _after_end(self, pending: deque[Request], chunk: list[Request]) -> bool:
@@ -524,8 +528,12 @@ class Server(lives.LocalHost):
                 return
         if self.is_front:
             self._let_out(life)
-        else:
-            life.cell.node.loop.call_soon(self._look, life, life.feed)
+            return
+        if not self.standing.leads:  # The leader has sent it; we may have to, when we lead.
+            self._note_released(life)
+            self._withheld += life.outs
+            life.outs = []
+        life.cell.node.loop.call_soon(self._look, life, life.feed)
 
     def _note_released(self, life: ServerLife) -> None:
         self.released.setdefault(life.turn, []).extend(out.digest() for out in life.outs)
@@ -564,8 +572,10 @@ class Server(lives.LocalHost):
         resting = self._on_to_rest()
         if not self._is_again:
             await self._hand_over_before(feed)
-        if self.standing.leads and self.life is life and life.feed is feed and life.outs:
-            self._let_out(life)
+        if self.standing.leads and self.life is life and life.feed is feed:
+            self._take_up_withheld(life)
+            if life.outs:
+                self._let_out(life)
         return await resting
 
     async def _hand_over_before(self, feed: Feed) -> None:
@@ -583,8 +593,15 @@ class Server(lives.LocalHost):
     def lead(self) -> None:
         """A turn that waits for an outcome may ask for it itself, when home has what comes before it."""
         life = self.life
-        if life is not None and life.feed is not None and life.outs:
+        if life is not None and life.feed is not None and self._withheld:
             self._look(life, life.feed)
+
+    def _take_up_withheld(self, life: ServerLife) -> None:
+        """What the last leader may have sent, and may not."""
+        if self._withheld:
+            self.released.pop(life.turn, None)
+            life.outs = self._withheld + life.outs
+            self._withheld = []
 
     # -- points -----------------------------------------------------------------------------------------------------
 
@@ -774,6 +791,7 @@ class Server(lives.LocalHost):
         """What the life says, in order."""
         match record:
             case TurnEnd():
+                self._withheld = []
                 if record.status == FAILED and not self._is_quiet and record.id not in self._skips:
                     self._failed = record.id
                 if not self._is_quiet:
