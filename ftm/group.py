@@ -6,6 +6,7 @@ The proxy, the detector and the failover manager act on this; the next life of e
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -197,10 +198,9 @@ class Group:
         cell = self.cell_of(name)
         if cell is None or cell.is_dead:
             return  # Whoever comes there looks by itself.
-        try:
-            cell.ref.tell(message)
-        except HoldfastError:
-            return  # The same.
+        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, in whose name it is not said.
+        with contextlib.suppress(HoldfastError):  # The same.
+            cell.admit(cell, message)
 
     # -- from the home ----------------------------------------------------------------------------------------------
 

@@ -148,6 +148,7 @@ class Load:
                 self.answered[tag] = await self.ref.ask(self.make(tag, 1), timeout=30.0)
             except hf.HoldfastError as error:
                 self.failed[tag] = error
+                return  # It is seen in the end.
             self.longest = max(self.longest, loop.time() - begin)
 
     async def reached(self, answers: int) -> None:
@@ -155,6 +156,7 @@ class Load:
         goal = len(self.answered) + answers
         async with asyncio.timeout(60):
             while len(self.answered) < goal:
+                assert len(self.failed) < self.clients, f"nobody is left who asks: {self.failed}"
                 await asyncio.sleep(0.001)
 
     async def stop(self) -> None:

@@ -102,8 +102,8 @@ async def test_its_next_lives_are_protected_too_and_not_after_a_detach(system: h
 
 async def test_timers_come_along(system: hf.ActorSystem, recovery: Any) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery))
-    await ref.ask(Later(2.0, 1))
-    await ref.ask(Later(4.0, 2))
+    await ref.ask(Later(1.0, 1))
+    await ref.ask(Later(2.5, 2))
     await attach(system, ref)
     async with asyncio.timeout(20):
         while await ref.ask(Tags()) != [1]:
