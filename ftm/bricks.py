@@ -270,8 +270,8 @@ class Proceed(Brick):
         self._flushes: list[ReplyHandle[None]] = []
         self._work_now: Work | None = None
 
-    def on_start(self, restored: bool) -> None:
-        """The server reports here from now on."""
+    def take_over(self) -> None:
+        """The server reports here from now on. (Not from the start: a brick that is only prepared must not hear it.)"""
         server = self._standing.server
         server.on_more = self._go_on
         server.outward = self._outward

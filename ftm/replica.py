@@ -233,7 +233,7 @@ class Replica(Supervisor):
         """Have this stack be the one: bind everything, end what is not needed."""
         old, self._woven, standing = self._woven, woven, self._standing
         kept = set(woven.names.values())
-        left = [name for name in old.names.values() if name not in kept]
+        left = [name for name in old.names.values() if name not in kept and name in self._children]
         for name in left:  # What is in their mailboxes belongs to the time before.
             await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
         standing.config, standing.layers = woven.config, woven.layers
@@ -242,6 +242,9 @@ class Replica(Supervisor):
         roles = [one.role(leads=standing.leads) for one in woven.layers]
         standing.computes = standing.leads or all(role.computes for role in roles)
         self._server.is_lazy = not any("state_access" in one.needs for one in woven.layers)
+        server = self._server
+        if not server.is_lazy and server.tail and server.life is not None and server.life.feed is None:
+            server.capture()  # From here on, the last part is what was handled since the last point.
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         standing.forget_bricks()
         self._bind_all(woven)
@@ -279,12 +282,21 @@ class Replica(Supervisor):
         node.bind(proceed, "server", server)
         node.bind(proceed, "state", state)
         node.bind(proceed, "out", proxy)
+        brick = proceed.actor
+        assert isinstance(brick, Proceed)
+        brick.take_over()
 
     # -- orders -----------------------------------------------------------------------------------------------------
 
     @on(Assume)
     async def _assume(self, message: Assume) -> None:
-        woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=message.leads)
+        old = self._woven
+        places = weave(old.layers, leads=message.leads)
+        left = [name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]]
+        for name in left:  # What is in their mailboxes belongs to the time before.
+            await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
+        await self._end_bricks(left)  # First: the new ones have their names.
+        woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         await self._take_up(woven, leads=message.leads)
 
     @on(Prepare)
