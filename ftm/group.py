@@ -100,6 +100,7 @@ class Group:
         self.on_start_failed: Callable[[TurnEnd], None] = lambda end: None
         self.on_ended: Callable[[dict[str, Any]], None] = lambda reason: None
         self.on_joined: Callable[[], None] = lambda: None
+        self.on_joining: Callable[[str], None] = lambda name: None
 
     # -- replicas ---------------------------------------------------------------------------------------------------
 
@@ -198,7 +199,7 @@ class Group:
         cell = self.cell_of(name)
         if cell is None or cell.is_dead:
             return  # Whoever comes there looks by itself.
-        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, in whose name it is not said.
+        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, whose words it is not.
         with contextlib.suppress(HoldfastError):  # The same.
             cell.admit(cell, message)
 
