@@ -294,10 +294,13 @@ class Proceed(Brick):
         self._works.clear()
         if self._work_now is not None:
             self._standing.server.abandon()
-        return self._flush(Flush())
+        return self._flushed()
 
     @on(Flush)
     def _flush(self, message: Flush) -> Any:
+        return self._flushed()
+
+    def _flushed(self) -> ReplyHandle[None]:
         handle: ReplyHandle[None] = self.ctx.reply_handle()
         self._flushes.append(handle)
         self._go_on()
@@ -407,5 +410,3 @@ class Proceed(Brick):
         if standing.leads and not standing.is_fenced:
             # Called in the protected actor's turn: a plain `tell` would be taken for one of its own.
             self.ctx.tell(self.out._cell, Outward(standing.epoch, [record]))
-
-

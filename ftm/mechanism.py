@@ -218,7 +218,8 @@ def load(source: str | Path, *, sha256: str = "") -> type[Mechanism]:
 
 def _run(path: Path, code: bytes, digest: str) -> Any:
     """The module that this very code makes; loaded once."""
-    name = f"holdfast_mechanism_{path.stem}_{digest[:16]}"
+    place = hashlib.sha256(str(path).encode()).hexdigest()
+    name = f"holdfast_mechanism_{path.stem}_{place[:8]}_{digest[:16]}"
     module = sys.modules.get(name)
     if module is not None:
         return module

@@ -20,7 +20,7 @@ from ..checkpoint.method import Method
 from ..supervision.children import Child, new_cell
 from ..supervision.spec import Flags, Plan, child
 from ..supervision.supervisor import Supervisor
-from .bricks import FOREVER, After, Before, Brick, Proceed, Settle
+from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
 from .mechanism import Description, Mechanism, MechanismRefused, revive
 from .orders import Beat, Setting
 from .protocol import Assume, InnerProtocol, RequestProtocol
@@ -282,9 +282,9 @@ class Replica(Supervisor):
         node.bind(proceed, "server", server)
         node.bind(proceed, "state", state)
         node.bind(proceed, "out", proxy)
-        brick = proceed.actor
-        assert isinstance(brick, Proceed)
-        brick.take_over()
+        computing = proceed.actor
+        assert isinstance(computing, Proceed)
+        computing.take_over()
 
     # -- orders -----------------------------------------------------------------------------------------------------
 
@@ -321,9 +321,17 @@ class Replica(Supervisor):
         if woven is None or woven.config != message.config:
             self._prepared = woven
             return self._fail(MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared"))
+        await self._catch_up()
         await self._take_up(woven)
         self._standing.peer_turn = -2  # What the other one has is not known to the new bricks.
         return None
+
+    async def _catch_up(self) -> None:
+        """Nothing is inside the one that leads, but a follower may be behind it."""
+        names = self._woven.names
+        for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
+            await self._cell(names[slot]).ref.ask(Settle(), timeout=FOREVER)
+        await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
 
     @on(Abort)
     async def _abort(self, message: Abort) -> None:
