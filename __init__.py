@@ -4,6 +4,10 @@ Actors live in supervision trees, each in a task or in an OS process of its own.
 mailbox come back as if nothing had happened.
 """
 
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
+
 from holdfast.actors.actor import Actor, Start, on, start, subscribe
 from holdfast.actors.bindings import Binding, Unbound
 from holdfast.actors.context import ActorContext
@@ -179,6 +183,13 @@ from holdfast.system.transaction.events import (
 )
 from holdfast.system.transaction.operation import Operation, Step
 
+if TYPE_CHECKING:
+    from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
+    from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
+    from holdfast.ftm.mechanisms.lfr import LFR
+    from holdfast.ftm.mechanisms.pbr import PBR
+    from holdfast.ftm.mechanisms.tr import TR, NoMajority
+
 __all__ = [
     "Actor",
     "ActorContext",
@@ -217,6 +228,7 @@ __all__ = [
     "Crash",
     "DeadLetter",
     "DeleteChild",
+    "Diverged",
     "DynamicSupervisor",
     "Event",
     "EventStream",
@@ -240,11 +252,15 @@ __all__ = [
     "KeyFreed",
     "KeyRegistered",
     "Killed",
+    "LFR",
     "Limits",
     "LogLine",
     "LoopLagged",
     "MailboxFull",
+    "Masked",
     "MaxChildren",
+    "Mechanism",
+    "MechanismRefused",
     "Message",
     "MessageIn",
     "MessageOut",
@@ -255,6 +271,7 @@ __all__ = [
     "NOPROC",
     "NORMAL",
     "NameTaken",
+    "NoMajority",
     "NoPartitions",
     "NoProc",
     "NoRoute",
@@ -273,6 +290,7 @@ __all__ = [
     "Opaque",
     "Operation",
     "OutOfMemory",
+    "PBR",
     "PartitionSupervisor",
     "Plan",
     "PoolInfo",
@@ -286,6 +304,7 @@ __all__ = [
     "ProgramInfo",
     "ProgramInput",
     "ProgramStatus",
+    "ProtectionLost",
     "Quarantined",
     "QuarantinedMessage",
     "Recovered",
@@ -335,6 +354,7 @@ __all__ = [
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
+    "TR",
     "TaskSupervisor",
     "Tasks",
     "TerminateChild",
@@ -361,6 +381,7 @@ __all__ = [
     "check_children",
     "checkpoint_only",
     "child",
+    "compose",
     "dynamic",
     "fresh",
     "held",
@@ -386,3 +407,24 @@ __all__ = [
     "tree_from",
     "wrap",
 ]
+
+# Most programs protect nobody: what they do not use is not imported.
+_LAZY = {
+    "Diverged": "holdfast.ftm.alarms",
+    "LFR": "holdfast.ftm.mechanisms.lfr",
+    "Masked": "holdfast.ftm.alarms",
+    "Mechanism": "holdfast.ftm.mechanism",
+    "MechanismRefused": "holdfast.ftm.mechanism",
+    "NoMajority": "holdfast.ftm.mechanisms.tr",
+    "PBR": "holdfast.ftm.mechanisms.pbr",
+    "ProtectionLost": "holdfast.ftm.alarms",
+    "TR": "holdfast.ftm.mechanisms.tr",
+    "compose": "holdfast.ftm.mechanism",
+}
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _LAZY:
+        value = globals()[name] = getattr(_import_module(_LAZY[name]), name)
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

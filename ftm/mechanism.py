@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import importlib
-import importlib.metadata
 import importlib.util
 import os
 import sys
@@ -173,7 +172,9 @@ def find(name: str) -> type[Mechanism]:
     """
     if name in BUILT_IN:
         return only(importlib.import_module(f"{__package__}.mechanisms.{name}"), name)
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
+    from importlib.metadata import entry_points  # It takes longer to import than all of this package.
+
+    for point in entry_points(group=ENTRY_POINTS, name=name):
         try:
             kind = point.load()
         except Exception as error:  # It may be anything's code.
