@@ -56,6 +56,9 @@ class FailoverManager(Actor):
         group = self._group
         while not group.is_over and group.is_begun:
             if group.primary is not None and not group.is_well(group.primary):
+                if group.is_awaited(group.primary):  # To end it would lose what only it has.
+                    self._later()
+                    return
                 self._depose(group.primary)
             elif group.primary is None:
                 if not await self._replaced():
