@@ -188,7 +188,8 @@ if TYPE_CHECKING:
     from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.mechanisms.lfr import LFR
     from holdfast.ftm.mechanisms.pbr import PBR
-    from holdfast.ftm.mechanisms.tr import TR, NoMajority
+    from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.voters import NoMajority
 
 __all__ = [
     "Actor",
@@ -415,7 +416,7 @@ _LAZY = {
     "Masked": "holdfast.ftm.alarms",
     "Mechanism": "holdfast.ftm.mechanism",
     "MechanismRefused": "holdfast.ftm.mechanism",
-    "NoMajority": "holdfast.ftm.mechanisms.tr",
+    "NoMajority": "holdfast.ftm.voters",
     "PBR": "holdfast.ftm.mechanisms.pbr",
     "ProtectionLost": "holdfast.ftm.alarms",
     "TR": "holdfast.ftm.mechanisms.tr",
