@@ -157,6 +157,8 @@ class Detector(Actor):
         group.heard(beat.name, life)
 
     def _look(self) -> None:
+        if self.ctx.closed:
+            return  # This life was killed: the next one looks, and this one hears nothing any more.
         loop = self.ctx.cell.node.loop
         now = self._clock.tick(loop.time())
         for name, life in self._group.watched():
