@@ -253,7 +253,10 @@ class Cell(_Hot):
             self.host.push(self, item)
 
     def urge(self, item: Item) -> None:
-        """Put a command ahead of all messages; commands keep their order among themselves."""
+        """Put a command ahead of all messages; commands keep their order among themselves.
+
+        Between two turns only: what is left to do after a turn that was killed or raised comes first.
+        """
         if self.state is GONE:
             item.undelivered(self, "stopped")
             return
@@ -261,7 +264,13 @@ class Cell(_Hot):
         if more.urgent is None:
             more.urgent = deque()
         more.urgent.append(item)
-        mailbox.queue_of(self).appendleft(NEXT_URGENT)
+        queue = mailbox.queue_of(self)
+        front = queue[0] if queue else None
+        if isinstance(front, Item) and front.ends_turn:
+            queue[0] = NEXT_URGENT
+            queue.appendleft(front)
+        else:
+            queue.appendleft(NEXT_URGENT)
         self.schedule()
 
     def schedule(self) -> None:

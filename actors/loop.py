@@ -290,6 +290,7 @@ class TurnEnded(Item):
     """What is left to do after a suspended turn that did not simply succeed."""
 
     __slots__ = ("error", "turn")
+    is_command = ends_turn = True
 
     def __init__(self, turn: Suspended, error: BaseException | None) -> None:
         self.turn, self.error = turn, error

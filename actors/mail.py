@@ -36,6 +36,8 @@ class Item:
     """Whether it concerns one life only, and is dropped when that ends; messages stay with the address."""
     is_command: ClassVar[bool] = False
     """Whether it stands at the front of the queue for a command, ahead of all messages."""
+    ends_turn: ClassVar[bool] = False
+    """Whether it is what is left of the turn before: nothing, not even a command, comes between the two."""
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:

@@ -331,6 +331,7 @@ class Life:
             return
         actor = self.cell.actor
         assert actor is not None
+        assert self.feed is None, "a state is saved between two turns, never in the middle of one"
         begin = time.perf_counter()
         try:
             if not is_last and self.images.suits():

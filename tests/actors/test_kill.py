@@ -161,3 +161,19 @@ async def test_a_kill_while_children_are_stopped_leaves_no_child_behind(system: 
     assert await ended == hf.KILLED
     assert await child_ended == hf.KILLED
     assert system.tree() == ["/t"]
+
+
+async def test_a_stop_that_comes_when_a_turn_has_just_failed_finds_the_asker_answered(system: hf.ActorSystem) -> None:
+    """What is left to do after a turn is done before any command, or the crash would be lost with its asker."""
+    loop = asyncio.get_running_loop()
+
+    async def work(actor: Doer) -> None:
+        await asyncio.sleep(0)
+        loop.call_soon(actor.ctx.cell.request_stop)  # Comes behind this turn and ahead of the actor's next slice.
+        raise RuntimeError("boom")
+
+    ref = system.spawn(hf.start(Doer))
+    ended = ref._cell.ended()
+    with pytest.raises(hf.RemoteCrash, match="boom"):
+        await ref.ask(Do(work), timeout=5.0)
+    assert "boom" in str(await ended)

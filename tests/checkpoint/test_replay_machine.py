@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
@@ -196,7 +195,3 @@ class Recovery(RuleBasedStateMachine):
 
 TestRecovery = Recovery.TestCase
 TestRecovery.settings = settings(max_examples=60, stateful_step_count=25, deadline=None)
-# On a machine that is busy otherwise about one run in ten ends with a state that lacks what a turn after a crash
-# did (a crash, an echo, a kill, with a snapshot every half millisecond). The cause is not known yet: docs/roadmap.md.
-KNOWN = "known fault: on a busy machine a state may lack a turn after crash, echo and kill"
-TestRecovery.pytestmark = [pytest.mark.xfail(strict=False, reason=KNOWN)]  # type: ignore[attr-defined]
