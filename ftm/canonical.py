@@ -13,7 +13,7 @@ import math
 import sys
 from collections import deque
 from fractions import Fraction
-from typing import Any, Final
+from typing import Any, Final, TypeGuard
 
 import msgspec
 
@@ -159,7 +159,7 @@ def close(one: Any, other: Any, abs_: float, rel: float, seconds: float, integer
     return bool(one == other)
 
 
-def _is_number(form: object) -> bool:
+def _is_number(form: object) -> TypeGuard[float]:
     return isinstance(form, int | float | decimal.Decimal | Fraction)
 
 
