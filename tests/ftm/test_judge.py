@@ -4,6 +4,7 @@ import itertools
 import math
 from typing import Any
 
+import hypothesis
 import msgspec
 import pytest
 from hypothesis import given
@@ -224,10 +225,16 @@ def test_one_glitch_of_a_measurement_changes_nothing() -> None:
 # -- noise ----------------------------------------------------------------------------------------------------------
 
 # Most of it at its limits, where it is worst.
-noises = st.lists(st.sampled_from([-1.0, 1.0]) | st.floats(-1, 1), min_size=1, max_size=60)
+noises = st.lists(st.sampled_from([-1.0, 1.0, 0.5]) | st.floats(-1, 1), min_size=8, max_size=40)
 
 
-@given(st.floats(-2, 2), st.floats(0.01, 0.9), noises, st.sampled_from(["pbr", "lfr"]), st.sampled_from([1.0, 0.3]))
+@given(
+    st.integers(-15, 15).map(lambda tenths: tenths / 10),
+    st.integers(2, 90).map(lambda percent: percent / 100),
+    noises,
+    st.sampled_from(["pbr", "lfr"]),
+    st.sampled_from([1.0, 0.3]),
+)
 def test_noise_within_the_margin_never_makes_it_flap(
     place: float, margin: float, noise: list[float], start: str, smoothing: float
 ) -> None:
@@ -244,14 +251,20 @@ def test_noise_within_the_margin_never_makes_it_flap(
 
 @given(
     st.lists(
-        st.tuples(st.floats(0.1, 3), st.floats(0, 1e9), st.integers(1, 4), st.integers(0, 3), st.booleans()),
-        min_size=1,
-        max_size=60,
+        st.tuples(
+            st.integers(1, 6),
+            st.sampled_from([1e3, 2e5, 1e9]),
+            st.sampled_from([1, 2, 4, 4]),
+            st.integers(0, 1),
+            st.booleans(),
+        ),
+        min_size=10,
+        max_size=50,
     ),
     st.sampled_from(["pbr", "lfr", "tmr"]),
 )
 def test_however_wild_the_world_is_changes_are_a_dwell_time_apart(
-    world: list[tuple[float, float, int, int, bool]], start: str
+    world: list[tuple[int, float, int, int, bool]], start: str
 ) -> None:
     settings = Settings(required=CRASH, confirm=2, dwell=40, urgent_dwell=15, transition_cost=0.1, smoothing=1)
     one = judge((start,), settings=settings, units=4)
@@ -268,15 +281,15 @@ def test_however_wild_the_world_is_changes_are_a_dwell_time_apart(
         assert later - earlier >= (15 if is_urgent else 40)
 
 
-@given(st.lists(st.integers(0, 3), min_size=20, max_size=60))
+@hypothesis.settings(max_examples=30)
+@given(st.lists(st.integers(0, 3), min_size=20, max_size=40))
 def test_signals_that_come_and_go_do_not_flap(counts: list[int]) -> None:
     """Mismatches in any rhythm: TR is added once, and not taken away before a calm of full length."""
     app = msgspec.structs.replace(APP, state_bytes=0, request_bytes=0)
     one = judge(application=app)
-    added, removed, last = list[float](), list[float](), -math.inf
+    added, removed = list[float](), list[float]()
     for second, count in enumerate(counts):
         one.signal("mismatch", float(second), count)
-        last = second if count else last
         verdict = follow(one, float(second))
         if verdict.kind == ADAPT:
             (added if verdict.target == ("pbr", "tr") else removed).append(second)
