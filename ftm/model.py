@@ -7,7 +7,7 @@ still be covered is told beside, and is nobody's decision but the caller's (T46)
 
 A mechanism is known here by its declaration: class attributes. `Declaration` says which, and what they mean.
 
-Source: Lauer et al. 2018, *Adaptive Fault Tolerance*, section 3 and Table I, extended.
+Source: Lauer et al. 2018, *Resilient Computing on ROS using Adaptive Fault Tolerance*, section 3 and Table I, extended.
 """
 
 from __future__ import annotations

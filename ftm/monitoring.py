@@ -31,6 +31,7 @@ SIGNS: Final[Mapping[str, str]] = {
     "ActorCrashed": CRASH,
     "ProcessDied": CRASH,
     "ReplicaLost": CRASH,
+    "Masked": MISMATCH,
     "Mismatch": MISMATCH,
     "Diverged": DIVERGED,
 }
