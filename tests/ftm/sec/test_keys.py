@@ -130,3 +130,15 @@ def test_text_shows_a_fingerprint_of_the_public_half_only() -> None:
 def test_importing_holdfast_needs_no_cryptography() -> None:
     program = "import sys, holdfast, holdfast.ftm; sys.exit('cryptography' in sys.modules)"
     subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
+
+
+def test_without_the_extra_it_says_what_to_install() -> None:
+    program = (
+        "import importlib.util as finder\n"
+        "real = finder.find_spec\n"
+        "finder.find_spec = lambda name, *rest: None if name == 'cryptography' else real(name, *rest)\n"
+        "import holdfast.ftm.sec.keys\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert done.returncode == 1
+    assert "pip install 'holdfast[sec]'" in done.stderr.splitlines()[-1]
