@@ -26,8 +26,18 @@ SKEW: Final = dt.timedelta(minutes=5)
 """How far the clocks of two participants may be apart."""
 MOST_BYTES: Final = 16_384
 MOST_NAME: Final = 64
-_UNREADABLE: Final = (ValueError, TypeError, UnsupportedAlgorithm, x509.ExtensionNotFound, x509.DuplicateExtension)
-"""What reading rubbish raises: parts are read only when they are looked at."""
+_SIGNED_BY_ED25519: Final = bytes.fromhex("300506032b6570034100")
+"""DER between what is signed and an Ed25519 signature: the algorithm, and that 64 whole bytes follow."""
+_UNREADABLE: Final = (
+    ValueError,
+    TypeError,
+    UnsupportedAlgorithm,
+    x509.InvalidVersion,
+    x509.ExtensionNotFound,
+    x509.DuplicateExtension,
+    Warning,
+)
+"""What reading rubbish raises: parts are read only when they are looked at. Warnings, where these are errors."""
 
 
 class Peer(msgspec.Struct, frozen=True):
@@ -73,7 +83,9 @@ def read_request(data: bytes) -> tuple[str, bytes]:
     try:
         request = x509.load_der_x509_csr(data)
         key = request.public_key()
-        is_valid = request.is_signature_valid
+        is_valid = isinstance(key, Ed25519PublicKey) and _is_of(
+            key, data, request.tbs_certrequest_bytes, request.signature
+        )
         name = _common_name(request.subject)
     except _UNREADABLE:
         raise Rejected(MALFORMED, "a request for a certificate") from None
@@ -168,7 +180,7 @@ class Trust:
         what = "a list of revocations"
         try:
             listed = x509.load_der_x509_crl(data)
-            if not is_signed(self._key, listed.signature, listed.tbs_certlist_bytes):
+            if not _is_of(self._key, data, listed.tbs_certlist_bytes, listed.signature):
                 raise Rejected(UNTRUSTED, what)
             is_ours = listed.issuer == self._root.subject
             number = listed.extensions.get_extension_for_class(x509.CRLNumber).value.crl_number
@@ -205,7 +217,7 @@ class Trust:
         try:
             certificate = x509.load_der_x509_certificate(data)
             # First this: what the authority has not signed is not looked into.
-            if not is_signed(self._key, certificate.signature, certificate.tbs_certificate_bytes):
+            if not _is_of(self._key, data, certificate.tbs_certificate_bytes, certificate.signature):
                 raise Rejected(UNTRUSTED, "a certificate")
             key = certificate.public_key()
             subject = _common_name(certificate.subject)
@@ -238,6 +250,11 @@ class Trust:
             raise Rejected(STALE_LIST, what)
         if serial in self._revoked:
             raise Rejected(REVOKED, what)
+
+
+def _is_of(key: Ed25519PublicKey, data: bytes, content: bytes, signature: bytes) -> bool:
+    """Whether the content was signed with the key, and the bytes around it are as they must be: nothing is free."""
+    return data.endswith(content + _SIGNED_BY_ED25519 + signature) and is_signed(key, signature, content)
 
 
 def _name(name: str) -> x509.Name:
