@@ -6,6 +6,7 @@ The proxy, the detector and the failover manager act on this; the next life of e
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -105,6 +106,7 @@ class Group:
         self.on_start_failed: Callable[[TurnEnd], None] = lambda end: None
         self.on_ended: Callable[[dict[str, Any]], None] = lambda reason: None
         self.on_joined: Callable[[], None] = lambda: None
+        self.on_joining: Callable[[str], None] = lambda name: None
 
     # -- replicas ---------------------------------------------------------------------------------------------------
 
@@ -224,10 +226,9 @@ class Group:
         cell = self.cell_of(name)
         if cell is None or cell.is_dead:
             return  # Whoever comes there looks by itself.
-        try:
-            cell.ref.tell(message)
-        except HoldfastError:
-            return  # The same.
+        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, whose words it is not.
+        with contextlib.suppress(HoldfastError):  # The same.
+            cell.admit(cell, message)
 
     # -- from the home ----------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 import msgspec
 
@@ -29,6 +29,9 @@ if TYPE_CHECKING:
 
 M = TypeVar("M", bound="Mechanism")
 
+Part = Literal["before", "proceed", "after"]
+SCRIPTS = "holdfast_script_"
+"""How the modules of reconfiguration scripts are called: only the process that runs the script has them by name."""
 ENTRY_POINTS = "holdfast.mechanisms"
 BUILT_IN = ("pbr", "lfr", "tr")
 
@@ -137,7 +140,11 @@ class Mechanism:
 
 def code_of(kind: type[Any]) -> Code:
     """How another process finds a class."""
-    file, digest = getattr(sys.modules.get(kind.__module__), "__holdfast_file__", ("", ""))
+    module = sys.modules.get(kind.__module__)
+    file, digest = getattr(module, "__holdfast_file__", ("", ""))
+    if not file and kind.__module__.startswith(SCRIPTS) and getattr(module, "__file__", None):
+        file = str(getattr(module, "__file__", ""))
+        digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
     return Code(message_name(kind), file, digest)
 
 
@@ -268,7 +275,8 @@ def load_module(text: str, *, sha256: str = "") -> Any:
 
 def _run(path: Path, code: bytes, digest: str) -> Any:
     """The module that this very code makes; loaded once."""
-    name = f"holdfast_mechanism_{path.stem}_{digest[:16]}"
+    place = hashlib.sha256(str(path).encode()).hexdigest()
+    name = f"holdfast_mechanism_{path.stem}_{place[:8]}_{digest[:16]}"
     module = sys.modules.get(name)
     if module is not None:
         return module

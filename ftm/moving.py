@@ -76,6 +76,7 @@ class ToGroup(Move):
         self._home: Detached | None = None
         self._switch = self._old.switch if isinstance(self._old, TaskHost) else None
         self._rest: dict[str, Any] = {}
+        self.ending: asyncio.Future[None] | None = None  # that of the replicas, if they are not needed
 
     @property
     def is_recorded(self) -> bool:
@@ -212,8 +213,8 @@ class ToGroup(Move):
             key = f"attached.{index}"
             if queued:
                 switch.record(TICK, name, body, None, origin=key)
-            if not queued or interval > 0:
-                switch.timers.start(key, name, body, left, interval)
+            if not queued or interval:
+                switch.timers.start(key, name, body, left or 0.0, interval or 0.0)
         for item in items:
             if isinstance(item, Item) and not hasattr(item, "message"):
                 with contextlib.suppress(HoldfastError):  # What is left is of the life that ends.
@@ -237,9 +238,7 @@ class ToGroup(Move):
         cell = self.cell
         if self._take is not None:
             self._take.is_void = True
-        ended = asyncio.ensure_future(self.host.dismantle(cell))
-        self.node.remains[ended] = cell.path
-        ended.add_done_callback(lambda done: self.node.remains.pop(done, None))
+        self.ending = asyncio.ensure_future(self.host.dismantle(cell))
         if self._live.done() and not self._live.cancelled():
             self._live.exception()
         transit = self.transit
@@ -270,6 +269,7 @@ class FromGroup(Move):
         self._twin: Cell | None = None
         self._over = self._group.on_over
         self._has_fallen = False
+        self.ending: asyncio.Future[None] | None = None  # that of the replicas
 
     async def take(self) -> None:
         group = self._group
@@ -294,9 +294,7 @@ class FromGroup(Move):
         group = host.group
         if group is not None:
             group.is_over = True
-        ended = asyncio.ensure_future(host.dismantle(cell))
-        self.node.remains[ended] = cell.path
-        ended.add_done_callback(lambda done: self.node.remains.pop(done, None))
+        self.ending = asyncio.ensure_future(host.dismantle(cell))
 
     def undo(self) -> None:
         cell = self.cell
@@ -444,7 +442,7 @@ class ToPlainTask(FromGroup):
         more.stash = deque(kept) if kept else None
         for name, body, left, interval in switch.timers.saved().values():
             message = cell.node.codec.decode(cell.table.kind_named(name), body)
-            Timer.unpacked(cell, message, max(0.0, left), interval, False)
+            Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
         switch.timers.replace({})
         for ask, name, body, sender in getattr(homed, "waiting", ()):
             del name, body, sender

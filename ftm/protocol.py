@@ -90,6 +90,7 @@ class RequestProtocol(Brick):
     """The entry and exit of a replica; `next` is the Proxy."""
 
     peer_messages = (Take, Resync)
+    answers_later = True
 
     before: Binding[Actor]
     proceed: Binding[Actor]

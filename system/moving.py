@@ -215,6 +215,10 @@ class Moves:
                     raise
             else:
                 return move
+            finally:
+                ending: asyncio.Future[None] | None = getattr(move, "ending", None)
+                if ending is not None:  # The processes of replicas that are not needed.
+                    await ending
 
     def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
         """The move that brings the actor to where its spec says."""

@@ -16,8 +16,8 @@ import dataclasses
 from typing import Any, ClassVar
 
 from ...actors.message import Message
-from ..bricks import FOREVER, After
 from ..alarms import ProtectionLost
+from ..bricks import FOREVER, After
 from ..mechanism import Mechanism, Role
 from ..messages import Done, Logged, State
 from ..standing import PeerLost

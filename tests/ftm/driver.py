@@ -174,7 +174,9 @@ class Driver:
 
     def again(self) -> None:
         """After a failover: everything that has no end yet goes to the new primary, what had begun first."""
-        left = sorted((one for one in self.feeds.values() if one.id not in self.ends), key=lambda f: f.id != self.partial)
+        left = sorted(
+            (one for one in self.feeds.values() if one.id not in self.ends), key=lambda f: f.id != self.partial
+        )
         self.queue.clear()
         self.out_now = None
         go = Go(False, 0) if not any(isinstance(one, str) for one in self.more) and 0 not in self.ends else None

@@ -129,7 +129,7 @@ class Large(hf.Actor):
     """Says what has changed."""
 
     def __init__(self) -> None:
-        self.values: dict[int, int] = {key: 0 for key in range(1000)}
+        self.values: dict[int, int] = dict.fromkeys(range(1000), 0)
         self._changed: dict[int, int] = {}
 
     @hf.on(Add)

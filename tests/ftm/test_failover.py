@@ -95,7 +95,9 @@ async def test_a_protected_actor_answers_as_an_ordinary_one(system: hf.ActorSyst
 async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSystem) -> None:
     ref = await started(system)
     seen = {path.removeprefix(f"{ref.path}/ftm/") for path in system.tree() if path.startswith(f"{ref.path}/ftm/")}
-    bricks = {f"{name}/{brick}" for name in ("r1", "r2") for brick in ("protocol", "before", "proceed", "state", "beat")}
+    bricks = {
+        f"{name}/{brick}" for name in ("r1", "r2") for brick in ("protocol", "before", "proceed", "state", "beat")
+    }
     assert {*PARTS, "r1", "r2"} | bricks <= seen
 
 
@@ -165,6 +167,21 @@ async def test_the_parts_at_the_root_may_die_at_any_moment(system: hf.ActorSyste
         await two_again(ref)
     await load.stop()
     load.check(await ref.ask(Tags()))
+
+
+@pytest.mark.parametrize("method", ["hybrid", "replay_only"])
+async def test_the_supervisor_of_the_mechanism_may_die(system: hf.ActorSystem, method: str) -> None:
+    ref = await started(system, recovery=METHODS[method]())
+    load = Load(ref)
+    await load.reached(40)
+    ftm = group_of(ref).node.find(f"{ref.path}/ftm")
+    assert ftm is not None
+    ftm.kill()
+    await load.reached(40)
+    await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert ref._cell.life == 2
 
 
 STEPS = ("depose", "epoch", "kill", "lead", "bind", "peer")

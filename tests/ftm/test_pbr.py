@@ -10,7 +10,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.exits import SHUTDOWN, pack_exit
-from holdfast.checkpoint.records import OK, STASHED, Closed as LifeClosed, TurnEnd
+from holdfast.checkpoint.records import OK, STASHED, TurnEnd
+from holdfast.checkpoint.records import Closed as LifeClosed
 from holdfast.ftm.alarms import ProtectionLost
 from holdfast.ftm.bricks import Letter
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
