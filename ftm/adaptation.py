@@ -1,11 +1,11 @@
 """The adaptation engine: another stack of mechanisms for a protected actor, while requests flow (A5, A76 to A82).
 
 The bricks that are new are started in all replicas beside the old ones (prepare). Then nothing new goes in, what is
-inside comes to its end, and each replica has all that the other has sent to it (rest). Only then the replicas bind their
-bricks anew (commit); the old ones end behind that. Requests that come meanwhile wait at the home.
+inside comes to its end, and each replica has all that the other has sent to it (rest). Only then the replicas bind
+their bricks anew (commit); the old ones end behind that. Requests that come meanwhile wait at the home.
 
-What is under way stands in the group, outside this actor: it may die at any moment, and its next life goes on. Up to the
-commit a change can be given up; from there on it is carried to its end, for a replica that has changed stays so. A
+What is under way stands in the group, outside this actor: it may die at any moment, and its next life goes on. Up to
+the commit a change can be given up; from there on it is carried to its end, for a replica that has changed stays so. A
 replica that has not, though it should have, is killed, and begins again as the recipe then says.
 """
 
@@ -181,9 +181,9 @@ class AdaptationEngine(Actor):
         errors = {name: error for name, error in found.items() if error is not None}
         if errors:
             await self._wait_for_change(LOOK_AGAIN)  # If it has died, that is known soon.
-            for name, error in errors.items():
+            for name, why in errors.items():
                 if group.members.get(name) == members[name] and group.is_well(name):
-                    change.give_up(f"{name} could not prepare it: {error}")
+                    change.give_up(f"{name} could not prepare it: {why}")
             return
         change.prepared, change.epoch, change.stage = members, epoch, RESTING
 

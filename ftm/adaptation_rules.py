@@ -210,4 +210,3 @@ def _brick(code: Any, base: type[Brick]) -> type[Brick]:
         problem = f"it must define one {base.__name__}{f' called {name}' if name else ''}, and has: {known}"
         raise MechanismRefused(Path(file).name, problem)
     return kinds[0]
-

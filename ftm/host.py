@@ -169,9 +169,6 @@ class GroupHost(HomeHost):
         group.on_joining = lambda name: self._bind_all(cell, group, name)
 
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
-        start = cell.extra().start
-        assert start is not None
-        bindings = {port: target.path for port, target in cell.extra().bindings.items()}
         parts = (
             child("proxy", Start(Proxy, (group,))),
             child("detector", Start(Detector, (group,))),

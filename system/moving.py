@@ -178,11 +178,12 @@ class Moves:
                 change = await host.adapt(cell, mechanism, lambda: replace_mechanism(cell, wanted))
                 break
             except CannotAdapt:
-                if cell.life == life and host.is_up(cell) or cell.is_dead or self._node.loop.time() > end:
+                if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
                     raise
         if self._node.watched:
-            names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
-            self._node.emit(MechanismChanged(cell.path, *names, change.config, change.gone_on_at - change.rest_at))
+            was, names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
+            seconds = change.gone_on_at - change.rest_at
+            self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
 
     async def _alone(self, cell: Cell, change: Coroutine[Any, Any, None], name: str) -> None:
         """Carry out a change of where an actor lives while no other is; it comes to its end in any case."""
