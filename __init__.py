@@ -4,6 +4,10 @@ Actors live in supervision trees, each in a task or in an OS process of its own.
 mailbox come back as if nothing had happened.
 """
 
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
+
 from holdfast.actors.actor import Actor, Start, on, start, subscribe
 from holdfast.actors.bindings import Binding, Unbound
 from holdfast.actors.context import ActorContext
@@ -179,6 +183,23 @@ from holdfast.system.transaction.events import (
 )
 from holdfast.system.transaction.operation import Operation, Step
 
+if TYPE_CHECKING:
+    from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
+    from holdfast.ftm.detector import Detection
+    from holdfast.ftm.events import (
+        FailedOver,
+        MechanismAttached,
+        MechanismDetached,
+        ReplicaJoined,
+        ReplicaLost,
+        WrongSuspicion,
+    )
+    from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
+    from holdfast.ftm.mechanisms.lfr import LFR
+    from holdfast.ftm.mechanisms.pbr import PBR
+    from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.voters import NoMajority
+
 __all__ = [
     "Actor",
     "ActorContext",
@@ -217,12 +238,15 @@ __all__ = [
     "Crash",
     "DeadLetter",
     "DeleteChild",
+    "Detection",
+    "Diverged",
     "DynamicSupervisor",
     "Event",
     "EventStream",
     "ExitReason",
     "Exited",
     "Failed",
+    "FailedOver",
     "Flags",
     "GetChildSpec",
     "Held",
@@ -240,11 +264,17 @@ __all__ = [
     "KeyFreed",
     "KeyRegistered",
     "Killed",
+    "LFR",
     "Limits",
     "LogLine",
     "LoopLagged",
     "MailboxFull",
+    "Masked",
     "MaxChildren",
+    "Mechanism",
+    "MechanismAttached",
+    "MechanismDetached",
+    "MechanismRefused",
     "Message",
     "MessageIn",
     "MessageOut",
@@ -255,6 +285,7 @@ __all__ = [
     "NOPROC",
     "NORMAL",
     "NameTaken",
+    "NoMajority",
     "NoPartitions",
     "NoProc",
     "NoRoute",
@@ -273,6 +304,7 @@ __all__ = [
     "Opaque",
     "Operation",
     "OutOfMemory",
+    "PBR",
     "PartitionSupervisor",
     "Plan",
     "PoolInfo",
@@ -286,6 +318,7 @@ __all__ = [
     "ProgramInfo",
     "ProgramInput",
     "ProgramStatus",
+    "ProtectionLost",
     "Quarantined",
     "QuarantinedMessage",
     "Recovered",
@@ -302,6 +335,8 @@ __all__ = [
     "RemoteCrash",
     "ReplayDiverged",
     "ReplayPaced",
+    "ReplicaJoined",
+    "ReplicaLost",
     "ReplyHandle",
     "ResizePartitions",
     "ResizePool",
@@ -335,6 +370,7 @@ __all__ = [
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
+    "TR",
     "TaskSupervisor",
     "Tasks",
     "TerminateChild",
@@ -356,11 +392,13 @@ __all__ = [
     "WhichChildren",
     "Wrapped",
     "WrongActor",
+    "WrongSuspicion",
     "bounded",
     "calls",
     "check_children",
     "checkpoint_only",
     "child",
+    "compose",
     "dynamic",
     "fresh",
     "held",
@@ -386,3 +424,31 @@ __all__ = [
     "tree_from",
     "wrap",
 ]
+
+# Most programs protect nobody: what they do not use is not imported.
+_LAZY = {
+    "Detection": "holdfast.ftm.detector",
+    "Diverged": "holdfast.ftm.alarms",
+    "FailedOver": "holdfast.ftm.events",
+    "LFR": "holdfast.ftm.mechanisms.lfr",
+    "Masked": "holdfast.ftm.alarms",
+    "Mechanism": "holdfast.ftm.mechanism",
+    "MechanismAttached": "holdfast.ftm.events",
+    "MechanismDetached": "holdfast.ftm.events",
+    "MechanismRefused": "holdfast.ftm.mechanism",
+    "NoMajority": "holdfast.ftm.voters",
+    "PBR": "holdfast.ftm.mechanisms.pbr",
+    "ProtectionLost": "holdfast.ftm.alarms",
+    "ReplicaJoined": "holdfast.ftm.events",
+    "ReplicaLost": "holdfast.ftm.events",
+    "TR": "holdfast.ftm.mechanisms.tr",
+    "WrongSuspicion": "holdfast.ftm.events",
+    "compose": "holdfast.ftm.mechanism",
+}
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _LAZY:
+        value = globals()[name] = getattr(_import_module(_LAZY[name]), name)
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -39,7 +39,7 @@ class FailoverManager(Actor):
 
     def __init__(self, group: Group, step: Callable[[str], None] | None = None) -> None:
         self._group = group
-        self._step = step or (lambda name: None)
+        self._step = step or nothing
         self._timer: asyncio.TimerHandle | None = None
 
     def on_start(self, restored: bool) -> None:
@@ -58,6 +58,9 @@ class FailoverManager(Actor):
             if group.is_changing:
                 return  # It is short, and whoever does it wakes us.
             if group.primary is not None and not group.is_well(group.primary):
+                if group.is_awaited(group.primary):  # To end it would lose what only it has.
+                    self._later()
+                    return
                 self._depose(group.primary)
             elif group.primary is None:
                 if not await self._replaced():
@@ -183,3 +186,7 @@ async def bury(group: Group, name: str, life: int) -> None:
     else:
         worker.kill(KILLED)
         await worker.gone()
+
+
+def nothing(step: str) -> None:
+    """Nobody wants to know of the steps."""

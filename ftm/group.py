@@ -76,6 +76,7 @@ class Group:
         self.dropped: set[str] = set()  # backups that the primary still has to forget
         self.up: dict[str, int] = {}  # name to life, of those heard of
         self.suspects: dict[str, int] = {}
+        self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
         self.failovers = 0
         self.is_begun = False  # somebody has led
@@ -128,6 +129,13 @@ class Group:
         life = self.members.get(name, 0)
         return life > 0 and self.life_of(name) == life and self.suspects.get(name) != life
 
+    def is_awaited(self, name: str) -> bool:
+        """Whether a member that is suspected, and may yet be heard of again, is all there is."""
+        life = self.members.get(name, 0)
+        is_alive = life > 0 and self.life_of(name) == life
+        waited = self.node.loop.time() - self.suspected_at
+        return is_alive and not self.backups() and waited < self.detection.hopeless
+
     def backups(self) -> list[str]:
         """Those that could lead instead of the primary, in order."""
         return [name for name in self.names if name not in (self.primary, self.leading) and self.is_well(name)]
@@ -163,6 +171,7 @@ class Group:
     def suspect(self, name: str, life: int, why: str) -> None:
         """A replica is silent for too long."""
         self.suspects[name] = life
+        self.suspected_at = self.node.loop.time()
         if name in (self.primary, self.leading):
             self.why, self.noticed = why, time.monotonic()
         self.wake()

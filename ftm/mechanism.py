@@ -10,7 +10,6 @@ import copy
 import dataclasses
 import hashlib
 import importlib
-import importlib.metadata
 import importlib.util
 import os
 import sys
@@ -221,7 +220,9 @@ def find(name: str) -> type[Mechanism]:
     """
     if name in BUILT_IN:
         return only(importlib.import_module(f"{__package__}.mechanisms.{name}"), name)
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
+    from importlib.metadata import entry_points  # It takes longer to import than all of this package.
+
+    for point in entry_points(group=ENTRY_POINTS, name=name):
         try:
             kind = point.load()
         except Exception as error:  # It may be anything's code.

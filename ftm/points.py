@@ -165,6 +165,8 @@ class Points(lives.LocalHost):
         elif point is None and turn >= 0:  # Its state is lost: it begins as without recovery, and is live at once.
             first = [BeginAgain(life, "on_start")] if type(actor).on_start is not Actor.on_start else []
             self._put([*first, GoLive(life, Go(False, turn))])
+        elif has_state and type(actor).on_start is not Actor.on_start:
+            self._put(())  # `on_start(restored=True)` must have returned before anybody counts on this life.
         else:
             return
         if await self._rest() is not OVER:

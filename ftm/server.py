@@ -419,6 +419,7 @@ class Server(Points):
 
     async def go(self, go: Go) -> Live | None:
         """Replay is over: new inputs come from here on."""
+        await self.ensure()
         life = self.life
         if life is None:
             return None

@@ -95,7 +95,7 @@ class Total(hf.Actor):
         return sum(self.seen)
 
     @hf.on(Put)
-    def put(self, message: Put) -> int | None:
+    def put(self, message: Put) -> Any:
         if not self.is_open:
             self.ctx.stash()
             return None
