@@ -344,7 +344,9 @@ class Replica(Supervisor):
         gate = cell[f"{layers[0].name}.before"]
         outlet = cell[f"{layers[0].name}.after"] if is_secured else proxy
         entries = [cell[PROTOCOL if index == 0 else f"{one.name}.protocol"] for index, one in enumerate(layers)]
-        exits = [entries[0] if is_secured and index == 0 else cell[f"{one.name}.after"] for index, one in enumerate(layers)]
+        exits = [
+            entries[0] if is_secured and index == 0 else cell[f"{one.name}.after"] for index, one in enumerate(layers)
+        ]
         found += [(entries[0], "gate", gate)]
         for index, one in enumerate(layers):
             protocol, before, after = entries[index], cell[f"{one.name}.before"], cell[f"{one.name}.after"]

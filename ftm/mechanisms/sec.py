@@ -1,8 +1,8 @@
 """Secured links (SEC): what goes between proxy and replicas, and between replicas, is ciphered, signed and fresh.
 
 Fault model  somebody sits on the links: reads, alters, forges, replays, drops, delays, speaks as another.
-Guarantee    nothing can be read there; what was altered, forged, replayed, is another's or too old is refused, counted by
-             reason and told (`FrameRefused`); what was refused or lost on the way is sent again, and handled once, in order.
+Guarantee    nothing can be read there; what was altered, forged, replayed, is another's or too old is refused, counted
+             by reason and told (`FrameRefused`); what was refused or lost is sent again, and handled once, in order.
 Not covered  who sees or runs the processes; sizes and times; one who drops everything; heartbeats, and the orders with
              which the stack of mechanisms itself is changed, which are not ciphered.
 Needs        a certification authority (`CertificationAuthority`), and `pip install holdfast[sec]`.
@@ -176,7 +176,7 @@ class SEC(Mechanism):
         """Whether the extra is installed, and the directory is safe."""
         super().check(kind, where)
         try:
-            from ..sec import link  # noqa: F401, PLC0415
+            from ..sec import link  # noqa: F401
         except ImportError as error:
             raise MechanismRefused(self.name, str(error)) from error
         try:
@@ -195,7 +195,7 @@ class SEC(Mechanism):
         enrols: Callable[[], list[str]] | None = None,
     ) -> SecuredLink:
         """This participant's end of its links."""
-        from ..sec.link import Link  # noqa: PLC0415
+        from ..sec.link import Link
 
         return Link(node, address, path, self, epoch, enrols)
 

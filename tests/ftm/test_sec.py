@@ -38,7 +38,7 @@ CA = "/app/ca"
 @pytest.fixture
 async def secured(system: hf.ActorSystem) -> AsyncIterator[hf.ActorSystem]:
     await system.start(hf.child("ca", hf.start(CertificationAuthority)))
-    yield system
+    return system
 
 
 def group_of(ref: Any) -> Any:
@@ -159,9 +159,7 @@ async def test_what_is_altered_or_dropped_on_the_way_is_said_again(
     work, reason = REFUSALS[harm]
     with secured.events() as events:
         tap.strike = every(7, work)
-        replies = []
-        for n in range(20):
-            replies.append(await ref.ask(Add(n), timeout=30.0))
+        replies = [await ref.ask(Add(n), timeout=30.0) for n in range(20)]
         tap.strike = lambda path, frame: frame
         assert replies == list(range(1, 21))
         assert await ref.ask(Tags()) == list(range(20))
@@ -185,7 +183,7 @@ async def test_what_is_replayed_is_refused(secured: hf.ActorSystem, monkeypatch:
     frames = [(path, message.frame) for path, message in tap.seen if isinstance(message, Sealed)]
     assert {path.rpartition("/ftm/")[2] for path, _ in frames} >= {"proxy", "r1/protocol"}
     for path, frame in frames:
-        with pytest.raises(Refused, match="replayed|wrong_session"):
+        with pytest.raises(Refused, match=r"replayed|wrong_session"):
             await node.cell_at(path).ref.ask(Sealed(frame))
     letters = [(path, m) for path, m in tap.seen if isinstance(m, Parcel) and m.name.endswith(":Letter")]
     assert letters
