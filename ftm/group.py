@@ -368,10 +368,10 @@ class Group:
         """What left in the middle of a turn, or beside it."""
         if self._is_of_now(outward.epoch):
             for record in outward.records:
-                if isinstance(record, Released) and self.is_live and record.turn <= self.switch.turn:
-                    if not self._is_known(record.turn, record.id):
-                        self._is_behind(record.turn)
-                        return
+                is_old = isinstance(record, Released) and self.is_live and record.turn <= self.switch.turn
+                if is_old and not self._is_known(record.turn, record.id):
+                    self._is_behind(record.turn)
+                    return
                 self.switch.from_life(record)
 
     def _is_known(self, turn: int, number: int) -> bool:
