@@ -39,7 +39,7 @@ class FailoverManager(Actor):
 
     def __init__(self, group: Group, step: Callable[[str], None] | None = None) -> None:
         self._group = group
-        self._step = step or (lambda name: None)
+        self._step = step or nothing
         self._timer: asyncio.TimerHandle | None = None
 
     def on_start(self, restored: bool) -> None:
@@ -183,3 +183,7 @@ class FailoverManager(Actor):
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.ctx.cell.node.loop.call_later(AGAIN_AFTER, self._group.wake)
+
+
+def nothing(step: str) -> None:
+    """Nobody wants to know of the steps."""
