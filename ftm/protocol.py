@@ -312,10 +312,10 @@ class RequestProtocol(Brick):
     async def _bring(self, path: str) -> int:
         """Bring another replica to our state; requests wait only while that is captured."""
         standing, server = self._standing, self._standing.server
-        if standing.peer == path and standing.peer_state == "live":
-            return server.turn
         if not standing.leads:
             raise CannotJoin(path=path, why=f"{standing.path} does not lead")
+        if standing.peer == path:  # It follows anew, perhaps in another life: what it was sent has not reached it.
+            standing.set_peer(path, "joining")
         self._holds += 1
         try:
             await self._quiet()

@@ -32,7 +32,7 @@ from tests.ftm.injection import Fault, Page, recipe, unwrap, wrap_root
 REQUEST = "REQUEST"
 """In place of the message that the workload's clients send most."""
 CLIENTS = 4
-GIVE_UP = 4.0
+GIVE_UP = 3.0
 """Seconds in which an armed fault is reached, or is not on the way of this mechanism."""
 ALARMS = (FailedOver, WrongSuspicion, Diverged, Masked, ProtectionLost, ReplicaLost)
 QUICK = Detection(interval=0.02, pause=0.3)
@@ -395,12 +395,13 @@ class Campaign:
                 await whole(self.ref)
                 self.events.take()
                 load.begin()
-                spread = max(8, requests // max(1, min(most, len(faults)))) if faults else requests
+                least = min(most, len(faults))
+                spread = max(8, requests // max(1, least))
                 if not faults:
                     await load.reached(requests)
                     row.false_alarms += sum(isinstance(one, ALARMS) for one in self.events.take())
                 count = 0
-                while faults and (load.done < requests) and count < most and len(row.unreached) < 2 * len(faults):
+                while count < least or (faults and load.done < requests and count < most):
                     fault = faults[count % len(faults)]
                     count += 1
                     await self._trial(fault, max(4, spread // 3))
