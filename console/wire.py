@@ -108,7 +108,8 @@ def open_arg(arg: AnyArg) -> Any:
     if arg.of == "code":
         return unpack_recipe(arg.data).kind
     if arg.of == "mechanism":
-        return open_mechanism(decode_value(arg.data))
+        data: Any = decode_value(arg.data)
+        return open_mechanism(data)
     return unpack_function(decode_value(arg.data))
 
 
