@@ -37,6 +37,7 @@ from holdfast.actors.errors import (
     SpecError,
     StartFailed,
     StartIgnored,
+    StoreError,
     TreeFailed,
     UnknownMessage,
     WrongActor,
@@ -115,6 +116,7 @@ from holdfast.checkpoint.compared import StateDiverged
 from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.file import RecoveryFile, load_recovery
 from holdfast.checkpoint.groups import NoSuchGroup
+from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed, StoreInUse
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.checkpoint.readonly import NotReadonly
@@ -236,6 +238,7 @@ __all__ = [
     "CountChildren",
     "CountPartitions",
     "Crash",
+    "DamagedStore",
     "DeadLetter",
     "DeleteChild",
     "Detection",
@@ -359,6 +362,7 @@ __all__ = [
     "SnapshotFailed",
     "SnapshotTaken",
     "SpecError",
+    "StaleEpoch",
     "Start",
     "StartChild",
     "StartFailed",
@@ -367,6 +371,9 @@ __all__ = [
     "Statistics",
     "Status",
     "Step",
+    "StoreError",
+    "StoreFailed",
+    "StoreInUse",
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
