@@ -19,8 +19,9 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
+from .letters import Letters
 from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
-from .sealed import Back, Call, LinkLost, Part, Refused, Sealed
+from .sealed import LinkLost, Part, Refused, Sealed
 from .standing import PeerLost
 
 if TYPE_CHECKING:
@@ -76,7 +77,7 @@ class Abandon(Message[None]):
     """Drop what is being computed, and what waits to be; answered when nothing is."""
 
 
-class Brick(Actor):
+class Brick(Letters):
     """What all bricks have in common."""
 
     deterministic = False
@@ -240,32 +241,6 @@ class Brick(Actor):
         handle: ReplyHandle[bytes] = self.ctx.reply_handle()
         self.ctx.create_task(self._answer_letter(handle, message))
         return handle
-
-    async def _take_sealed(self, link: SecuredLink, frame: bytes) -> bytes | ReplyHandle[bytes]:
-        if not self.answers_later:
-            return await link.take(frame, self._read)
-        handle: ReplyHandle[bytes] = self.ctx.reply_handle()
-        self.ctx.create_task(self._answer_sealed(handle, link, frame))
-        return handle
-
-    async def _answer_sealed(self, handle: ReplyHandle[bytes], link: SecuredLink, frame: bytes) -> None:
-        try:
-            handle.reply(await link.take(frame, self._read))
-        except Refusal as no:
-            handle.fail(no)
-
-    async def _read(self, call: Call) -> Back:
-        """What was in a sealed letter."""
-        standing, codec = self._standing, self._standing.node.codec
-        try:
-            standing.check(call.epoch, call.config)
-            kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
-            if kind is None or call.stream != self.slot:
-                raise Refused(path=self.ctx.path, reason="malformed")
-            reply = await self.from_peer(codec.decode(kind, call.parts[0].body))
-        except Refusal as no:
-            return Back(*codec.encode_error(no))
-        return Back("reply", "", codec.encode(reply, self.ctx.path))
 
     async def _answer_letter(self, handle: ReplyHandle[bytes], message: Message[Any]) -> None:
         try:

@@ -22,6 +22,7 @@ from ..actors.message import Message, message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
 from .bricks import FOREVER, Abandon, Brick, Flush, Where
+from .gate import Gate
 from .messages import (
     CannotJoin,
     ConfigMismatch,
@@ -39,7 +40,7 @@ from .messages import (
     Work,
 )
 from .orders import Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
-from .sealed import Agree, Back, Greet, Opened, Refused, Sealed
+from .sealed import Refused
 from .standing import PeerLost
 
 if TYPE_CHECKING:
@@ -87,14 +88,13 @@ class InnerProtocol(Brick):
         return await self.next.ask(done, timeout=FOREVER)
 
 
-class RequestProtocol(Brick):
+class RequestProtocol(Gate):
     """The entry and exit of a replica; `next` is the Proxy."""
 
     peer_messages = (Take, Resync)
     answers_later = True
 
     before: Binding[Actor]
-    gate: Binding[Actor]
     proceed: Binding[Actor]
 
     def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
@@ -110,53 +110,6 @@ class RequestProtocol(Brick):
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
         self._later: list[Any] = []  # what goes home behind that
         self.paths: dict[str, str] = {}
-        self._is_opened = False  # what is being handled has come over a secured link
-
-    # -- a secured link ---------------------------------------------------------------------------------------------
-
-    @on(Greet)
-    def _greet(self, message: Greet) -> Any:
-        return self._to_gate(message)
-
-    @on(Agree)
-    def _agree(self, message: Agree) -> Any:
-        return self._to_gate(message)
-
-    @on(Sealed)
-    def _sealed(self, message: Sealed) -> Any:
-        return self._to_gate(message)
-
-    def _to_gate(self, message: Message[Any]) -> Any:
-        if self._standing.link is None:
-            raise Refused(path=self._standing.path, reason="closed")
-        handle = self.ctx.reply_handle()
-        self.ctx.create_task(self._passed(handle, self.gate.ask(message, timeout=FOREVER)))
-        return handle
-
-    async def _passed(self, handle: ReplyHandle[Any], asked: Awaitable[Any]) -> None:
-        try:
-            handle.reply(await asked)
-        except HoldfastError as error:
-            handle.fail(error)
-
-    @on(Opened)
-    def _opened(self, message: Opened) -> Any:
-        real = self._standing.take_opened(message.key)
-        if real is None:
-            raise Refused(path=self._standing.path, reason="forged")
-        self._is_opened = True
-        try:
-            return getattr(self, HANDLERS[type(real)])(real)
-        finally:
-            self._is_opened = False
-
-    def _admits(self) -> bool:
-        """Whether this may come as it does: with a secured link, over that only."""
-        link = self._standing.link
-        if link is None or self._is_opened:
-            return True
-        link.plain()
-        return False
 
     # -- requests ---------------------------------------------------------------------------------------------------
 
@@ -542,8 +495,4 @@ HANDLERS: dict[type[Message[Any]], str] = {
 }
 """What the root says to a replica."""
 OPENED = {message_name(kind): kind for kind in HANDLERS}
-
-
-def encode_reply(codec: Any, value: Any) -> Back:
-    """A reply, on its way over a secured link."""
-    return Back("reply", "", codec.encode(value, ""))
+RequestProtocol.handlers = HANDLERS

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import msgspec
 
 from ..actors.events import Event
 from ..actors.message import Message, Refusal
+
+if TYPE_CHECKING:
+    from ..actors.codec import Codec
 
 
 class Refused(Refusal):
@@ -83,6 +86,11 @@ class Back(msgspec.Struct, array_like=True):
     body: bytes
 
 
+def encode_reply(codec: Codec, value: object) -> Back:
+    """A reply, on its way over a secured link."""
+    return Back("reply", "", codec.encode(value, ""))
+
+
 TELLS, ORDERS = "", "order"
 """Streams: messages that want no reply, in order; asks, in no order. All others are letters between bricks."""
 
@@ -105,26 +113,34 @@ class SecuredLink(Protocol):
 
     def tell(self, path: str, message: Message[Any], reach: Reach, still: Still) -> None:
         """Bring a message there, once, behind those that were told before."""
+        ...
 
     async def call(
         self, path: str, stream: str, part: Part, reach: Reach, still: Still, epoch: int = -1, config: int = -1
     ) -> Back:
         """Ask something, until the answer comes. Raises LinkLost."""
+        ...
 
     async def take(self, frame: bytes, handle: Handle) -> bytes:
         """Open a frame, and have what is in it done once; the reply is sealed. Raises Refused."""
+        ...
 
     async def greet(self, hello: bytes) -> bytes:
         """Answer a hello. Raises Refused."""
+        ...
 
     async def agree(self, hello: bytes, finish: bytes) -> None:
         """Complete a hand-shake. Raises Refused."""
+        ...
 
     def plain(self) -> None:
         """Something came that was not sealed."""
+        ...
 
     async def ready(self) -> None:
         """Get all certificates. Raises HoldfastError."""
+        ...
 
     def close(self) -> None:
         """Nothing is sent or accepted any more."""
+        ...

@@ -30,7 +30,7 @@ from ...actors.mail import ReplyHandle
 from ..bricks import FOREVER, After, Before
 from ..mechanism import Mechanism, MechanismRefused, Role
 from ..messages import Done, Outward, Taken
-from ..sealed import ORDERS, Agree, Back, Call, Greet, LinkLost, Opened, Refused, Sealed
+from ..sealed import ORDERS, Agree, Back, Call, Greet, LinkLost, Opened, Refused, Sealed, encode_reply
 
 if TYPE_CHECKING:
     from ...actors.message import Message
@@ -77,7 +77,7 @@ class Opening(Before):
     async def _do(self, call: Call) -> Back:
         standing = self._standing
         codec = standing.node.codec
-        from ..protocol import OPENED, encode_reply
+        from ..protocol import OPENED
 
         for part in call.parts:
             message = codec.decode(OPENED[part.name], part.body)

@@ -9,7 +9,7 @@ import stat
 import subprocess
 import sys
 from collections import Counter as Counts
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ CA = "/app/ca"
 
 
 @pytest.fixture
-async def secured(system: hf.ActorSystem) -> AsyncIterator[hf.ActorSystem]:
+async def secured(system: hf.ActorSystem) -> hf.ActorSystem:
     await system.start(hf.child("ca", hf.start(CertificationAuthority)))
     return system
 
