@@ -18,6 +18,7 @@ from __future__ import annotations
 import atexit
 import dataclasses
 import functools
+import importlib
 import os
 import shutil
 import tempfile
@@ -176,7 +177,7 @@ class SEC(Mechanism):
         """Whether the extra is installed, and the directory is safe."""
         super().check(kind, where)
         try:
-            from ..sec import link  # noqa: F401
+            importlib.import_module("..sec.link", __package__)
         except ImportError as error:
             raise MechanismRefused(self.name, str(error)) from error
         try:

@@ -98,6 +98,7 @@ class Tap:
     def __init__(self) -> None:
         self.strike: Callable[[str, bytes], bytes | None] = lambda path, frame: frame
         self.seen: list[tuple[str, Any]] = []
+        self.own: set[bytes] = set()
 
     def on_replicas(self, monkeypatch: pytest.MonkeyPatch) -> Tap:
         real = Inner._admit
@@ -119,9 +120,14 @@ class Tap:
         self.seen.append((cell.path, message))
         if isinstance(message, Parcel) and message.name.endswith((":Sealed", ":Letter")):
             new: Any = self.strike(cell.path, message.body)
+            new = message.body if new is SWALLOWED else new
             item.message = None if new is None else Parcel(message.name, new)
-        elif isinstance(message, Sealed):
+        elif isinstance(message, Sealed) and message.frame not in self.own:
             new = self.strike(cell.path, message.frame)
+            if new is SWALLOWED:  # It arrives, and whoever has sent it does not hear so.
+                self.own.add(message.frame)
+                cell.ref.ask(message).add_done_callback(lambda done: done.exception())
+                return
             item.message = None if new is None else Sealed(new)
         if getattr(item, "message", item) is not None:
             go_on()
@@ -143,7 +149,12 @@ def flip(frame: bytes) -> bytes:
     return frame[:-30] + bytes([frame[-30] ^ 4]) + frame[-29:]
 
 
-REFUSALS = {"altered": (flip, "forged"), "dropped": (lambda frame: None, "")}
+SWALLOWED = b"swallowed"
+REFUSALS: dict[str, tuple[Callable[[bytes], bytes | None], str]] = {
+    "altered": (flip, "forged"),
+    "dropped": (lambda frame: None, ""),
+    "unanswered": (lambda frame: SWALLOWED, ""),
+}
 
 
 @pytest.mark.parametrize("harm", REFUSALS)
