@@ -94,6 +94,7 @@ class Brick(Actor):
         self._standing, self.mechanism, self.slot = standing, mechanism, slot
         self._sheets: dict[int, list[bytes]] = {}
         self._numbers = itertools.count(1)
+        self._sending = asyncio.Lock()
         self._handle: ReplyHandle[Any] | None = None
 
     @property
@@ -139,8 +140,11 @@ class Brick(Actor):
             if peer is None or standing.peer != peer:
                 raise PeerLost("there is none")
             try:
-                ref = await self._find_peer(peer)
-                asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
+                async with self._sending:  # In order: finding the peer takes the first one longer than the others.
+                    if standing.peer != peer:
+                        continue
+                    ref = await self._find_peer(peer)
+                    asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
                 reply = await standing.wait_for(asked)
             except (PeerLost, ConfigMismatch):
                 raise
