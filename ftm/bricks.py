@@ -184,10 +184,14 @@ class Brick(Actor):
     def _settle(self, message: Settle) -> None:
         """All that came before is done."""
 
-    def _refuses(self, epoch: int) -> bool:
-        """Whether this comes from an earlier epoch, or nothing from here counts any more."""
+    def _refuses(self, epoch: int | None = None) -> bool:
+        """Whether this comes from an earlier epoch, or nothing from here counts any more.
+
+        What the bricks of a replica say to each other is refused for the latter only: a follower that leads from now
+        on has still to compute what the last leader gave it.
+        """
         standing = self._standing
-        if epoch < standing.epoch or standing.is_fenced:
+        if standing.is_fenced or (epoch is not None and epoch < standing.epoch):
             standing.refused += 1
             return True
         return False
@@ -202,7 +206,7 @@ class Before(Brick):
 
     @on(Work)
     async def _work(self, work: Work) -> None:
-        if self._refuses(work.epoch):
+        if self._refuses():
             return
         out = await self.before(work)
         if out is not None:
@@ -227,7 +231,7 @@ class After(Brick):
     @on(Done)
     async def _done(self, done: Done) -> Any:
         self._handle = handle = self.ctx.reply_handle()
-        if not self._refuses(done.epoch):
+        if not self._refuses():
             try:
                 out = await self.after(done)
             except StaleEpoch:
@@ -267,7 +271,7 @@ class Proceed(Brick):
 
     @on(Work)
     def _take(self, work: Work) -> None:
-        if self._refuses(work.epoch):
+        if self._refuses():
             return
         self._works.append(work)
         self._go_on()
@@ -331,7 +335,7 @@ class Proceed(Brick):
                 is_live = server.life is not None and server.life.is_live
                 live = Live(0.0) if is_live else await server.go(work.go)
             server.seal(ends)
-            waits = not is_last and server.runs_alone(pending[0])
+            waits = not is_last and self.leads and server.runs_alone(pending[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
             if is_last:
                 return

@@ -11,6 +11,8 @@ from collections import deque
 from collections.abc import Awaitable, Coroutine
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ..actors.actor import on
 from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
@@ -30,6 +32,7 @@ from .messages import (
     Lead,
     Logged,
     ReplyEvicted,
+    Request,
     StaleEpoch,
     State,
     Taken,
@@ -75,7 +78,7 @@ class InnerProtocol(Brick):
 
     @on(Work)
     def _work(self, work: Work) -> None:
-        if not self._refuses(work.epoch):
+        if not self._refuses():
             self.before.tell(work)
 
     @on(Done)
@@ -99,6 +102,9 @@ class RequestProtocol(Brick):
         self._idle: list[asyncio.Future[None]] = []
         self._pieces: list[bytes] = []
         self._lock = asyncio.Lock()
+        self._marker: int | None = None  # what the last leader gave us to compute is over when this comes back
+        self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
+        self._later: list[Any] = []  # what goes home behind that
         self.paths: dict[str, str] = {}
 
     # -- requests ---------------------------------------------------------------------------------------------------
@@ -111,6 +117,8 @@ class RequestProtocol(Brick):
             return
         self._held.append(work)
         self._go_on()
+        if self._wanted is not None:
+            self._flush_known(self._wanted)
 
     def _go_on(self) -> None:
         while self._held and self._current is None and not self._holds:
@@ -122,7 +130,20 @@ class RequestProtocol(Brick):
                     one.set_result(None)
 
     def _begin(self, work: Work) -> None:
-        log, left, known = self._standing.log, [], list[TurnEnd]()
+        known, left = self._split(work)
+        goes_in = bool(left) or work.go is not None
+        if known or self._later or not goes_in:
+            more, self._later = self._later, []
+            self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in, None, more))
+        if goes_in:
+            self._standing.inside.update((one.feed.id, one) for one in left)
+            self._current = work.number
+            self.before.tell(Work(work.epoch, work.config, work.number, left, work.go, work.again))
+
+    def _split(self, work: Work) -> tuple[list[TurnEnd], list[Request]]:
+        """The outcomes that are known, in turn order, and the requests that were never handled."""
+        standing, left, known = self._standing, list[Request](), list[TurnEnd]()
+        log = standing.log
         for request in work.requests:
             number = request.feed.id
             end = log.find(number)
@@ -130,36 +151,58 @@ class RequestProtocol(Brick):
                 log.duplicates += 1
                 known.append(end)
             elif request.feed.turn < 0 and log.was_evicted(number):
-                error = ReplyEvicted(path=self._standing.address, number=number)
-                answer = Answer(*self._standing.node.codec.encode_error(error))
+                error = ReplyEvicted(path=standing.address, number=number)
+                answer = Answer(*standing.node.codec.encode_error(error))
                 known.append(TurnEnd(-1, number, DROPPED, [], answer))
             else:
                 left.append(request)
-        goes_in = bool(left) or work.go is not None
-        if known or not goes_in:
-            known.sort(key=lambda end: end.turn)
-            self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in))
-        if goes_in:
-            self._standing.inside.update((one.feed.id, one) for one in left)
-            self._current = work.number
-            self.before.tell(Work(work.epoch, work.config, work.number, left, work.go, work.again))
+        known.sort(key=lambda end: end.turn)
+        return known, left
 
     @on(Done)
     def _done(self, done: Done) -> Taken:
         standing = self._standing
-        if done.epoch < standing.epoch or standing.is_fenced:
-            standing.refused += 1
+        if self._refuses():
             return Taken()
         standing.log.add(standing.entries(done.ends))
         for end in done.ends:
             standing.inside.pop(end.id, None)
-        if standing.leads and (done.number >= 0 or done.ends or done.more):
+        if self._marker is not None:
+            self._drained(done)
+        elif standing.leads:
+            if done.epoch != standing.epoch:
+                done = msgspec.structs.replace(done, epoch=standing.epoch)
             self.next.tell(done)
         if done.is_last and done.number == self._current:
             self._current = None
             standing.inside.clear()
             self._go_on()
         return Taken()
+
+    def _drained(self, done: Done) -> None:
+        """An outcome of what the last leader gave us: home gets it, in its order, when it asks for it again."""
+        self._later += done.more
+        if done.number == self._marker:
+            self._marker = self._wanted = None
+        elif done.wait:
+            self._flush_known(done.part)
+
+    def _flush_known(self, part: int) -> None:
+        """A turn waits until home has all that came before it: that is what home asks for again and we know."""
+        self._wanted = part
+        while self._held:
+            work = self._held.popleft()
+            known, left = self._split(work)
+            waits = bool(left)
+            if known or not waits:
+                done = Done(work.epoch, work.config, work.number, known, not waits, None, [], part, waits)
+                self.next.tell(done)
+            if waits:
+                self._held.appendleft(msgspec.structs.replace(work, requests=left))
+                self._wanted = None
+                if not known:
+                    self.proceed.tell(Ended(self._standing.epoch, part))
+                return
 
     @on(Inward)
     def _inward(self, message: Inward) -> None:
@@ -222,7 +265,7 @@ class RequestProtocol(Brick):
         await self._replica().ask(Assume(True), timeout=FOREVER)
         standing.leading = epoch
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
-        self._current = marker = -2 - epoch
+        self._current = self._marker = marker = -2 - epoch
         self.before.tell(Work(epoch, standing.config, marker, []))
         server.lead()
         return server.turn
@@ -237,7 +280,7 @@ class RequestProtocol(Brick):
         standing.set_peer(None, "none")
         standing.is_fenced, standing.leading = False, -1
         self._held.clear()
-        self._current = None
+        self._current = self._marker = self._wanted = None
         standing.inside.clear()
         standing.unready()
         await self._replica().ask(Assume(False), timeout=FOREVER)

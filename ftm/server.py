@@ -210,6 +210,9 @@ class Server(lives.LocalHost):
         self._skips: dict[int, TurnEnd] = {}
         self._failed: int | None = None
         self._live: Live | None = None
+        self._missed: str | None = None
+        self._has_released = False
+        self._pending: deque[Request] = deque()
         self._resting: asyncio.Future[str] | None = None
         self._chunk = 8
         self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
@@ -275,6 +278,7 @@ class Server(lives.LocalHost):
         """The state to begin with, whenever a life is wanted; a life that runs is not touched."""
         self.point, self.marks, self.tail, self.previous = point, [], [], None
         self._point_names = None
+        self.confirmed = self.handed
         if point is not None:
             self.marks = [UNKNOWN] * len(point.deltas)
 
@@ -371,14 +375,27 @@ class Server(lives.LocalHost):
         cell.schedule()
 
     def _rest(self) -> asyncio.Future[str]:
+        """Wait for what is given to the server now."""
+        self._missed = None
+        return self._on_to_rest()
+
+    def _on_to_rest(self) -> asyncio.Future[str]:
+        """Wait on for what was given to it; it may have come to rest while nobody waited."""
         assert self.cell is not None
-        self._resting = self.cell.node.loop.create_future()
-        return self._resting
+        resting: asyncio.Future[str] = self.cell.node.loop.create_future()
+        missed, self._missed = self._missed, None
+        if missed is not None:
+            resting.set_result(missed)
+        else:
+            self._resting = resting
+        return resting
 
     def at_rest(self, why: str) -> None:
         """What was given to the server is done, or cannot go on."""
         resting, self._resting = self._resting, None
-        if resting is not None and not resting.done():
+        if resting is None:
+            self._missed = why
+        elif not resting.done():
             resting.set_result(why)
 
     def _go(self, feeds: Iterable[tuple[Feed, TurnEnd | None]]) -> asyncio.Future[str]:
@@ -396,7 +413,7 @@ class Server(lives.LocalHost):
 
     def runs_alone(self, request: Request) -> bool:
         """Whether it has to stand at the front: it may want something released before its end."""
-        if not self.standing.leads or self._is_again:
+        if self._is_again or (self.is_lazy and not self.standing.leads):
             return False
         feed = request.feed
         if feed.kind == START or (feed.kind, feed.name) in self.alone:
@@ -406,7 +423,8 @@ class Server(lives.LocalHost):
     def _next(self, pending: deque[Request]) -> list[Request]:
         """The next few that can be given to the server at once."""
         if self.runs_alone(pending[0]):
-            return [] if self.begun or self.ends or self.confirmed < self.handed else [pending.popleft()]
+            is_early = self.standing.leads and self.confirmed < self.handed
+            return [] if self.begun or self.ends or is_early else [pending.popleft()]
         chunk: list[Request] = []
         while pending and len(chunk) < self._chunk and not (chunk and self.runs_alone(pending[0])):
             chunk.append(pending.popleft())
@@ -415,7 +433,8 @@ class Server(lives.LocalHost):
     async def part(self, pending: deque[Request]) -> list[TurnEnd]:
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
         begin = time.perf_counter()
-        self.begun, self.ends, self._is_abandoned = [], [], False
+        self.begun, self.ends, self._is_abandoned, self._has_released = [], [], False, False
+        self._pending = pending
         while pending and not self.is_over:
             if self.life is None:
                 await self._begin()
@@ -434,7 +453,7 @@ class Server(lives.LocalHost):
                     self._chunk = min(256, self._chunk * 2)
                 elif now - at > PART and self._chunk > 1:
                     self._chunk //= 2
-                if now - begin > PART and not self._is_again:
+                if (now - begin > PART and not self._is_again) or self._has_released:
                     break
             elif why is UNDONE:
                 self._take_back(pending)
@@ -512,7 +531,18 @@ class Server(lives.LocalHost):
         self.released.setdefault(life.turn, []).extend(out.digest() for out in life.outs)
 
     def _let_out(self, life: ServerLife) -> None:
+        """What has left cannot be undone: the part ends with this turn, whatever was to come after it."""
         self._note_released(life)
+        self._has_released = True
+        queue, feed = mailbox.queue_of(life.cell), life.feed
+        left = set[int]()
+        for index, item in enumerate(queue):
+            if type(item) is Fed and item.life is life:
+                left.add(item.feed.id)
+                queue[index] = mailbox.NOTHING  # Not removed: the run loop has counted them.
+        if left and feed is not None:
+            self._pending.extendleft(reversed([one for one in self.begun if one.feed.id in left]))
+            self.begun = [one for one in self.begun if one.feed.id not in left]
         life.release_now()
 
     def _look(self, life: ServerLife, feed: Feed) -> None:
@@ -523,14 +553,15 @@ class Server(lives.LocalHost):
     async def _blocked(self) -> str:
         """The turn in hand waits for what it has not been allowed to send."""
         life = self.life
-        assert life is not None
-        feed = life.feed
-        assert feed is not None
-        if self.standing.leads and self.ends and self.has_access and not self._is_again:
+        feed = None if life is None else life.feed
+        if life is None or feed is None or self._missed is not None:
+            return await self._on_to_rest()  # It has its outcome meanwhile.
+        looks_at_state = self.standing.leads or not self.is_lazy  # Somebody does, when outcomes are handed over.
+        if looks_at_state and self.ends and self.has_access and not self._is_again:
             self.alone.add((feed.kind, feed.name))
             await self.drop_life()
             return UNDONE
-        resting = self._rest()
+        resting = self._on_to_rest()
         if not self._is_again:
             await self._hand_over_before(feed)
         if self.standing.leads and self.life is life and life.feed is feed and life.outs:
@@ -550,10 +581,10 @@ class Server(lives.LocalHost):
             await self.hand_over(ends, self.standing.leads)
 
     def lead(self) -> None:
-        """What waits for a release may have it now: all before it is at home, or comes from the log."""
+        """A turn that waits for an outcome may ask for it itself, when home has what comes before it."""
         life = self.life
-        if life is not None and life.feed is not None and life.outs and not self.ends:
-            self._let_out(life)
+        if life is not None and life.feed is not None and life.outs:
+            self._look(life, life.feed)
 
     # -- points -----------------------------------------------------------------------------------------------------
 

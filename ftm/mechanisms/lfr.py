@@ -27,6 +27,8 @@ from ..messages import Done, Request, Work
 from ..protocol import ResyncPeer
 from ..standing import PeerLost
 
+FORWARDED = -1
+"""In place of a batch's number: it came from the leader, and home knows nothing of it here."""
 GONE = 1e-9
 """A deadline that is over, on whatever clock."""
 
@@ -117,7 +119,7 @@ class Handling(Before):
         work = message.work
         left = [one for one in work.requests if log.find(one.feed.id) is None and one.feed.id not in standing.inside]
         standing.inside.update((one.feed.id, one) for one in left)
-        self.next.tell(Work(standing.epoch, work.config, work.number, left, work.go, work.again))
+        self.next.tell(Work(standing.epoch, work.config, FORWARDED, left, work.go, work.again))
 
 
 class Computing(Proceed, Sender):
@@ -128,7 +130,7 @@ class Computing(Proceed, Sender):
     async def heard(self, outcome: Outcome) -> None:
         """Pass on what the leader's turn has heard."""
         if self.leads and self._standing.peer is not None:
-            self.send_peer(Heard(outcome))
+            self._standing.forwarded.append(self.send_peer(Heard(outcome)))
 
     async def from_peer(self, message: Message[Any]) -> None:
         """The leader's turn has heard this."""
