@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 M = TypeVar("M", bound="Mechanism")
 
 ENTRY_POINTS = "holdfast.mechanisms"
-BUILT_IN = ("pbr", "lfr", "tr")
+BUILT_IN = ("pbr", "lfr", "tr", "ad", "rb", "nvp", "tmr")
 
 
 class MechanismRefused(HoldfastError):
@@ -108,8 +108,14 @@ class Mechanism:
         """For another process."""
         module = sys.modules.get(type(self).__module__)
         file, digest = getattr(module, "__holdfast_file__", ("", ""))
-        settings = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.init}
+        fields = [field.name for field in dataclasses.fields(self) if field.init]
+        settings = {name: _plain(getattr(self, name)) for name in fields}
         return Description(message_name(type(self)), settings, file, digest)
+
+
+def _plain(value: Any) -> Any:
+    """A setting as it travels; a mechanism that has structs among its settings takes them back as dicts."""
+    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else value
 
 
 def has_state_access(kind: type[Actor]) -> bool:

@@ -84,6 +84,20 @@ class Place(NamedTuple):
     name: str  # that it would like
 
 
+def nested(layers: tuple[Mechanism, ...]) -> tuple[Mechanism, ...]:
+    """The same layers as they are woven: assertions stand inside replication, so that no state leaves unchecked.
+
+    For whoever reads a composition they stand outside: what they check is what the replicas have come to.
+    """
+    replication = [one for one in layers if one.layer == "replication"]
+    if not replication:
+        return layers
+    moved = [one for one in layers if one.layer == "assertion"]
+    kept = [one for one in layers if one.layer != "assertion"]
+    at = kept.index(replication[-1]) + 1
+    return (*kept[:at], *moved, *kept[at:])
+
+
 def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
     """The bricks of a composition, by slot, outermost layer first.
 
@@ -129,7 +143,7 @@ class Replica(Supervisor):
         made = tuple(one if isinstance(one, Mechanism) else revive(one) for one in layers)
         for one in made:
             one.check(start.kind, setting.address)
-        self._made = made
+        self._made = nested(made)
 
     def init(self) -> Plan:
         """The protected actor and its state manager; the bricks follow."""
@@ -171,7 +185,7 @@ class Replica(Supervisor):
 
     def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Any:
         """The lives of the protected actor begin and end as the bricks want it; the end of a brick is ours."""
-        if cell.name == SERVER:
+        if cell.name == SERVER or isinstance(cell.host, Server):
             return None
         return super().child_exited(cell, life, reason)
 
@@ -292,7 +306,7 @@ class Replica(Supervisor):
         try:
             if self._prepared is not None:
                 await self._drop_prepared()
-            layers = tuple(revive(one) for one in message.layers)
+            layers = nested(tuple(revive(one) for one in message.layers))
             for one in layers:
                 one.check(self._recipe.kind, self._setting.address)
             leads = self._standing.leads

@@ -31,6 +31,7 @@ from ..checkpoint.method import Method
 from ..checkpoint.records import (
     FAILED,
     START,
+    Answer,
     Feed,
     Go,
     Ignored,
@@ -68,6 +69,7 @@ UNKNOWN: Final = -3
 OVER, BLOCKED, ENDED, UNDONE = "over", "blocked", "ended", "undone"
 
 HandOver = Callable[[list[TurnEnd], bool], Awaitable[None]]
+TurnHook = Callable[["Server", TurnEnd], TurnEnd]
 
 
 class ServerContext(RecordedContext):
@@ -94,12 +96,17 @@ class ServerLife(Life):
     def __init__(self, cell: Cell, server: Server, method: Method) -> None:
         super().__init__(cell, server, method, None)
         self.server = server
+        self.ended: Feed | None = None  # what the last turn has handled
         self.saves = server.has_access
 
     def _context(self, cell: Cell) -> RecordedContext:
         made = self._context_made = ServerContext(cell, self.server.address)
         made.recorded = self
         return made
+
+    def close_turn(self, status: str, answer: Answer) -> None:
+        self.ended = self.feed
+        super().close_turn(status, answer)
 
     def release(self) -> None:
         if self.feed is not None and self.outs:
@@ -204,6 +211,8 @@ class Server(lives.LocalHost):
         self.begun: list[Request] = []
         self.alone: set[tuple[str, str]] = set()  # inputs that have wanted to be at the front once
         self.handed = self.confirmed = 0  # parts: handed over, known to be at home
+        self.hooks: list[TurnHook] = []  # see each end while the actor is as the turn has left it; the innermost first
+        self.objections: dict[int, str] = {}  # what hooks have against turns, by number of the request
         self.hand_over: HandOver | None = None  # Proceed's, while a batch runs
         self.on_more: Callable[[], None] = lambda: None
         self.outward: Callable[[Released], None] = lambda record: None
@@ -721,13 +730,24 @@ class Server(lives.LocalHost):
         saved: Any = decode_value(point.data)
         return list(saved[2])
 
-    async def again(self) -> tuple[list[TurnEnd], State]:
+    async def again(
+        self, since: State | None = None, feeds: list[Request] | None = None
+    ) -> tuple[list[TurnEnd], State]:
         """Rewind to the point before the last part, and run that part again; returns ends and state.
 
         Nothing is handed over. Asks get the outcomes that they had.
+
+        Args:
+            since: rewind to this state instead.
+            feeds: run these requests instead.
         """
-        assert self.previous is not None
-        before, requests = self.previous
+        assert self.previous is not None or since is not None
+        previous = self.previous
+        before, requests = previous if previous is not None else (since, feeds)
+        before, requests = since or before, requests if feeds is None else feeds
+        assert before is not None
+        assert requests is not None
+        self.objections.clear()
         if self.life is None:
             self.point, self.tail = before, []
             await self._begin()
@@ -747,7 +767,7 @@ class Server(lives.LocalHost):
             await self._begin()
         self._skips.clear()
         state = self.capture()
-        self.previous = before, requests
+        self.previous = previous
         return ends, state
 
     async def back(self) -> State:
@@ -760,6 +780,13 @@ class Server(lives.LocalHost):
         else:
             self.rewind(before)
         return before
+
+    async def adopt(self, state: State) -> None:
+        """Go on from this state, with a life of its own; what led to it has happened elsewhere."""
+        live = state.live or (self.life is not None and self.life.is_live)
+        await self.drop_life()
+        self.install(msgspec.structs.replace(state, live=live))
+        await self.ensure()
 
     def skip_to(self, turn: int) -> None:
         """These numbers are used, though no turn has left anything."""
@@ -774,6 +801,9 @@ class Server(lives.LocalHost):
         """What the life says, in order."""
         match record:
             case TurnEnd():
+                if self.hooks and not self._is_quiet and record.id not in self._skips:
+                    for hook in self.hooks:
+                        record = hook(self, record)
                 if record.status == FAILED and not self._is_quiet and record.id not in self._skips:
                     self._failed = record.id
                 if not self._is_quiet:
