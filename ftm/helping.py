@@ -8,9 +8,8 @@ import msgspec
 
 from ..actors.message import Message
 from ..checkpoint.records import Outcome, TurnEnd
-from .bricks import Before
 from .messages import Logged, Request, State
-from .runs import Missing, Run, Shadow, digest_of_state
+from .runs import Missing, Remembering, Run, Shadow, digest_of_state
 
 
 class Computed(msgspec.Struct, array_like=True):
@@ -39,6 +38,7 @@ class Compute(Message[Computed]):
     requests: list[Request]
     heard: list[Outcome]
     keep: bool
+    log: list[Logged] = []
 
 
 class Settled(Message[None]):
@@ -47,7 +47,7 @@ class Settled(Message[None]):
     right: bool
 
 
-class Helping(Before):
+class Helping(Remembering):
     """A Before that computes in a shadow what the other replica asks for."""
 
     peer_messages = (Compute, Settled)
@@ -111,5 +111,5 @@ class Helping(Before):
         self._digest, self._kept = digest, run.state
         clients = {one.feed.id: (one.client, one.incarnation) for one in order.requests}
         entries: list[Logged] = [(*clients.get(end.id, ("", 0)), end.id, end) for end in run.ends]
-        standing.log.add(entries)
+        standing.log.add([*order.log, *entries])
         standing.kept = standing.epoch, run.state.turn

@@ -14,25 +14,27 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from ..actors import lives
 from ..actors.actor import Actor, Start
-from ..actors.cell import DOWN, Cell
-from ..actors.errors import HoldfastError, type_name
+from ..actors.cell import Cell
+from ..actors.errors import HoldfastError
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.values import decode_value, state_digest
 from ..checkpoint.records import CRASH, DROPPED, FAILED, Answer, Closed, Ignored, Outcome, PipeDone, Snapshot, TurnEnd
 from ..checkpoint.records import Unsaved
 from ..supervision.spec import child
-from .bricks import After
+from .bricks import After, Before
 from .canonical import canonical, end_form
-from .messages import Done, Request, State
+from .messages import Done, Request, State, Work
 from .server import Server, ServerLife
 from .voters import Agreed, AnyVoter, Undecided, _decide
 
 if TYPE_CHECKING:
-    from ..checkpoint.method import Method
     from .standing import Standing
 
 _NUMBERS: Final = itertools.count(1)
+MOST_INPUTS: Final = 4096
+"""Requests that are remembered: more than can be inside a replica."""
 
 
 class Run(msgspec.Struct):
@@ -211,8 +213,7 @@ class Shadow(Server):
         """It is not needed any more."""
         await self.drop_life()
         if self.cell is not None:
-            self.cell.node.here  # noqa: B018
-            retire(self.cell)
+            lives.retire(self.cell, SHUTDOWN)
             self.cell = None
 
     # -- nothing leaves ---------------------------------------------------------------------------------------------
@@ -248,14 +249,19 @@ class Shadow(Server):
         """None is taken."""
 
 
-def retire(cell: Cell) -> None:
-    """Give up the address of a shadow."""
-    from ..actors import lives
-
-    lives.retire(cell, SHUTDOWN)
-
-
 # -- deciding --------------------------------------------------------------------------------------------------------
+
+
+class Remembering(Before):
+    """A Before that keeps what goes in: the other runs get that, whatever has become of it further inside."""
+
+    async def before(self, work: Work) -> Work:
+        """Remember the requests of a batch."""
+        inputs = self._standing.inputs
+        inputs.update((one.feed.id, one) for one in work.requests)
+        while len(inputs) > MOST_INPUTS:
+            del inputs[next(iter(inputs))]
+        return work
 
 
 class Deciding(After):
@@ -269,6 +275,9 @@ class Deciding(After):
         """The run that is right, or why there is none. Without `first`, the actor has not run these requests yet."""
         raise NotImplementedError
 
+    async def begun(self, done: Done) -> None:
+        """Hear of the first turn, about which nothing can be decided."""
+
     async def after(self, done: Done) -> Done | None:
         """Have the part decided; what was found in place of what had come out goes on."""
         server = self._standing.server
@@ -279,10 +288,13 @@ class Deciding(After):
                 raise HoldfastError(f"{self._standing.path}: an assertion has failed while a turn waits")
             return done
         if server.previous is None:
+            await self.begun(done)
             return done  # The very first turn, `on_start`: there is nothing to begin again from.
         before, asked = server.previous
         before = msgspec.structs.replace(before, live=server.life.is_live)
         dropped = {end.id for end in done.ends if end.status == DROPPED}
+        inputs = self._standing.inputs
+        asked = [inputs.get(one.feed.id, one) for one in asked]
         requests = [one if one.feed.id in dropped else without_deadline(one) for one in asked]
         first = self._last_run(before, done.ends)
         server.objections = {}
@@ -359,11 +371,3 @@ def without_deadline(request: Request) -> Request:
     if not feed.deadline:
         return request
     return Request(request.client, request.incarnation, msgspec.structs.replace(feed, deadline=0.0))
-
-
-def class_name(kind: type) -> str:
-    """How a class is called in messages to people."""
-    return type_name(kind)
-
-
-__all__ = ["DOWN", "Deciding", "Missing", "Run", "Shadow", "digest_of_state", "turns_of", "vote"]

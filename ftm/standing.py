@@ -33,6 +33,7 @@ class Standing:
         self.is_fenced = False  # another one leads: nothing that is said here counts
         self.log = ReplyLog()
         self.inside: dict[int, Request] = {}  # requests that are being handled
+        self.inputs: dict[int, Request] = {}  # requests as they came in, for whoever runs them once more
         self.peer: str | None = None  # the path of the other replica
         self.peer_state: PeerState = "none"
         self.peer_turn = -2  # the last turn whose state it has acknowledged, -2 if that is not known

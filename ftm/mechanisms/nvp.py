@@ -25,7 +25,7 @@ from ..assertions import names_of
 from ..mechanism import Mechanism, Role
 from ..messages import Request, State
 from ..model import Cost
-from ..runs import Deciding, Run, Shadow, turns_of, vote
+from ..runs import Deciding, Remembering, Run, Shadow, turns_of, vote
 from ..versions import version
 from ..voters import AnyVoter, Majority, Median, NoMajority, Undecided
 from .rb import protected_class
@@ -87,7 +87,7 @@ class NVP(Mechanism):
     units: ClassVar[int] = 1
     layer: ClassVar[str] = "repetition"
     cost: ClassVar[Cost] = Cost(runs=3, latency=3, total=3)
-    roles: ClassVar[dict[str, Role]] = {"single": Role(after=Versions)}
+    roles: ClassVar[dict[str, Role]] = {"single": Role(before=Remembering, after=Versions)}
 
     versions: Any = ()
     voter: Any = Majority()

@@ -21,7 +21,7 @@ from ..alarms import Objected
 from ..assertions import Assertion, Inspector, names_of
 from ..mechanism import Mechanism, MechanismRefused, Role
 from ..messages import Request, State
-from ..runs import Deciding, Missing, Run, Shadow
+from ..runs import Deciding, Missing, Remembering, Run, Shadow
 from ..versions import version
 
 
@@ -101,7 +101,7 @@ class RB(Mechanism):
     cpu: ClassVar[str] = "low"
     units: ClassVar[int] = 1
     layer: ClassVar[str] = "repetition"
-    roles: ClassVar[dict[str, Role]] = {"single": Role(after=Alternating)}
+    roles: ClassVar[dict[str, Role]] = {"single": Role(before=Remembering, after=Alternating)}
 
     alternates: Any = ()
     test: Any = ()

@@ -21,7 +21,7 @@ from ...actors.errors import HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
 from ..helping import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..mechanism import Mechanism, Role
-from ..messages import Request, StaleEpoch, State
+from ..messages import Done, Request, StaleEpoch, State
 from ..model import Cost
 from ..runs import Deciding, Run, digest_of_state, turns_of, vote
 from ..standing import PeerLost
@@ -87,6 +87,13 @@ class Voting(Deciding):
         if 0 in wrong:  # The right outcomes, and the state behind them, are with the others: one of them leads.
             raise OutvotedHere(f"{standing.path} leads and was outvoted")
         return own
+
+    async def begun(self, done: Done) -> None:
+        """The others begin with the state after `on_start`."""
+        standing = self._standing
+        point = standing.server.capture()
+        order = Compute(point.turn, b"", point, [], [], True, standing.entries(done.ends))
+        await asyncio.gather(*(self._at(path, point, order) for path in self._others()))
 
     def _digest_of(self, state: State) -> bytes:
         if self._point is not state and self._point != state:
