@@ -38,6 +38,7 @@ class Compute(Message[Computed]):
     requests: list[Request]
     heard: list[Outcome]
     keep: bool
+    live: bool = True
     log: list[Logged] = []
 
 
@@ -81,6 +82,8 @@ class Helping(Remembering):
             before = self._base(order)
             if before is None:
                 return Computed([], [], None, b"", [], NEEDS_STATE)
+        if before.live != order.live:
+            before = msgspec.structs.replace(before, live=order.live)
         if self._shadow is None:
             self._shadow = Shadow(self._standing, None)
         run = await self._shadow.run(before, order.requests, order.heard)

@@ -65,7 +65,7 @@ class Asserting(Deciding):
         standing = self._standing
         if standing.peer is None:
             return "there is no other replica"
-        order = Compute(before.turn, b"", before, requests, self.heard(before), False)
+        order = Compute(before.turn, b"", before, requests, self.heard(before), False, before.live)
         try:
             done = await self.ask_at(standing.peer, "ad.before", order)
         except HoldfastError as error:

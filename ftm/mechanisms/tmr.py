@@ -17,6 +17,8 @@ import asyncio
 import dataclasses
 from typing import Any, ClassVar
 
+import msgspec
+
 from ...actors.errors import HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
 from ..helping import NEEDS_STATE, Compute, Computed, Helping, Settled
@@ -62,7 +64,7 @@ class Voting(Deciding):
         assert own.state is not None
         digest = self._digest_of(own.state)
         paths = self._others()
-        order = Compute(before.turn, base, None, requests, self.heard(before), True)
+        order = Compute(before.turn, base, None, requests, self.heard(before), True, before.live)
         computed = await asyncio.gather(*(self._at(path, before, order) for path in paths))
         others = [None if one is None else Run(one.ends, one.released, None, one.digest) for one in computed]
         runs: list[Run | None] = [Run(own.ends, own.released, None, digest), *others]
@@ -92,7 +94,7 @@ class Voting(Deciding):
         """The others begin with the state after `on_start`."""
         standing = self._standing
         point = standing.server.capture()
-        order = Compute(point.turn, b"", point, [], [], True, standing.entries(done.ends))
+        order = Compute(point.turn, b"", point, [], [], True, point.live, standing.entries(done.ends))
         await asyncio.gather(*(self._at(path, point, order) for path in self._others()))
 
     def _digest_of(self, state: State) -> bytes:
@@ -110,7 +112,7 @@ class Voting(Deciding):
             try:
                 done = await self.ask_at(path, "tmr.before", order)
                 if done.problem == NEEDS_STATE:
-                    whole = Compute(order.turn, order.base, before, order.requests, order.heard, True)
+                    whole = msgspec.structs.replace(order, state=before)
                     done = await self.ask_at(path, "tmr.before", whole)
             except StaleEpoch:
                 raise
