@@ -7,7 +7,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py))))
 
 .DEFAULT_GOAL := check
-.PHONY: demo test lint check bench build clean
+.PHONY: demo test campaign lint check bench build clean
 
 demo: $(VENV)/.demo
 	$(BIN)/holdfast demo
@@ -15,6 +15,11 @@ demo: $(VENV)/.demo
 # The tests of one file stay in one process.
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(PYTEST_ARGS)
+
+# Hours of it: every kind of end, again and again, and every safety check removed once. See docs/testing.md.
+campaign: $(VENV)/.dev
+	HOLDFAST_KILLS=10000 HOLDFAST_CUTS=5000 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
+	    tests/checkpoint/test_kills.py tests/checkpoint/sqlite/test_power.py tests/checkpoint/test_removed.py
 
 # The static part of `check`, cheapest first.
 lint: $(VENV)/.dev .link/holdfast

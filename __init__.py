@@ -4,6 +4,10 @@ Actors live in supervision trees, each in a task or in an OS process of its own.
 mailbox come back as if nothing had happened.
 """
 
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
+
 from holdfast.actors.actor import Actor, Start, on, start, subscribe
 from holdfast.actors.bindings import Binding, Unbound
 from holdfast.actors.context import ActorContext
@@ -33,6 +37,7 @@ from holdfast.actors.errors import (
     SpecError,
     StartFailed,
     StartIgnored,
+    StoreError,
     TreeFailed,
     UnknownMessage,
     WrongActor,
@@ -111,6 +116,7 @@ from holdfast.checkpoint.compared import StateDiverged
 from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.file import RecoveryFile, load_recovery
 from holdfast.checkpoint.groups import NoSuchGroup
+from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed, StoreInUse
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.checkpoint.readonly import NotReadonly
@@ -179,6 +185,23 @@ from holdfast.system.transaction.events import (
 )
 from holdfast.system.transaction.operation import Operation, Step
 
+if TYPE_CHECKING:
+    from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
+    from holdfast.ftm.detector import Detection
+    from holdfast.ftm.events import (
+        FailedOver,
+        MechanismAttached,
+        MechanismDetached,
+        ReplicaJoined,
+        ReplicaLost,
+        WrongSuspicion,
+    )
+    from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
+    from holdfast.ftm.mechanisms.lfr import LFR
+    from holdfast.ftm.mechanisms.pbr import PBR
+    from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.voters import NoMajority
+
 __all__ = [
     "Actor",
     "ActorContext",
@@ -215,14 +238,18 @@ __all__ = [
     "CountChildren",
     "CountPartitions",
     "Crash",
+    "DamagedStore",
     "DeadLetter",
     "DeleteChild",
+    "Detection",
+    "Diverged",
     "DynamicSupervisor",
     "Event",
     "EventStream",
     "ExitReason",
     "Exited",
     "Failed",
+    "FailedOver",
     "Flags",
     "GetChildSpec",
     "Held",
@@ -240,11 +267,17 @@ __all__ = [
     "KeyFreed",
     "KeyRegistered",
     "Killed",
+    "LFR",
     "Limits",
     "LogLine",
     "LoopLagged",
     "MailboxFull",
+    "Masked",
     "MaxChildren",
+    "Mechanism",
+    "MechanismAttached",
+    "MechanismDetached",
+    "MechanismRefused",
     "Message",
     "MessageIn",
     "MessageOut",
@@ -255,6 +288,7 @@ __all__ = [
     "NOPROC",
     "NORMAL",
     "NameTaken",
+    "NoMajority",
     "NoPartitions",
     "NoProc",
     "NoRoute",
@@ -273,6 +307,7 @@ __all__ = [
     "Opaque",
     "Operation",
     "OutOfMemory",
+    "PBR",
     "PartitionSupervisor",
     "Plan",
     "PoolInfo",
@@ -286,6 +321,7 @@ __all__ = [
     "ProgramInfo",
     "ProgramInput",
     "ProgramStatus",
+    "ProtectionLost",
     "Quarantined",
     "QuarantinedMessage",
     "Recovered",
@@ -302,6 +338,8 @@ __all__ = [
     "RemoteCrash",
     "ReplayDiverged",
     "ReplayPaced",
+    "ReplicaJoined",
+    "ReplicaLost",
     "ReplyHandle",
     "ResizePartitions",
     "ResizePool",
@@ -324,6 +362,7 @@ __all__ = [
     "SnapshotFailed",
     "SnapshotTaken",
     "SpecError",
+    "StaleEpoch",
     "Start",
     "StartChild",
     "StartFailed",
@@ -332,9 +371,13 @@ __all__ = [
     "Statistics",
     "Status",
     "Step",
+    "StoreError",
+    "StoreFailed",
+    "StoreInUse",
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
+    "TR",
     "TaskSupervisor",
     "Tasks",
     "TerminateChild",
@@ -356,11 +399,13 @@ __all__ = [
     "WhichChildren",
     "Wrapped",
     "WrongActor",
+    "WrongSuspicion",
     "bounded",
     "calls",
     "check_children",
     "checkpoint_only",
     "child",
+    "compose",
     "dynamic",
     "fresh",
     "held",
@@ -386,3 +431,31 @@ __all__ = [
     "tree_from",
     "wrap",
 ]
+
+# Most programs protect nobody: what they do not use is not imported.
+_LAZY = {
+    "Detection": "holdfast.ftm.detector",
+    "Diverged": "holdfast.ftm.alarms",
+    "FailedOver": "holdfast.ftm.events",
+    "LFR": "holdfast.ftm.mechanisms.lfr",
+    "Masked": "holdfast.ftm.alarms",
+    "Mechanism": "holdfast.ftm.mechanism",
+    "MechanismAttached": "holdfast.ftm.events",
+    "MechanismDetached": "holdfast.ftm.events",
+    "MechanismRefused": "holdfast.ftm.mechanism",
+    "NoMajority": "holdfast.ftm.voters",
+    "PBR": "holdfast.ftm.mechanisms.pbr",
+    "ProtectionLost": "holdfast.ftm.alarms",
+    "ReplicaJoined": "holdfast.ftm.events",
+    "ReplicaLost": "holdfast.ftm.events",
+    "TR": "holdfast.ftm.mechanisms.tr",
+    "WrongSuspicion": "holdfast.ftm.events",
+    "compose": "holdfast.ftm.mechanism",
+}
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _LAZY:
+        value = globals()[name] = getattr(_import_module(_LAZY[name]), name)
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -25,6 +25,7 @@ HoldfastError
 ├── SpecError            a child specification is not valid
 ├── UnsavableValue       a value that no snapshot can hold
 ├── DamagedValue         saved bytes that cannot be read
+├── StoreError           what must be kept could not be: StoreFailed, DamagedStore, StoreInUse, StaleEpoch
 ├── ProcessUnavailable   no OS process could be had
 ├── TreeFailed           the root supervisor gave up
 └── Refusal              a handler's typed "no" (`message.py`)
@@ -323,6 +324,10 @@ class DamagedValue(HoldfastError):
 
     def __str__(self) -> str:
         return f"a saved value cannot be read: {self.problem}; use an older one"
+
+
+class StoreError(HoldfastError):
+    """The store could not keep what must be kept, or not give it back; see `checkpoint/journal.py`."""
 
 
 class ProcessUnavailable(HoldfastError):

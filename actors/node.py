@@ -15,7 +15,7 @@ from . import lives, stopping
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
-from .errors import ActorStopped, NameTaken, NoSuchActor, SendError, SpecError, WrongActor, type_name
+from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
 from .events import DeadLetter, Event, EventHub
 from .exits import ExitReason
 from .keeper import Keeper, NothingKept
@@ -87,7 +87,7 @@ class Node(RunLoop):
         if self.watched:
             self.events.emit(DeadLetter(cell.path, message, why))
 
-    def not_taken(self, cell: Cell, message: Message[Any], error: SendError) -> None:
+    def not_taken(self, cell: Cell, message: Message[Any], error: HoldfastError) -> None:
         """A subscriber could not take what was published; one that has ended meanwhile is no subscriber any more."""
         if not isinstance(error, ActorStopped):
             self.dead_letter(cell, message, str(error))

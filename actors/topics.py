@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from .errors import ActorStopped, MailboxFull, UnknownMessage
+from .errors import ActorStopped, MailboxFull, StoreError, UnknownMessage
 
 if TYPE_CHECKING:
     from .cell import Cell
 
-NOT_TAKEN = (ActorStopped, MailboxFull, UnknownMessage)
+NOT_TAKEN = (ActorStopped, MailboxFull, StoreError, UnknownMessage)
 """Why one subscriber may not take what is published; the others get it all the same."""
 
 

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
 ACCEPTED = Answer(REPLY, "", msgspec.msgpack.encode(None))
 
 
+MARK = "ask "
+"""How the origin of an input begins that somebody's recorded turn has asked; the asker is its sender."""
+
+
 class Over:
     """Stands for the future of an ask that is over."""
 
@@ -83,6 +87,11 @@ class SwitchAsk(RelayedAsk, eq=False):
             self.switch.calls.outcome(self.turn, self.k, answer, batch)
 
 
+def origin_of(ask: SwitchAsk) -> str:
+    """How the journal of its receiver names an ask."""
+    return f"{MARK}{ask.turn}.{ask.k}"
+
+
 def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:
     """Hand an encoded outcome to whoever asks from outside recorded turns."""
     if isinstance(ask, RelayedAsk):
@@ -112,12 +121,17 @@ class Calls:
         self.sends: set[tuple[int, int]] = set()  # whose receivers have no room yet
         self.outcomes: dict[tuple[int, int], Answer] = {}  # since the last snapshot
 
-    def join(self, verb: str, turn: int, k: int) -> None:
+    def join(self, turn: int, key: int, out: Out) -> None:
         """An ask or send that was made before the crash: answered from the journal, or when its pending call is."""
+        k, rejoin = out.k, self._home.rejoin
         answer = self.outcomes.get((turn, k))
-        if answer is None and verb == "send":
+        if answer is None and out.verb == "send":
             answer = None if (turn, k) in self.sends else ACCEPTED
-        elif answer is None and (turn, k) not in self.asks:
+        elif (
+            answer is None
+            and (turn, k) not in self.asks
+            and not (rejoin is not None and rejoin.joins(self._home, turn, key, out))
+        ):
             # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
             answer = Answer(*self._home.node.codec.encode_error(AskTimeout("(unknown since the restart)", 0.0, None)))
         if answer is not None and self._home.port is not None:

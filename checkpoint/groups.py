@@ -14,11 +14,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..actors.errors import HoldfastError
-from .asks import SwitchAsk
 from .inputs import Input
 from .journal import Entry, Saved
-from .records import Out
-from .saved import FORMAT, Meta, outlasting
+from .saved import FORMAT, Meta, outlasting, owed
 
 if TYPE_CHECKING:
     from .homes import Homes
@@ -39,21 +37,6 @@ class NoSuchGroup(HoldfastError):
         return f"there is no group snapshot {self.name!r}; checkpoint_group() makes one"
 
 
-class Pending(msgspec.Struct, array_like=True, frozen=True):
-    """An ask under way between two of the group: whose turn waits, and which input it has become."""
-
-    asker: str
-    turn: int
-    k: int
-    seconds: float
-    receiver: str
-    input: int
-    is_later: bool
-    chain: list[tuple[str, int]]
-    name: str
-    body: bytes
-
-
 class Image(msgspec.Struct, array_like=True, frozen=True):
     """One home at the cut."""
 
@@ -68,7 +51,6 @@ class Group(msgspec.Struct, array_like=True, frozen=True):
     format: int
     time: float
     images: list[Image]
-    asks: list[Pending]
 
 
 class Groups:
@@ -77,7 +59,6 @@ class Groups:
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
         self._waiting: set[str] = set()  # who waits for the others of a group that is restored
-        self._asks: list[Pending] = []  # of the group that was restored last: to be joined when its homes are open
         unfinished = homes.journal.noted(RESTORING)
         if unfinished is not None:  # This process's predecessor died in the middle of it.
             self.replace(unfinished.decode())
@@ -91,7 +72,7 @@ class Groups:
             HoldfastError: one of them is not recorded, or the store refused.
         """
         homes = [self._recorded(path) for path in paths]
-        group = Group(FORMAT, self._homes.node.wall(), [_image(home) for home in homes], self._pending(homes))
+        group = Group(FORMAT, self._homes.node.wall(), [_image(home) for home in homes])
         self._homes.journal.note(_key(name), msgspec.msgpack.encode(group))
 
     def _recorded(self, path: str) -> Switch:
@@ -101,35 +82,6 @@ class Groups:
         if not home.method.replays:
             raise HoldfastError(f"{path} replays nothing: only actors with recovery=hybrid(...) can be in a group")
         return home
-
-    def _pending(self, homes: Iterable[Switch]) -> list[Pending]:
-        """Asks of the group to the group."""
-        known = {home.path: home for home in homes}
-        found: list[Pending] = []
-        for home in known.values():
-            waiting = [(source.id, source.ask, False) for source in home.open.values()]
-            waiting += [(key, ask, True) for key, ask in home.later.items()]
-            for key, ask, is_later in waiting:
-                if isinstance(ask, SwitchAsk) and ask.switch.path in known and not ask.is_over:
-                    parcel: Any = ask.message
-                    body = home.open[key].body if key in home.open else getattr(parcel, "body", b"")
-                    name = home.open[key].name if key in home.open else getattr(parcel, "name", "")
-                    asker: Switch = ask.switch
-                    found.append(
-                        Pending(
-                            asker.path,
-                            ask.turn,
-                            ask.k,
-                            ask.timeout,
-                            home.path,
-                            key,
-                            is_later,
-                            list(ask.chain),
-                            name,
-                            body,
-                        )
-                    )
-        return found
 
     # -- the way back -----------------------------------------------------------------------------------------------
 
@@ -168,6 +120,7 @@ class Groups:
             self._homes.vacate(image.path, "its group goes back to an earlier snapshot")
         for image in group.images:
             meta = msgspec.msgpack.decode(image.meta, type=Meta)
+            meta = msgspec.structs.replace(meta, time=self._homes.node.wall())  # Its timers have stood still.
             entries: list[Entry] = [tuple(_tuple(part) for part in entry) for entry in image.entries]
             if journal.durable:
                 old = [position for position, _ in journal.load(image.path).entries]
@@ -175,8 +128,9 @@ class Groups:
                 journal.cut(image.path, msgspec.msgpack.encode(fresh), old, turn=meta.turn, keep=1)
                 if entries:
                     journal.append([(image.path, entry) for entry in entries])
-            self._homes.planted[image.path] = Saved(image.meta, meta.turn, list(enumerate(entries, 1)))
-        self._asks = list(group.asks)
+            self._homes.planted[image.path] = Saved(
+                msgspec.msgpack.encode(meta), meta.turn, list(enumerate(entries, 1))
+            )
         journal.note(RESTORING, None)
 
     def _group(self, name: str) -> Group:
@@ -204,32 +158,8 @@ class Groups:
                 home.let_at()
 
     def opened(self, home: Switch) -> None:
-        """A home has its next cell: asks between it and those that are open already are joined."""
+        """A home has its next cell: it holds what waits while its group is restored."""
         home.kept_back = home.path in self._waiting
-        left: list[Pending] = []
-        for one in self._asks:
-            asker, receiver = self._homes.at(one.asker), self._homes.at(one.receiver)
-            if asker is None or receiver is None or asker.cell is None:
-                left.append(one)
-                continue
-            self._join(one, asker, receiver)
-        self._asks = left
-
-    def _join(self, one: Pending, asker: Switch, receiver: Switch) -> None:
-        out = Out(one.k, "ask", one.receiver, one.name, one.body, one.seconds)
-        assert receiver.cell is not None
-        chain = tuple((path, number) for path, number in one.chain)
-        ask = SwitchAsk.made(asker, one.turn, out, chain, receiver.cell)
-        source = receiver.open.get(one.input)
-        if one.is_later:
-            receiver.later[one.input] = ask
-        elif source is not None:
-            source.ask, source.chain = ask, chain
-            ask.started = True
-        else:
-            return
-        asker.calls.asks[one.turn, one.k] = ask
-        asker.node.deadlines.add(ask)
 
 
 def _key(name: str) -> str:
@@ -244,7 +174,15 @@ def _image(home: Switch) -> Image:
     if newest.blocks:  # They are removed when later snapshots do not need them: a group has its own copy.
         state = b"".join(part.data for part in home.images.restore(newest.blocks))
     meta = msgspec.structs.replace(
-        newest, format=FORMAT, next_id=home.next_id, timers=timers, topics=topics, state=state, blocks=[], earlier=[]
+        newest,
+        format=FORMAT,
+        next_id=home.next_id,
+        timers=timers,
+        topics=topics,
+        state=state,
+        blocks=[],
+        earlier=[],
+        owed=owed(home),
     )
     inputs = {turn.input.id: turn.input for turn in home.turns.values()} | home.open
     entries: list[Entry] = [_in(inputs[key]) for key in sorted(inputs)]

@@ -25,6 +25,7 @@ from .method import Durability, Method
 from .quarantine import PLACE, Quarantine
 from .recovery.held import hold, inlet, let_go
 from .recovery.register import Recoveries, Recovery
+from .rejoin import Rejoin
 from .rollback import roll_back
 from .switch import Switch
 
@@ -57,6 +58,7 @@ class Homes:
         if unfinished is not None:  # This process's predecessor died in the middle of it.
             self._erase_tree(unfinished.decode())
         self.groups = Groups(self)
+        self.rejoin = Rejoin(self)
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for."""
@@ -65,7 +67,9 @@ class Homes:
             switch = self._switches[cell.path] = Switch(
                 self.node, cell.path, method, self._journal_of(method), self.planted.pop(cell.path, None)
             )  # fmt: skip
-            switch.recoveries, switch.quarantine = self.recoveries, self.quarantine
+            switch.recoveries, switch.quarantine, switch.rejoin = self.recoveries, self.quarantine, self.rejoin
+            switch.cell = cell
+            self.rejoin.loaded(switch)
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
                 begin()

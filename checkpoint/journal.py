@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 
-from ..actors.errors import HoldfastError
+from ..actors.errors import StoreError
 
 if TYPE_CHECKING:
     from .segments import Segment
@@ -27,7 +27,7 @@ Entry: TypeAlias = "tuple[Primitive, ...]"
 """What the switch writes: a short `str` kind ("in", "out", "got", "end", "note"), then what that kind needs."""
 
 
-class StoreInUse(HoldfastError):
+class StoreInUse(StoreError):
     """A live process has the store open: stop it, or open with `takeover=True`."""
 
     def __init__(self, path: str, pid: int) -> None:
@@ -38,7 +38,7 @@ class StoreInUse(HoldfastError):
         return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
 
 
-class StaleEpoch(HoldfastError):
+class StaleEpoch(StoreError):
     """The store was opened by somebody else since: nothing was written; stop, for you are no longer its owner."""
 
     def __init__(self, path: str, epoch: int, current: int) -> None:
@@ -52,7 +52,7 @@ class StaleEpoch(HoldfastError):
         )
 
 
-class DamagedStore(HoldfastError):
+class DamagedStore(StoreError):
     """What was stored cannot be trusted: `address` and `position` say where, when that is known."""
 
     def __init__(self, path: str, address: str | None, position: int | None, reason: str) -> None:
@@ -71,7 +71,7 @@ class DamagedStore(HoldfastError):
         return f"{where} is damaged: {self.reason}; {remedy}"
 
 
-class StoreFailed(HoldfastError):
+class StoreFailed(StoreError):
     """The operating system or a lock refused the store: `reason` says whether trying again makes sense."""
 
     def __init__(self, path: str, reason: str) -> None:

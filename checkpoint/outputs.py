@@ -10,7 +10,7 @@ from ..actors.cell import GONE, Cell
 from ..actors.codec import Parcel
 from ..actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ..actors.mail import Envelope
-from .asks import SwitchAsk, answer_ask
+from .asks import SwitchAsk, answer_ask, origin_of
 from .inputs import Batch
 from .records import MESSAGE, Answer, Out
 from .recovery.held import Inlet, inlet
@@ -48,6 +48,8 @@ class Outputs:
                     ask, source.ask = source.ask, None
                 kind, _, name = out.name.partition("|")
                 if isinstance(ask, SwitchAsk):
+                    if home.journal.durable:
+                        batch.add(home.path, ("replied", turn, int(out.to)), home.positions_of(turn))
                     ask.give(Answer(kind, name, out.body), batch)
                 elif ask is not None:
                     batch.after.append(lambda: answer_ask(home, ask, Answer(kind, name, out.body)))
@@ -84,7 +86,7 @@ class Outputs:
         if not self._home.journal.durable:
             return
         self.kept.append(out)
-        entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval)
+        entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, self._home.node.wall())
         batch.add(self._home.path, entry, self._home.positions_of(turn))
 
     def _deliver(self, target: Cell, out: Out, batch: Batch, sender: str | None = None) -> None:
@@ -179,7 +181,7 @@ class Outputs:
         elif switch.waits(ask):
             ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, tuple(p for p, _ in chain)))), batch)
         elif switch.bound is None or switch.bound.makes_room(ask, out.name, out.body, home.path):
-            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch)
+            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
             asked.ask, asked.chain = ask, chain
             ask.started = True
             batch.after.append(lambda: switch.admitted(asked))

@@ -15,7 +15,7 @@ from ..actors.cell import ANY
 from ..actors.codec import Parcel
 from ..actors.errors import HoldfastError, NoSuchActor
 from .inputs import Batch, Input
-from .records import MESSAGE, TICK
+from .records import MESSAGE, PIPE, TICK
 
 if TYPE_CHECKING:
     from ..actors.node import Node
@@ -139,7 +139,7 @@ class Quarantine:
             raise NoSuchActor(one.address)
         batch = Batch()
         kind = MESSAGE if one.kind == TICK else one.kind  # Its timer goes its own way.
-        again = home.record(kind, one.name, one.body, one.sender, batch, "" if one.kind == TICK else one.origin)
+        again = home.record(kind, one.name, one.body, one.sender, batch, one.origin if one.kind == PIPE else "")
         self._free(one, home.journal.durable, batch)
         batch.after.append(lambda: home.admitted(again))
         batch.commit(home.journal)

@@ -8,6 +8,7 @@ import msgspec
 
 from ..actors.errors import HoldfastError
 from ..actors.events import SnapshotDamaged
+from .asks import SwitchAsk, origin_of
 from .compression import PLAIN, compressor, decompress
 from .inputs import OVERHEAD, Input, Turn
 from .journal import DamagedStore, Entry
@@ -30,6 +31,9 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     A large state is not in `state`, but in `blocks`: places in packs. `earlier` packs are needed by older snapshots.
     `codec`: how `state` is compressed, and `length` what it was before.
 
+    `time` (Unix) is when it was made, 0 in stores of before: timers have run on since. `owed`: inputs that are to be
+    answered later, with the address that has asked and their origin.
+
     `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
     were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh.
     """
@@ -47,6 +51,8 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     earlier: list[int] = []
     codec: int = PLAIN
     length: int = 0
+    time: float = 0.0
+    owed: dict[int, tuple[str, str]] = {}
 
     @property
     def has_state(self) -> bool:
@@ -84,7 +90,8 @@ def encode_meta(meta: Meta, compress: bool | int) -> bytes:
 def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> Meta:
     """A snapshot of the state after `turn`, with what the home knows at this moment."""
     timers, topics = outlasting(home)
-    return Meta(FORMAT, turn, home.next_id, stash, timers, topics, home.journal.epoch, state, turn)
+    epoch, now = home.journal.epoch, home.node.wall()
+    return Meta(FORMAT, turn, home.next_id, stash, timers, topics, epoch, state, turn, time=now, owed=owed(home))
 
 
 def cut(home: Switch, state: bytes, record: Snapshot) -> None:
@@ -115,6 +122,12 @@ def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:
             case _:
                 topics.pop(out.to, None)
     return timers, list(topics)
+
+
+def owed(home: Switch) -> dict[int, tuple[str, str]]:
+    """The asks from recorded turns that are to be answered later."""
+    asks = ((key, ask) for key, ask in home.later.items() if isinstance(ask, SwitchAsk) and not ask.is_over)
+    return {key: (ask.sender.path, origin_of(ask)) for key, ask in asks}
 
 
 def put(home: Switch, meta: Meta, keep: int) -> None:
@@ -167,8 +180,12 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
     timers: dict[str, Saved] = {}
     if newest is not None:
         meta = home.newest = newest
-        home.turn, home.next_id, home.stash, timers = meta.turn, meta.next_id, meta.stash, dict(meta.timers)
-        home.topics = dict.fromkeys(meta.topics)
+        home.turn, home.next_id, home.stash = meta.turn, meta.next_id, meta.stash
+        home.topics, home.owed = dict.fromkeys(meta.topics), dict(meta.owed)
+        timers = {
+            key: (name, body, left - elapsed(home, meta.time), interval)
+            for key, (name, body, left, interval) in meta.timers.items()
+        }
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     for source in home.open.values():
@@ -178,6 +195,11 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
             home.bytes += len(turn.input.body) + OVERHEAD
     for key, (name, body, left, interval) in timers.items():
         home.timers.start(key, name, body, max(0.0, left), interval)
+
+
+def elapsed(home: Switch, since: float) -> float:
+    """Seconds since a moment that a store of before may not have (0), by a clock that may have been set back."""
+    return max(0.0, home.node.wall() - since) if since else 0.0
 
 
 def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:
@@ -241,11 +263,19 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
         case ("drop", key):
             dropped = home.open.pop(key, None)
             home.dropped += ([] if dropped is None else dropped.positions, [position])
-        case ("op", turn, verb, key, name, body, seconds, interval):
+        case ("later", turn, key):
+            home.positions_of(turn).append(position)
+            source = home.turns[turn].input
+            if source.sender is not None:
+                home.owed[key] = (source.sender, source.origin)
+        case ("replied", turn, key):
+            home.positions_of(turn).append(position)
+            home.owed.pop(key, None)
+        case ("op", turn, verb, key, name, body, seconds, interval, *when):
             home.positions_of(turn).append(position)
             match verb:
                 case "timer":
-                    timers[key] = (name, body, seconds, interval)
+                    timers[key] = (name, body, seconds - elapsed(home, *when or (0.0,)), interval)
                 case "cancel":
                     timers.pop(key, None)
                 case "subscribe":

@@ -20,7 +20,7 @@ from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
 from .admission import submit, taken_up
 from .arrival import Arrival
-from .asks import Calls, SwitchAsk, answer_ask
+from .asks import Calls, SwitchAsk, answer_ask, origin_of
 from .bound import HomeBound
 from .compared import StateDiverged
 from .due import Due
@@ -68,6 +68,7 @@ from .timers import Timers
 if TYPE_CHECKING:
     from ..actors.node import Node
     from .recovery.register import Recoveries
+    from .rejoin import Rejoin
 
 
 class Switch:
@@ -84,6 +85,7 @@ class Switch:
         self.partial: list[int] = []  # digests of what the turn after `turn` has released
         self.partial_id = -1
         self.later: dict[int, Ask] = {}
+        self.owed: dict[int, tuple[str, str]] = {}  # as read back: asker and origin of what was to be answered later
         self.timers = Timers(self)
         self.outputs = Outputs(self)
         self.ends = Ends(self)
@@ -93,6 +95,7 @@ class Switch:
         self.inlets: dict[str, Inlet] = {}
         self.recoveries: Recoveries | None = None
         self.quarantine: Quarantine | None = None
+        self.rejoin: Rejoin | None = None
         self.waits_for_release = False  # somebody else says when the actor gets what is new
         self.replay = Replay(self)
         self.skipping = Skipping(self)
@@ -160,8 +163,9 @@ class Switch:
 
     def take(self, ask: Ask | None, name: str, body: bytes, sender: str | None) -> None:
         """Admit a message for which there is room."""
+        origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
         try:
-            source = self.record(MESSAGE, name, body, sender)
+            source = self.record(MESSAGE, name, body, sender, origin=origin)
         except HoldfastError as error:  # The store has no room, or has failed.
             if ask is None:
                 raise
@@ -237,13 +241,9 @@ class Switch:
     @property
     def is_live(self) -> bool:
         """Whether the life has caught up, even if somebody else says when it gets what is new."""
-        waits = (
-            (self.waits_for_release or self.kept_back)
-            and self.live is not None
-            and self.live.done()
-            and self.port is not None
-        )
-        return self.is_released or waits
+        waits = self.waits_for_release or self.kept_back
+        caught_up = self.port is not None and self.live is not None and self.live.done()
+        return self.is_released or (waits and caught_up)
 
     @property
     def state_turn(self) -> int:
@@ -435,7 +435,7 @@ class Switch:
                     raise ReplayDiverged(self.path, turn, out.k)
                 self._replay_k = out.k
                 if out.verb in ("ask", "send"):
-                    self.calls.join(out.verb, turn, out.k)
+                    self.calls.join(turn, key, out)
             elif ended:
                 raise ReplayDiverged(self.path, turn, out.k)
             else:
@@ -465,6 +465,8 @@ class Switch:
         if end.answer.kind == LATER:
             if source.ask is not None:
                 self.later[end.id] = source.ask
+                if self.journal.durable and isinstance(source.ask, SwitchAsk):
+                    batch.add(self.path, ("later", end.turn, end.id), self.positions_of(end.turn))
         elif end.status != STASHED:
             self.give(source, end.answer, batch)
         batch.commit(self.journal)

@@ -16,7 +16,7 @@ from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.mail import ReplyHandle
-from ..actors.message import Message, message_name
+from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
 from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
@@ -78,6 +78,9 @@ class Brick(Actor):
     deterministic = False
     peer_messages: ClassVar[tuple[type[Message[Any]], ...]] = ()
     """What `from_peer` understands."""
+
+    answers_later: ClassVar[bool] = False
+    """Whether other messages are handled while `from_peer` waits for something."""
 
     next: Binding[Actor]
     peer: Binding[Actor]
@@ -194,7 +197,7 @@ class Brick(Actor):
         self._sheets.setdefault(message.sheets, []).append(message.data)
 
     @on(Letter)
-    async def _take_letter(self, letter: Letter) -> bytes:
+    async def _take_letter(self, letter: Letter) -> bytes | ReplyHandle[bytes]:
         sheets = self._sheets.pop(letter.sheets, []) if letter.sheets else []
         standing = self._standing
         standing.check(letter.epoch, letter.config)
@@ -202,8 +205,18 @@ class Brick(Actor):
         if kind is None:
             raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")
         codec = standing.node.codec
-        reply = await self.from_peer(codec.decode(kind, b"".join(sheets) if sheets else letter.body))
-        return codec.encode(reply, self.ctx.path)
+        message = codec.decode(kind, b"".join(sheets) if sheets else letter.body)
+        if not self.answers_later:
+            return codec.encode(await self.from_peer(message), self.ctx.path)
+        handle: ReplyHandle[bytes] = self.ctx.reply_handle()
+        self.ctx.create_task(self._answer_letter(handle, message))
+        return handle
+
+    async def _answer_letter(self, handle: ReplyHandle[bytes], message: Message[Any]) -> None:
+        try:
+            handle.reply(self._standing.node.codec.encode(await self.from_peer(message), self.ctx.path))
+        except Refusal as no:
+            handle.fail(no)
 
     @on(Settle)
     def _settle(self, message: Settle) -> None:
@@ -282,8 +295,8 @@ class Proceed(Brick):
         self._flushes: list[ReplyHandle[None]] = []
         self._work_now: Work | None = None
 
-    def on_start(self, restored: bool) -> None:
-        """The server reports here from now on."""
+    def take_over(self) -> None:
+        """The server reports here from now on. (Not from the start: a brick that is only prepared must not hear it.)"""
         server = self._standing.server
         server.on_more = self._go_on
         server.outward = self._outward
@@ -306,10 +319,13 @@ class Proceed(Brick):
         self._works.clear()
         if self._work_now is not None:
             self._standing.server.abandon()
-        return self._flush(Flush())
+        return self._flushed()
 
     @on(Flush)
     def _flush(self, message: Flush) -> Any:
+        return self._flushed()
+
+    def _flushed(self) -> ReplyHandle[None]:
         handle: ReplyHandle[None] = self.ctx.reply_handle()
         self._flushes.append(handle)
         self._go_on()
@@ -419,5 +435,3 @@ class Proceed(Brick):
         if standing.leads and not standing.is_fenced:
             # Called in the protected actor's turn: a plain `tell` would be taken for one of its own.
             self.ctx.tell(self.out._cell, Outward(standing.epoch, [record]))
-
-

@@ -9,7 +9,8 @@ from itertools import combinations
 import msgspec
 
 from .application import Application
-from .model import FAULTS, NEEDS, Choice, Entry, Faults, Mechanisms, Resources, label, select
+from .declaration import FAULTS, NEEDS, Entry, Mechanisms
+from .model import Choice, Faults, Resources, label, select
 
 
 def built_in_mechanisms() -> Mechanisms:

@@ -38,15 +38,17 @@ class Detection:
             they did before.
         pause: seconds of silence that are always acceptable, besides what the heartbeats so far let expect.
         spread: the least standard deviation that is reckoned with, in seconds.
+        hopeless: seconds after which even a replica is given up that nobody could take over from.
     """
 
     interval: float = 0.05
     threshold: float = 8.0
-    pause: float = 0.25
+    pause: float = 0.5
     spread: float = 0.01
+    hopeless: float = 10.0
 
     def __post_init__(self) -> None:
-        for name in ("interval", "threshold", "spread"):
+        for name in ("interval", "threshold", "spread", "hopeless"):
             value = getattr(self, name)
             if not _number(value) or not 0 < value < math.inf:
                 raise SpecError("Detection", f"{name} must be a finite number > 0, not {value!r}")
@@ -155,6 +157,8 @@ class Detector(Actor):
         group.heard(beat.name, life)
 
     def _look(self) -> None:
+        if self.ctx.closed:
+            return  # This life was killed: the next one looks, and this one hears nothing any more.
         loop = self.ctx.cell.node.loop
         now = self._clock.tick(loop.time())
         for name, life in self._group.watched():

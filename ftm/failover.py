@@ -39,7 +39,7 @@ class FailoverManager(Actor):
 
     def __init__(self, group: Group, step: Callable[[str], None] | None = None) -> None:
         self._group = group
-        self._step = step or (lambda name: None)
+        self._step = step or nothing
         self._timer: asyncio.TimerHandle | None = None
 
     def on_start(self, restored: bool) -> None:
@@ -56,6 +56,9 @@ class FailoverManager(Actor):
         group = self._group
         while not group.is_over and group.is_begun:
             if group.primary is not None and not group.is_well(group.primary):
+                if group.is_awaited(group.primary):  # To end it would lose what only it has.
+                    self._later()
+                    return
                 self._depose(group.primary)
             elif group.primary is None:
                 if not await self._replaced():
@@ -180,3 +183,7 @@ class FailoverManager(Actor):
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.ctx.cell.node.loop.call_later(AGAIN_AFTER, self._group.wake)
+
+
+def nothing(step: str) -> None:
+    """Nobody wants to know of the steps."""

@@ -6,6 +6,7 @@ The proxy, the detector and the failover manager act on this; the next life of e
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -74,6 +75,7 @@ class Group:
         self.dropped: set[str] = set()  # backups that the primary still has to forget
         self.up: dict[str, int] = {}  # name to life, of those heard of
         self.suspects: dict[str, int] = {}
+        self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
         self.failovers = 0
         self.is_begun = False  # somebody has led
@@ -99,6 +101,7 @@ class Group:
         self.on_start_failed: Callable[[TurnEnd], None] = lambda end: None
         self.on_ended: Callable[[dict[str, Any]], None] = lambda reason: None
         self.on_joined: Callable[[], None] = lambda: None
+        self.on_joining: Callable[[str], None] = lambda name: None
 
     # -- replicas ---------------------------------------------------------------------------------------------------
 
@@ -119,6 +122,13 @@ class Group:
         """Whether a member is the one that was taken in, and nobody suspects it."""
         life = self.members.get(name, 0)
         return life > 0 and self.life_of(name) == life and self.suspects.get(name) != life
+
+    def is_awaited(self, name: str) -> bool:
+        """Whether a member that is suspected, and may yet be heard of again, is all there is."""
+        life = self.members.get(name, 0)
+        is_alive = life > 0 and self.life_of(name) == life
+        waited = self.node.loop.time() - self.suspected_at
+        return is_alive and not self.backups() and waited < self.detection.hopeless
 
     def backups(self) -> list[str]:
         """Those that could lead instead of the primary, in order."""
@@ -155,6 +165,7 @@ class Group:
     def suspect(self, name: str, life: int, why: str) -> None:
         """A replica is silent for too long."""
         self.suspects[name] = life
+        self.suspected_at = self.node.loop.time()
         if name in (self.primary, self.leading):
             self.why, self.noticed = why, time.monotonic()
         self.wake()
@@ -197,10 +208,9 @@ class Group:
         cell = self.cell_of(name)
         if cell is None or cell.is_dead:
             return  # Whoever comes there looks by itself.
-        try:
-            cell.ref.tell(message)
-        except HoldfastError:
-            return  # The same.
+        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, whose words it is not.
+        with contextlib.suppress(HoldfastError):  # The same.
+            cell.admit(cell, message)
 
     # -- from the home ----------------------------------------------------------------------------------------------
 

@@ -19,6 +19,7 @@ from ..actors.control.orders import ReplaceCode, ReplaceState, Resume, Suspend
 from ..actors.errors import ControlFailed, HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
+from ..actors.process import frames
 from ..actors.process.remote import ProcessHost
 from ..checkpoint.homes import HomeHost, Homes, parent_ended, seen
 from ..checkpoint.method import Method
@@ -160,6 +161,7 @@ class GroupHost(HomeHost):
         group.on_start_failed = lambda end: self._start_failed(cell, end)
         group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
         group.on_joined = self._has_joined
+        group.on_joining = lambda name: self._bind_all(cell, group, name)
 
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
         start = cell.extra().start
@@ -182,7 +184,7 @@ class GroupHost(HomeHost):
                     tuple(layer.describe() for layer in self.layers),
                 ),
                 isolation="process",
-                backoff=Backoff(initial=0.0, maximum=2.0, reset_after=5.0),
+                backoff=Backoff(initial=0.01, maximum=2.0, reset_after=5.0),
             )
             for name in group.names
         )  # fmt: skip
@@ -416,7 +418,23 @@ class GroupHost(HomeHost):
         group.poke()
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        """Links and monitors are the home's; a binding is known to the replicas from their next life on."""
+        """Links and monitors are the home's; a binding is that of the actor in each replica."""
+        group = self.group
+        if verb == "bind" and group is not None:
+            for name in group.names:
+                self._bind(group, name, data)
+
+    def _bind(self, group: Group, name: str, data: dict[str, Any]) -> None:
+        cell = group.cell_of(name)
+        worker = cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None
+        if worker is not None and group.life_of(name):
+            to = worker.connection.name_out(group.place(f"{name}/server"))
+            worker.connection.send(frames.Command(to, "bind", data))
+
+    def _bind_all(self, cell: Cell, group: Group, name: str) -> None:
+        """A replica that was started again: what was bound since the first start."""
+        for port, target in cell.extra().bindings.items():
+            self._bind(group, name, {"port": port, "target": target.path})
 
     def running(self, cell: Cell) -> int:
         return -1 if self.group is None else self.group.only_suspect_input()

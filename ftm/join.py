@@ -64,6 +64,7 @@ class Joiner(Actor):
     async def _join(self, primary: str, name: str, life: int) -> None:
         group, epoch, begin = self._group, self._group.epoch, time.monotonic()
         await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
+        group.on_joining(name)
         turn = await group.protocol(primary).ask(Join(epoch, group.place(name)), JOINED_WITHIN)
         if group.epoch != epoch or group.primary != primary or group.life_of(name) != life or group.is_over:
             return  # It has caught up with one that does not lead any more.

@@ -15,11 +15,10 @@ from typing import Any, Final
 import msgspec
 
 from .application import Application
+from .declaration import Entry, Mechanisms
 from .model import (
     Choice,
-    Entry,
     Faults,
-    Mechanisms,
     Pricing,
     Refused,
     Resources,

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import importlib
-import importlib.metadata
 import importlib.util
 import os
 import sys
@@ -179,7 +178,9 @@ def find(name: str) -> type[Mechanism]:
     """
     if name in BUILT_IN:
         return only(importlib.import_module(f"{__package__}.mechanisms.{name}"), name)
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS, name=name):
+    from importlib.metadata import entry_points  # It takes longer to import than all of this package.
+
+    for point in entry_points(group=ENTRY_POINTS, name=name):
         try:
             kind = point.load()
         except Exception as error:  # It may be anything's code.
@@ -224,7 +225,8 @@ def load(source: str | Path, *, sha256: str = "") -> type[Mechanism]:
 
 def _run(path: Path, code: bytes, digest: str) -> Any:
     """The module that this very code makes; loaded once."""
-    name = f"holdfast_mechanism_{path.stem}_{digest[:16]}"
+    place = hashlib.sha256(str(path).encode()).hexdigest()
+    name = f"holdfast_mechanism_{path.stem}_{place[:8]}_{digest[:16]}"
     module = sys.modules.get(name)
     if module is not None:
         return module

@@ -96,7 +96,7 @@ class Done(Message[Taken]):
     ends: list[TurnEnd]
     is_last: bool
     live: Live | None = None
-    more: list[PipeDone | Snapshot | Unsaved | Closed | Ignored] = []
+    more: list[PipeDone | Snapshot | Unsaved | Closed | Ignored] = []  # noqa: RUF012  # a struct copies it
     part: int = 0
     wait: bool = False
 

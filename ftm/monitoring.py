@@ -22,6 +22,15 @@ from ..actors.actor import Actor, on
 from ..actors.events import Event, EventHub, EventStream
 from ..actors.message import Message
 from ..actors.ref import ActorRef
+from .adaptations import (
+    AdaptationDecided,
+    AdaptationDone,
+    AdaptationFailed,
+    AdaptationHeld,
+    AdaptationWithdrawn,
+    MonitoringBlind,
+    NothingValid,
+)
 from .application import Application
 from .judge import ADAPT, HOLD, NONE, STAY, Judge, Readings, Verdict
 from .model import Choice, Faults, Resources, choice_of, label
@@ -31,69 +40,11 @@ SIGNS: Final[Mapping[str, str]] = {
     "ActorCrashed": CRASH,
     "ProcessDied": CRASH,
     "ReplicaLost": CRASH,
+    "Masked": MISMATCH,
     "Mismatch": MISMATCH,
     "Diverged": DIVERGED,
 }
 """Events, by the name of their class, and the kind of sign they are. One fault may leave several signs."""
-
-
-# -- what it tells ---------------------------------------------------------------------------------------------------
-
-
-class AdaptationDecided(Event, frozen=True, eq=False):
-    """The mechanism is to be changed. In `notice` seconds, unless a person objects to decision `number`."""
-
-    number: int
-    current: tuple[str, ...]
-    target: tuple[str, ...]
-    reason: str
-    is_urgent: bool
-    notice: float
-
-
-class AdaptationHeld(Event, frozen=True, eq=False):
-    """The mechanism would be changed, but not yet, or a person does not want it."""
-
-    current: tuple[str, ...]
-    target: tuple[str, ...]
-    reason: str
-
-
-class NothingValid(Event, frozen=True, eq=False):
-    """No mechanism suits what there is: the present one goes on, and is not enough. `degraded` are ways to go on."""
-
-    current: tuple[str, ...]
-    reason: str
-    degraded: tuple[str, ...]
-
-
-class AdaptationDone(Event, frozen=True, eq=False):
-    """A decision was carried out."""
-
-    number: int
-    current: tuple[str, ...]
-
-
-class AdaptationFailed(Event, frozen=True, eq=False):
-    """A decision could not be carried out: the mechanism is the one before."""
-
-    number: int
-    target: tuple[str, ...]
-    reason: str
-
-
-class AdaptationWithdrawn(Event, frozen=True, eq=False):
-    """A decision that was announced is not carried out."""
-
-    number: int
-    target: tuple[str, ...]
-    reason: str
-
-
-class MonitoringBlind(Event, frozen=True, eq=False):
-    """Something could not be seen: a measurement failed, or so many events came that some were missed."""
-
-    reason: str
 
 
 # -- what it is told -------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ import msgspec
 
 from ..actors.actor import on
 from ..actors.bindings import Binding
-from ..actors.errors import HoldfastError
+from ..actors.errors import ActorStopped, HoldfastError
 from ..actors.exits import unpack_exit
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message
@@ -90,6 +90,7 @@ class RequestProtocol(Brick):
     """The entry and exit of a replica; `next` is the Proxy."""
 
     peer_messages = (Take, Resync)
+    answers_later = True
 
     before: Binding[Actor]
     proceed: Binding[Actor]
@@ -226,6 +227,9 @@ class RequestProtocol(Brick):
                 handle.reply(await work)
             except HoldfastError as error:
                 handle.fail(error)
+            except BaseException:
+                handle.fail(ActorStopped(self._standing.path))  # We end: nobody must wait for us.
+                raise
 
     async def _quiet(self) -> None:
         """Wait until nothing is inside. Whoever calls has raised `_holds`."""

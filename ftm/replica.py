@@ -20,7 +20,7 @@ from ..checkpoint.method import Method
 from ..supervision.children import Child, new_cell
 from ..supervision.spec import Flags, Plan, child
 from ..supervision.supervisor import Supervisor
-from .bricks import FOREVER, After, Before, Brick, Proceed, Settle
+from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
 from .mechanism import Description, Mechanism, MechanismRefused, revive
 from .orders import Beat, Setting
 from .protocol import Assume, InnerProtocol, RequestProtocol
@@ -247,7 +247,7 @@ class Replica(Supervisor):
         """Have this stack be the one: bind everything, end what is not needed."""
         old, self._woven, standing = self._woven, woven, self._standing
         kept = set(woven.names.values())
-        left = [name for name in old.names.values() if name not in kept]
+        left = [name for name in old.names.values() if name not in kept and name in self._children]
         for name in left:  # What is in their mailboxes belongs to the time before.
             await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
         standing.config, standing.layers = woven.config, woven.layers
@@ -256,6 +256,9 @@ class Replica(Supervisor):
         roles = [one.role(leads=standing.leads) for one in woven.layers]
         standing.computes = standing.leads or all(role.computes for role in roles)
         self._server.is_lazy = not any("state_access" in one.needs for one in woven.layers)
+        server = self._server
+        if not server.is_lazy and server.tail and server.life is not None and server.life.feed is None:
+            server.capture()  # From here on, the last part is what was handled since the last point.
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         standing.forget_bricks()
         self._bind_all(woven)
@@ -293,12 +296,21 @@ class Replica(Supervisor):
         node.bind(proceed, "server", server)
         node.bind(proceed, "state", state)
         node.bind(proceed, "out", proxy)
+        computing = proceed.actor
+        assert isinstance(computing, Proceed)
+        computing.take_over()
 
     # -- orders -----------------------------------------------------------------------------------------------------
 
     @on(Assume)
     async def _assume(self, message: Assume) -> None:
-        woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=message.leads)
+        old = self._woven
+        places = weave(old.layers, leads=message.leads)
+        left = [name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]]
+        for name in left:  # What is in their mailboxes belongs to the time before.
+            await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
+        await self._end_bricks(left)  # First: the new ones have their names.
+        woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         await self._take_up(woven, leads=message.leads)
 
     @on(Prepare)
@@ -323,9 +335,17 @@ class Replica(Supervisor):
         if woven is None or woven.config != message.config:
             self._prepared = woven
             return self._fail(MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared"))
+        await self._catch_up()
         await self._take_up(woven)
         self._standing.peer_turn = -2  # What the other one has is not known to the new bricks.
         return None
+
+    async def _catch_up(self) -> None:
+        """Nothing is inside the one that leads, but a follower may be behind it."""
+        names = self._woven.names
+        for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
+            await self._cell(names[slot]).ref.ask(Settle(), timeout=FOREVER)
+        await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
 
     @on(Abort)
     async def _abort(self, message: Abort) -> None:

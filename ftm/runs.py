@@ -26,7 +26,8 @@ from ..supervision.spec import child
 from .bricks import After, Before
 from .canonical import canonical, end_form
 from .messages import Done, Request, State, Work
-from .server import Server, ServerLife
+from .life import ServerLife
+from .server import Server
 from .voters import Agreed, AnyVoter, Undecided, _decide
 
 if TYPE_CHECKING:

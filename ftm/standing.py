@@ -67,8 +67,8 @@ class Standing:
         inside, found = self.inside, list[Logged]()
         for end in ends:
             request = inside.get(end.id)
-            client = ("", 0) if request is None else (request.client, request.incarnation)
-            found.append((*client, end.id, end))
+            client, life = ("", 0) if request is None else (request.client, request.incarnation)
+            found.append((client, life, end.id, end))
         return found
 
     def ready(self) -> None:

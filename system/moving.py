@@ -134,8 +134,8 @@ class Moves:
 
     async def _unprotected(self, cell: Cell, timeout: float) -> None:
         from ..ftm.events import MechanismDetached
+        from ..ftm.leaving import from_group
         from ..ftm.mechanism import compose
-        from ..ftm.moving import from_group
 
         before: ChildSpec = cell.spec
         wanted = dataclasses.replace(before, mechanism=None, isolation="task")
@@ -182,6 +182,10 @@ class Moves:
                     raise
             else:
                 return move
+            finally:
+                ending: asyncio.Future[None] | None = getattr(move, "ending", None)
+                if ending is not None:  # The processes of replicas that are not needed.
+                    await ending
 
     def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
         """The move that brings the actor to where its spec says."""

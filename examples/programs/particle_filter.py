@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from common import DATA, Feed, Program, Timed, Verdict, main
 from planning import Roads
-from scans import Floats, LikelihoodField, compose
+from scans import Estimate, Floats, LikelihoodField, Start, compose
 from willow import LASER_RANGE, PERIOD, Robot, bearings_of_beams, read_map, steer
 
 import holdfast as hf
@@ -35,22 +35,6 @@ DIFFUSION = np.array([0.03, 0.02, 0.02])  # what a step may be wrong by
 HIT_WIDTH = 0.15  # metres
 CAUTION = 0.2  # beams side by side see the same wall, so each counts less than one of its own would
 EVERY = 2  # beams
-
-
-class Start(hf.Message):
-    """The robot stands about here."""
-
-    x: float
-    y: float
-    heading: float
-
-
-class Estimate(hf.Message):
-    """Where the robot is, as far as the filter knows."""
-
-    x: float
-    y: float
-    heading: float
 
 
 class Moved(hf.Message[Estimate]):

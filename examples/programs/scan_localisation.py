@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from common import DATA, DamagedData, Feed, MissingData, Program, Timed, Verdict, main
-from scans import Floats, LikelihoodField, between, compose, end_points
+from scans import Estimate, Floats, LikelihoodField, Start, between, compose, end_points
 
 import holdfast as hf
 from holdfast.console.demo.grid import USABLE_RANGE, Geometry, OccupancyGrid
@@ -25,22 +25,6 @@ NEAREST = 0.3  # metres
 GOOD = 0.5  # metres that nineteen of twenty answers may be wrong at most
 NOISE = np.array([0.02, 0.02, 0.005])  # of the odometry, in each step: of its metres, its metres, radians
 TRUST = 10.0  # in the odometry
-
-
-class Start(hf.Message):
-    """The robot stands here."""
-
-    x: float
-    y: float
-    heading: float
-
-
-class Estimate(hf.Message):
-    """Where the robot is, as far as the matching knows."""
-
-    x: float
-    y: float
-    heading: float
 
 
 class Moved(hf.Message[Estimate]):

@@ -16,12 +16,30 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.optimize import least_squares
 
+import holdfast as hf
 from holdfast.console.demo.grid import Geometry, OccupancyGrid
 
 Floats = NDArray[np.floating[Any]]
 
+
 FARTHEST = 1.0  # metres: from there on it does not matter how far away the next wall is
 TOLERANCE = 0.1  # metres: end points farther than this from a wall pull less and less, as what has moved should
+
+
+class Start(hf.Message):
+    """The robot stands about here."""
+
+    x: float
+    y: float
+    heading: float
+
+
+class Estimate(hf.Message):
+    """Where the robot is, as far as the program knows."""
+
+    x: float
+    y: float
+    heading: float
 
 
 def place(points: Floats, pose: Floats) -> Floats:

@@ -52,7 +52,7 @@ class Notify(Message[None]):
 
 
 def digest(end: TurnEnd, released: list[int]) -> int:
-    """A checksum of the outcome of a turn: how it ended, its answer, and all that it has sent, earlier or at its end."""
+    """A checksum of the outcome of a turn: how it ended, its answer, and all that it has sent."""
     answer = end.answer
     head = f"{end.turn}|{end.status}|{answer.kind}|{answer.name}".encode()
     found = zlib.crc32(answer.body, zlib.crc32(head))

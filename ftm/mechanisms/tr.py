@@ -15,24 +15,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from ...actors.errors import HoldfastError
 from ...checkpoint.records import FAILED, Answer, TurnEnd
 from ..alarms import Masked
 from ..bricks import FOREVER, After
 from ..mechanism import Mechanism, Role
 from ..messages import Done
 from ..state import LastRun, Ran, RunAgain, Undo
-
-
-class NoMajority(HoldfastError):
-    """No two runs have come to the same: nobody knows which one is right. Nothing was changed."""
-
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return f"{self.actor}: {self.why}"
+from ..voters import NoMajority
 
 
 def outcome(ran: Ran) -> tuple[Any, ...]:

@@ -33,7 +33,8 @@ class OnProtection(OnLiving):
         assert place is not None
         if place.spec is None:
             raise wrong(self.target, "nobody supervises it, so nobody would start it again")
-        if place.cell is not None and is_elsewhere(place.cell):
+        above = place.parent
+        if above is not None and above.cell is not None and is_elsewhere(above.cell):
             raise wrong(self.target, "its supervisor lives in another process, which cannot have processes of its own")
 
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:

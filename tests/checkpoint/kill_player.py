@@ -60,10 +60,7 @@ async def main(store: str, durability: Any, begin: list[int]) -> None:
         first = await system.start(hf.child("first", hf.start(Ledger), isolation="process", recovery=recovery))
         if begin:
             await asyncio.gather(*[call(caller, n, first, second) for caller, n in enumerate(begin)])
-        for actor in (
-            first,
-            second,
-        ):  # Behind everything that was there: a recorded tell between them has been counted.
+        for actor in (first, second):  # Behind everything that was there: tells between the two have been counted.
             await actor.ask(All(), timeout=60.0)
         have = [await actor.ask(All(), timeout=60.0) for actor in (first, second)]
         os.write(1, json.dumps(have).encode() + b"\n")

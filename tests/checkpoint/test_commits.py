@@ -281,6 +281,46 @@ async def test_a_full_disk_refuses_clearly_and_when_there_is_room_all_goes_on(en
         assert await doer.ask(Seen(), timeout=30.0) == ["a", "e"]
 
 
+class Spread(hf.Message[None]):
+    text: str
+
+
+class Station(hf.Actor):
+    @hf.on(Spread)
+    async def spread(self, message: Spread) -> None:
+        await self.ctx.publish("/news", Note(message.text))
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_what_was_published_and_has_no_room_is_a_dead_letter_and_the_others_get_it(
+    engine: Any, isolation: Any
+) -> None:
+    engine.let_sync.set()
+    async with hf.ActorSystem("app", log=False, store=engine, intensity=1000) as system:
+        doer = await system.start(hf.child("doer", hf.start(Listener), recovery=hf.hybrid(interval=1000.0)))
+        other = await system.start(hf.child("other", hf.start(Listener)))
+        station = await system.start(hf.child("station", hf.start(Station), isolation=isolation))
+        await station.ask(Spread("a"), timeout=30.0)
+        engine.full = True
+        with system.events() as events:
+            await station.ask(Spread("b"), timeout=30.0)
+            assert await other.ask(Seen(), timeout=30.0) == ["a", "b"]
+            await system.homes.settled()
+            letters = [one for one in events.take() if isinstance(one, hf.DeadLetter)]
+            assert [(one.address, "no room" in one.why) for one in letters] == [(doer.path, True)]
+            engine.full = False
+            async with asyncio.timeout(30.0):
+                async for event in events:
+                    if isinstance(event, hf.JournalGoesOn):
+                        break
+        assert await doer.ask(Seen(), timeout=30.0) == ["a"]
+
+
+class Listener(Doer):
+    def on_start(self, restored: bool) -> None:
+        self.ctx.subscribe("/news")
+
+
 async def test_a_turn_that_ends_without_room_answers_when_there_is(engine: Any, isolation: str, gate: Path) -> None:
     engine.let_sync.set()
     async with hf.ActorSystem("app", log=False, store=engine, intensity=1000) as system:

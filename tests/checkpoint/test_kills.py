@@ -25,7 +25,7 @@ KILLS = int(os.environ.get("HOLDFAST_KILLS", "24"))
 SEED = int(os.environ.get("HOLDFAST_SEED", "20260901"))
 CALLERS = 8
 ROUND = 6
-"""Kills between two looks at what is there."""
+"""Kills of one store, before it is looked at what is there."""
 
 
 @dataclasses.dataclass
@@ -60,38 +60,37 @@ def begin(store: Path, durability: str, *first: int) -> subprocess.Popen[bytes]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, env={**os.environ, "PYTHONPATH": PATHS})
 
 
+@pytest.mark.parametrize("part", range(max(1, KILLS // (2 * ROUND))))
 @pytest.mark.parametrize("durability", ["os", "fsync"])
-def test_what_was_accepted_is_there_once_and_in_order(tmp_path: Path, durability: str) -> None:
-    moments = random.Random(f"{SEED} {durability}")
-    left, life = KILLS // 2, 0
-    while left:
-        store = tmp_path / f"app{life}.db"
-        accepted: dict[int, set[int]] = {caller: set() for caller in range(CALLERS)}
-        following = [1] * CALLERS
-        for _ in range(min(ROUND, left)):
-            left, life = left - 1, life + 1
-            root = begin(store, durability, *following)
-            assert root.stdout is not None
-            fatal, delay = moments.randint(1, 600), moments.uniform(0.0, 0.01)
-            with root.stdout as out:
-                for count, line in enumerate(out):
-                    if line.endswith(b"\n"):
-                        caller, n = map(int, line.split())
-                        accepted[caller].add(n)
-                    if count == fatal:
-                        threading.Timer(delay, root.kill).start()
-            assert root.wait(60) == -9, f"seed {SEED}: it ended by itself"
-            # One more of each may have been accepted without our hearing of it.
-            following = [max(seen, default=0) + 2 for seen in accepted.values()]
-        root = begin(store, durability)
-        output, _ = root.communicate(timeout=120)
-        assert root.returncode == 0
-        first, second = json.loads(output.splitlines()[-1])
-        for name, numbers in (("first", first), ("second", second)):
-            verdict = judge(accepted, numbers)
-            print(f"seed {SEED}, {durability}, kill {life}, {name}: {verdict}")  # shown if it fails, or with -s
-            assert (verdict.lost, verdict.doubled, verdict.reordered) == (0, 0, 0)
-        assert sorted(first) == sorted(second), f"seed {SEED}: what the first passed on is not what the second got"
+def test_what_was_accepted_is_there_once_and_in_order(tmp_path: Path, durability: str, part: int) -> None:
+    seed = f"{SEED} {durability} {part}"
+    moments = random.Random(seed)
+    store = tmp_path / "app.db"
+    accepted: dict[int, set[int]] = {caller: set() for caller in range(CALLERS)}
+    following = [1] * CALLERS
+    for _ in range(ROUND):
+        root = begin(store, durability, *following)
+        assert root.stdout is not None
+        fatal, delay = moments.randint(1, 600), moments.uniform(0.0, 0.01)
+        with root.stdout as out:
+            for count, line in enumerate(out):
+                if line.endswith(b"\n"):
+                    caller, n = map(int, line.split())
+                    accepted[caller].add(n)
+                if count == fatal:
+                    threading.Timer(delay, root.kill).start()
+        assert root.wait(60) == -9, f"seed {seed}: it ended by itself"
+        # One more of each may have been accepted without our hearing of it.
+        following = [max(seen, default=0) + 2 for seen in accepted.values()]
+    root = begin(store, durability)
+    output, _ = root.communicate(timeout=120)
+    assert root.returncode == 0
+    first, second = json.loads(output.splitlines()[-1])
+    for name, numbers in (("first", first), ("second", second)):
+        verdict = judge(accepted, numbers)
+        print(f"seed {seed}, {ROUND} kills, {name}: {verdict}")  # shown if it fails, or with -s
+        assert (verdict.lost, verdict.doubled, verdict.reordered) == (0, 0, 0)
+    assert sorted(first) == sorted(second), f"seed {seed}: what the first passed on is not what the second got"
 
 
 def test_the_judge_sees_what_is_wrong() -> None:

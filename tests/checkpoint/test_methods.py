@@ -447,7 +447,7 @@ async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
     system: hf.ActorSystem, there: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The store refuses it: the old life goes on, with all it has."""
-    import holdfast.checkpoint.switch as of_switches
+    import holdfast.checkpoint.arrival as of_arrivals
 
     def full(*_: Any) -> None:
         raise hf.HoldfastError("the disk is full")
@@ -455,7 +455,7 @@ async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
     ref = await doer(system, "process" if there == "task" else "task", "checkpoint_only")
     await ref.ask(Note("kept"))
     with monkeypatch.context() as broken:
-        broken.setattr(of_switches, "cut", full)
+        broken.setattr(of_arrivals, "cut", full)
         with pytest.raises(hf.CannotMove, match="could not be kept"):
             await system.set_isolation(ref, there)
     assert await ref.ask(Seen()) == ["kept"]

@@ -165,10 +165,11 @@ async def test_the_first_turn_that_a_replay_handles_otherwise_is_named(
         why = ""
         with system.events() as events:
             ref.kill()
-            async for event in events:
-                if isinstance(event, hf.RecoveryFailed):
-                    why = event.reason
-                    break
+            async with asyncio.timeout(30.0):
+                async for event in events:
+                    if isinstance(event, hf.RecoveryFailed):
+                        why = event.reason
+                        break
         assert "turn 2: after tests.checkpoint.test_strict:Put" in why
         quirk.unlink()
         assert await ref.ask(Put("d"), timeout=30.0) == ["a", "b", "c", "d"]

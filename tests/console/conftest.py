@@ -1,9 +1,14 @@
 """A small log of the demo's format, drawn here: a robot drives down a corridor."""
 
 import sys
+from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
+
+import holdfast as hf
+from holdfast.console.endpoint import control_endpoint
+from tests.system.trees import plant
 
 # What a command sends is rebuilt by name in the system that it reaches, so the root has to be on the path.
 ROOT = str(Path(__file__).parents[2])
@@ -31,3 +36,18 @@ def small_log(tmp_path: Path) -> Path:
     path = tmp_path / "corridor.g2o"
     path.write_text("# a corridor\n" + "".join(line(number) for number in range(SCANS)))
     return path
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    """A running system with the tree of the tests of transactions."""
+    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
+        await plant(running)
+        yield running
+
+
+@pytest.fixture
+async def path(system: hf.ActorSystem, tmp_path: Path) -> AsyncIterator[Path]:
+    """Where its control endpoint is."""
+    async with control_endpoint(system, tmp_path / "app.sock") as where:
+        yield where

@@ -4,16 +4,14 @@ import asyncio
 import hashlib
 import os
 import sys
-from collections.abc import AsyncIterator
 from pathlib import Path
 
 import pytest
 
 import holdfast as hf
-from holdfast.console.endpoint import control_endpoint
 from holdfast.system import script as script_module
 from holdfast.system.script import UntrustedFile, read_source
-from tests.system.trees import Add, picture, plant, ref
+from tests.system.trees import Add, picture, ref
 
 DONE, FAILED, UNUSABLE = 0, 1, 2
 GROW = """
@@ -52,19 +50,6 @@ async def reconfigure(system):
 
 
 @pytest.fixture
-async def system() -> AsyncIterator[hf.ActorSystem]:
-    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
-        await plant(running)
-        yield running
-
-
-@pytest.fixture
-async def socket(system: hf.ActorSystem, tmp_path: Path) -> AsyncIterator[Path]:
-    async with control_endpoint(system, tmp_path / "app.sock") as where:
-        yield where
-
-
-@pytest.fixture
 def grow(tmp_path: Path) -> Path:
     return written(tmp_path / "grow.py", GROW)
 
@@ -87,9 +72,9 @@ async def holdfast(*arguments: object) -> tuple[int, str, str]:
     return process.returncode or 0, output.decode(), errors.decode()
 
 
-async def test_a_script_is_carried_out_in_the_running_system(system: hf.ActorSystem, socket: Path, grow: Path) -> None:
+async def test_a_script_is_carried_out_in_the_running_system(system: hf.ActorSystem, path: Path, grow: Path) -> None:
     with system.events() as stream:
-        status, output, errors = await holdfast("apply", grow, "--socket", socket)
+        status, output, errors = await holdfast("apply", grow, "--socket", path)
         loaded = [event for event in stream.take() if isinstance(event, hf.ScriptLoaded)]
     assert (status, errors) == (DONE, "")
     assert "1. add /app/left/greeter\n2. register /app/left/greeter as 'greeter'\n" in output
@@ -104,9 +89,9 @@ async def test_a_script_is_carried_out_in_the_running_system(system: hf.ActorSys
     assert "/app/left/c" not in system.tree()
 
 
-async def test_a_dry_run_says_what_would_be_done(system: hf.ActorSystem, socket: Path, grow: Path) -> None:
+async def test_a_dry_run_says_what_would_be_done(system: hf.ActorSystem, path: Path, grow: Path) -> None:
     before = picture(system)
-    status, output, _ = await holdfast("apply", grow, "--socket", socket, "--dry-run")
+    status, output, _ = await holdfast("apply", grow, "--socket", path, "--dry-run")
     assert status == DONE
     assert "+ /app/left/greeter: Greeter, permanent, task, named 'greeter'" in output
     assert output.endswith("nothing was done: this was a dry run\n")
@@ -138,27 +123,27 @@ async def test_the_same_script_runs_in_process(system: hf.ActorSystem, grow: Pat
     ],
 )
 async def test_what_goes_wrong_is_said_and_changes_nothing(
-    system: hf.ActorSystem, socket: Path, tmp_path: Path, text: str, status: int, error: str
+    system: hf.ActorSystem, path: Path, tmp_path: Path, text: str, status: int, error: str
 ) -> None:
     before = picture(system)
-    done = await holdfast("apply", written(tmp_path / "script.py", text), "--socket", socket)
+    done = await holdfast("apply", written(tmp_path / "script.py", text), "--socket", path)
     assert done[0] == status
     assert error in done[2]
     assert picture(system) == before
 
 
 async def test_a_script_that_others_may_write_is_not_loaded(
-    system: hf.ActorSystem, socket: Path, grow: Path, tmp_path: Path
+    system: hf.ActorSystem, path: Path, grow: Path, tmp_path: Path
 ) -> None:
     before = picture(system)
     grow.chmod(0o622)
-    status, _, errors = await holdfast("apply", grow, "--socket", socket)
+    status, _, errors = await holdfast("apply", grow, "--socket", path)
     assert (status, "others may write it (mode 0622)" in errors) == (UNUSABLE, True)
     folder = tmp_path / "shared"
     folder.mkdir()
     other = written(folder / "grow.py", GROW)
     folder.chmod(0o777)
-    status, _, errors = await holdfast("apply", other, "--socket", socket)
+    status, _, errors = await holdfast("apply", other, "--socket", path)
     assert (status, f"{folder} is not loaded: others may write it" in errors) == (UNUSABLE, True)
     assert picture(system) == before
 
@@ -186,7 +171,7 @@ def test_a_large_script_is_not_read(grow: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 async def test_a_module_that_others_may_write_is_not_imported(
-    system: hf.ActorSystem, socket: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    system: hf.ActorSystem, path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The system checks for itself: the command may import what it likes."""
     library = tmp_path / "library"
@@ -201,13 +186,13 @@ async def test_a_module_that_others_may_write_is_not_imported(
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(library), os.environ.get("PYTHONPATH", "")]))
     before = picture(system)
     module.chmod(0o666)
-    status, _, errors = await holdfast("apply", script, "--socket", socket)
+    status, _, errors = await holdfast("apply", script, "--socket", path)
     assert (status, "others may write it (mode 0666)" in errors) == (FAILED, True)
     assert "shady_actors" not in sys.modules
     assert picture(system) == before
     module.chmod(0o600)
     with system.events() as stream:
-        status, _, errors = await holdfast("apply", script, "--socket", socket)
+        status, _, errors = await holdfast("apply", script, "--socket", path)
         told = [event.path for event in stream.take() if isinstance(event, hf.ScriptLoaded)]
     assert (status, errors) == (DONE, "")
     assert os.path.realpath(module) in told
@@ -221,11 +206,11 @@ async def test_nobody_answers(grow: Path, tmp_path: Path) -> None:
         assert (status, "no system answers at" in errors) == (UNUSABLE, True)
 
 
-async def test_tree_and_status_tell_of_the_running_system(system: hf.ActorSystem, socket: Path) -> None:
-    status, output, _ = await holdfast("tree", "--socket", socket)
+async def test_tree_and_status_tell_of_the_running_system(system: hf.ActorSystem, path: Path) -> None:
+    status, output, _ = await holdfast("tree", "--socket", path)
     assert (status, output.split()) == (DONE, system.tree())
-    status, output, _ = await holdfast("status", "/app/left/a", "--socket", socket)
+    status, output, _ = await holdfast("status", "/app/left/a", "--socket", path)
     assert status == DONE
     assert "kind: tests.system.trees.Counter\nstate: running\nparent: /app/left\n" in output
-    status, _, errors = await holdfast("status", "/app/nowhere", "--socket", socket)
+    status, _, errors = await holdfast("status", "/app/nowhere", "--socket", path)
     assert (status, errors) == (FAILED, "holdfast status: there is no actor at /app/nowhere\n")

@@ -8,7 +8,6 @@ import stat
 import struct
 import subprocess
 import sys
-from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +19,7 @@ from holdfast.console import endpoint as endpoint_module
 from holdfast.console.endpoint import Endpoint, EndpointInUse, control_endpoint
 from holdfast.console.remote import NotReached, RemoteRef, RemoteSystem
 from holdfast.console.wire import LARGEST, RESPONSE, BadRequest, Request, Tree, WrongUser, frame, outcome
-from tests.system.trees import Add, Counter, counter, picture, plant, ref
-
-
-@pytest.fixture
-async def system() -> AsyncIterator[hf.ActorSystem]:
-    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
-        await plant(running)
-        yield running
-
-
-@pytest.fixture
-async def path(system: hf.ActorSystem, tmp_path: Path) -> AsyncIterator[Path]:
-    async with control_endpoint(system, tmp_path / "app.sock") as where:
-        yield where
+from tests.system.trees import Add, Counter, counter, picture, ref
 
 
 async def far(path: Path, work: Any) -> Any:

@@ -52,3 +52,15 @@ def start_one(system: hf.ActorSystem, way: str) -> Starter:
         return system.ref("/app/top/one", recipe.kind)
 
     return start
+
+
+@pytest.fixture(params=["plain", "recorded"])
+def recovery(request: pytest.FixtureRequest) -> Any:
+    """Without recovery, and with it."""
+    return hf.hybrid(interval=3600.0) if request.param == "recorded" else None
+
+
+@pytest.fixture(params=["task", "process"])
+def here(request: pytest.FixtureRequest) -> str:
+    """Where the actor lives first."""
+    return str(request.param)

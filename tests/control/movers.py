@@ -318,3 +318,14 @@ class Leaves(Account):
         Path(f"{message.path}.begun").touch()
         await until(message.path)
         self.ctx.stop()
+
+
+OTHER: dict[str, Any] = {"task": "process", "process": "task"}
+
+
+def lives_in(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> Any:
+    return "task" if system.pid_of(ref) == os.getpid() else "process"
+
+
+def moved(stream: hf.EventStream) -> list[tuple[str, str]]:
+    return [(event.origin, event.to) for event in stream.take() if isinstance(event, hf.Moved)]

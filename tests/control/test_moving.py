@@ -11,6 +11,7 @@ import pytest
 
 import holdfast as hf
 from tests.control.movers import (
+    OTHER,
     Answer,
     Begin,
     Bond,
@@ -33,31 +34,10 @@ from tests.control.movers import (
     Where,
     Work,
     Worker,
+    lives_in,
+    moved,
 )
 from tests.control.players import Account, Add, Crash, Holder, Total, Wait, until_there
-
-KINDS = {"plain": None, "recorded": hf.hybrid(interval=3600.0)}
-OTHER: dict[str, Any] = {"task": "process", "process": "task"}
-
-
-@pytest.fixture(params=list(KINDS))
-def recovery(request: pytest.FixtureRequest) -> Any:
-    """Without recovery, and with it."""
-    return KINDS[request.param]
-
-
-@pytest.fixture(params=list(OTHER))
-def here(request: pytest.FixtureRequest) -> str:
-    """Where the actor lives first."""
-    return str(request.param)
-
-
-def lives_in(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> Any:
-    return "task" if system.pid_of(ref) == os.getpid() else "process"
-
-
-def moved(stream: hf.EventStream) -> list[tuple[str, str]]:
-    return [(event.origin, event.to) for event in stream.take() if isinstance(event, hf.Moved)]
 
 
 async def test_an_actor_is_moved_there_and_back_with_its_state(

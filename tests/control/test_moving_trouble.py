@@ -11,34 +11,14 @@ import pytest
 
 import holdfast as hf
 from tests.control.movers import (
+    OTHER,
     Fussy,
     Leaves,
     Work,
+    lives_in,
+    moved,
 )
 from tests.control.players import Account, Add, Crash, Total, until_there
-
-KINDS = {"plain": None, "recorded": hf.hybrid(interval=3600.0)}
-OTHER: dict[str, Any] = {"task": "process", "process": "task"}
-
-
-@pytest.fixture(params=list(KINDS))
-def recovery(request: pytest.FixtureRequest) -> Any:
-    """Without recovery, and with it."""
-    return KINDS[request.param]
-
-
-@pytest.fixture(params=list(OTHER))
-def here(request: pytest.FixtureRequest) -> str:
-    """Where the actor lives first."""
-    return str(request.param)
-
-
-def lives_in(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> Any:
-    return "task" if system.pid_of(ref) == os.getpid() else "process"
-
-
-def moved(stream: hf.EventStream) -> list[tuple[str, str]]:
-    return [(event.origin, event.to) for event in stream.take() if isinstance(event, hf.Moved)]
 
 
 @pytest.mark.parametrize("how", ["raise", "hang", "exit"])

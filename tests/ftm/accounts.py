@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import os
+from pathlib import Path
 from typing import Any
 
 import holdfast as hf
@@ -78,6 +79,18 @@ class Closed(Counter):
     state_access = False
 
 
+class Fussy(Counter):
+    """Does not want to come back as long as there is a file."""
+
+    def __init__(self, veto: str) -> None:
+        super().__init__()
+        self._veto = Path(veto)
+
+    def on_start(self, restored: bool) -> None:
+        if self._veto.exists():
+            raise RuntimeError("not now")
+
+
 class Put(hf.Message[int]):
     amount: int
 
@@ -94,6 +107,20 @@ class Account(hf.Actor):
         self.balance += message.amount
         self.puts += 1
         return self.balance
+
+
+class Pay(hf.Message[int]):
+    amount: int
+
+
+class Purse(hf.Actor):
+    """Asks whoever it is bound to."""
+
+    account: hf.Binding[Account]
+
+    @hf.on(Pay)
+    async def pay(self, message: Pay) -> int:
+        return await self.account.ask(Put(message.amount))
 
 
 class Transfer(hf.Message[int]):
@@ -148,6 +175,7 @@ class Load:
                 self.answered[tag] = await self.ref.ask(self.make(tag, 1), timeout=30.0)
             except hf.HoldfastError as error:
                 self.failed[tag] = error
+                return  # It is seen in the end.
             self.longest = max(self.longest, loop.time() - begin)
 
     async def reached(self, answers: int) -> None:
@@ -155,6 +183,7 @@ class Load:
         goal = len(self.answered) + answers
         async with asyncio.timeout(60):
             while len(self.answered) < goal:
+                assert len(self.failed) < self.clients, f"nobody is left who asks: {self.failed}"
                 await asyncio.sleep(0.001)
 
     async def stop(self) -> None:

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from holdfast.ftm.model import Cost
+from holdfast.ftm.declaration import Cost
 
 
 class Declared:

@@ -84,7 +84,7 @@ class Driver:
     async def start(self, names: Iterable[str] = ("r1", "r2"), isolation: str = "task", **setting: Any) -> None:
         """Start proxy, detector and replicas below a supervisor."""
         method = hf.hybrid().data() if hasattr(hf.hybrid(), "data") else {}
-        self.setting = {"config": 0, "method": method, "bindings": {}, "beat": 0.0, **setting}
+        self.setting: dict[str, Any] = {"config": 0, "method": method, "bindings": {}, "beat": 0.0, **setting}
         children = [hf.child("proxy", hf.start(Proxy, self)), hf.child("detector", hf.start(Detector))]
         ftm = hf.supervisor("ftm", children=children, intensity=100)
         await self.system.start(hf.supervisor("x", children=[ftm], intensity=100))
@@ -174,7 +174,9 @@ class Driver:
 
     def again(self) -> None:
         """After a failover: everything that has no end yet goes to the new primary, what had begun first."""
-        left = sorted((one for one in self.feeds.values() if one.id not in self.ends), key=lambda f: f.id != self.partial)
+        left = sorted(
+            (one for one in self.feeds.values() if one.id not in self.ends), key=lambda f: f.id != self.partial
+        )
         self.queue.clear()
         self.out_now = None
         go = Go(False, 0) if not any(isinstance(one, str) for one in self.more) and 0 not in self.ends else None

@@ -95,7 +95,7 @@ class Total(hf.Actor):
         return sum(self.seen)
 
     @hf.on(Put)
-    def put(self, message: Put) -> int | None:
+    def put(self, message: Put) -> Any:
         if not self.is_open:
             self.ctx.stash()
             return None
@@ -129,7 +129,7 @@ class Large(hf.Actor):
     """Says what has changed."""
 
     def __init__(self) -> None:
-        self.values: dict[int, int] = {key: 0 for key in range(1000)}
+        self.values: dict[int, int] = dict.fromkeys(range(1000), 0)
         self._changed: dict[int, int] = {}
 
     @hf.on(Add)

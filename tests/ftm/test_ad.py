@@ -132,15 +132,17 @@ async def test_in_processes_of_their_own_with_kills_meanwhile(system: hf.ActorSy
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=layers))
     await two_again(ref)
     load = Load(ref, clients=3)
-    with system.events() as events:
-        await load.reached(20)
-        for name in ("r1", "r2"):
-            os.kill(pid_of(system, ref, name), signal.SIGKILL)
+    try:
+        with system.events() as events:
             await load.reached(20)
-            await two_again(ref)
-            await load.reached(20)
-        assert any(one.by for one in events.take() if isinstance(one, Objected))
-    await load.stop()
+            for name in ("r1", "r2"):
+                os.kill(pid_of(system, ref, name), signal.SIGKILL)
+                await load.reached(20)
+                await two_again(ref)
+                await load.reached(20)
+            assert any(one.by for one in events.take() if isinstance(one, Objected))
+    finally:
+        await load.stop()
     assert group_of(ref).failovers >= 1
     tags = await ref.ask(Tags())
     place = {tag: index + 1 for index, tag in enumerate(tags)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -15,7 +16,7 @@ from holdfast.ftm.events import MechanismAttached, MechanismDetached
 from holdfast.ftm.host import GroupHost
 from holdfast.ftm.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
-from tests.ftm.accounts import Add, Closed, Counter, Later, Load, Tags, Total
+from tests.ftm.accounts import Account, Add, Closed, Counter, Fussy, Later, Load, Pay, Purse, Tags, Total
 from tests.ftm.test_failover import METHODS, group_of, pid_of, two_again
 
 # A refused or failed transaction ends with its block.
@@ -102,8 +103,8 @@ async def test_its_next_lives_are_protected_too_and_not_after_a_detach(system: h
 
 async def test_timers_come_along(system: hf.ActorSystem, recovery: Any) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery))
-    await ref.ask(Later(2.0, 1))
-    await ref.ask(Later(4.0, 2))
+    await ref.ask(Later(1.0, 1))
+    await ref.ask(Later(2.5, 2))
     await attach(system, ref)
     async with asyncio.timeout(20):
         while await ref.ask(Tags()) != [1]:
@@ -178,3 +179,57 @@ async def test_attached_twice_is_refused_and_a_dry_run_changes_nothing(system: h
     with pytest.raises(hf.TransactionRefused, match="already"):
         await attach(system, ref)
     assert await ref.ask(Total()) == 0
+
+
+async def test_if_the_new_life_cannot_begin_the_old_one_goes_on(
+    system: hf.ActorSystem, recovery: Any, tmp_path: Path
+) -> None:
+    veto = tmp_path / "veto"
+    ref = await system.start(hf.child("alice", hf.start(Fussy, str(veto)), recovery=recovery))
+    load = Load(ref)
+    await load.reached(10)
+    veto.touch()
+    with pytest.raises(hf.TransactionFailed):
+        await attach(system, ref)
+    assert not isinstance(ref._cell.host, GroupHost)
+    await load.reached(10)
+    veto.unlink()
+    await attach(system, ref)
+    await load.reached(10)
+    veto.touch()
+    with pytest.raises(hf.TransactionFailed, match="could not begin"):
+        await detach(system, ref)
+    assert isinstance(ref._cell.host, GroupHost)
+    await load.reached(10)
+    veto.unlink()
+    await detach(system, ref)
+    await load.reached(10)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert ref._cell.life == 1
+
+
+async def test_a_protected_actor_is_not_moved_by_anything_else(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
+    with pytest.raises(hf.CannotMove, match="detach"):
+        await system.set_isolation(ref, "process")
+    for step in (lambda change: change.replace_state(ref, dict), lambda change: change.isolation(ref, "process")):
+        with pytest.raises(hf.TransactionRefused, match="detach"):
+            async with system.transaction() as change:
+                step(change)
+    assert await ref.ask(Add(0)) == 1
+
+
+async def test_a_binding_is_that_of_every_replica_from_now_on(system: hf.ActorSystem) -> None:
+    one = await system.start(hf.child("one", hf.start(Account, 0)))
+    two = await system.start(hf.child("two", hf.start(Account, 1000)))
+    ref = await system.start(hf.child("alice", hf.start(Purse), mechanism=PBR(), bindings={"account": one.path}))
+    assert await ref.ask(Pay(1)) == 1
+    system.bind(ref, "account", two)
+    assert await ref.ask(Pay(1)) == 1001
+    for total in (1002, 1003):
+        primary = group_of(ref).primary
+        assert primary is not None
+        os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+        assert await ref.ask(Pay(1), timeout=30) == total
+        await two_again(ref)

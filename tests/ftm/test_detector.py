@@ -155,3 +155,15 @@ async def test_an_observer_that_was_held_up_suspects_nobody() -> None:
             detector.tell(Beat("r1", 1))
         assert watched.suspects == []
         await system.stop(detector)
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_killed_detector_suspects_nobody_any_more() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        detector = system.spawn(Start(Detector, (watched,)))
+        detector.tell(Beat("r1", 1))
+        await asyncio.sleep(0.1)
+        detector._cell.kill()
+        await asyncio.sleep(10.0)
+        assert watched.suspects == []

@@ -66,8 +66,14 @@ async def started(system: hf.ActorSystem, recipe: Any = None, **options: Any) ->
 async def two_again(ref: hf.ActorRef[Any]) -> None:
     """Wait until the group is complete."""
     async with asyncio.timeout(30):
-        while ref._cell.state != "running" or ref._cell.host.group is None or len(group_of(ref).members) < 2:
+        while not is_complete(ref):
             await asyncio.sleep(0.005)
+
+
+def is_complete(ref: hf.ActorRef[Any]) -> bool:
+    host = ref._cell.host
+    group = host.group if isinstance(host, GroupHost) else None
+    return group is not None and group.primary is not None and all(map(group.is_well, group.names))
 
 
 def stopped(pid: int) -> bool:
@@ -95,7 +101,9 @@ async def test_a_protected_actor_answers_as_an_ordinary_one(system: hf.ActorSyst
 async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSystem) -> None:
     ref = await started(system)
     seen = {path.removeprefix(f"{ref.path}/ftm/") for path in system.tree() if path.startswith(f"{ref.path}/ftm/")}
-    bricks = {f"{name}/{brick}" for name in ("r1", "r2") for brick in ("protocol", "before", "proceed", "state", "beat")}
+    bricks = {
+        f"{name}/{brick}" for name in ("r1", "r2") for brick in ("protocol", "before", "proceed", "state", "beat")
+    }
     assert {*PARTS, "r1", "r2"} | bricks <= seen
 
 
@@ -167,6 +175,21 @@ async def test_the_parts_at_the_root_may_die_at_any_moment(system: hf.ActorSyste
     load.check(await ref.ask(Tags()))
 
 
+@pytest.mark.parametrize("method", ["hybrid", "replay_only"])
+async def test_the_supervisor_of_the_mechanism_may_die(system: hf.ActorSystem, method: str) -> None:
+    ref = await started(system, recovery=METHODS[method]())
+    load = Load(ref)
+    await load.reached(40)
+    ftm = group_of(ref).node.find(f"{ref.path}/ftm")
+    assert ftm is not None
+    ftm.kill()
+    await load.reached(40)
+    await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert ref._cell.life == 2
+
+
 STEPS = ("depose", "epoch", "kill", "lead", "bind", "peer")
 
 
@@ -213,6 +236,30 @@ async def test_a_stopped_primary_that_wakes_up_changes_nothing(system: hf.ActorS
     over = [event for event in events.take() if isinstance(event, FailedOver)]
     assert [event.epoch for event in over] == [2]
     assert "no heartbeat" in over[0].why
+    events.close()
+
+
+async def test_a_silent_primary_that_nobody_could_replace_is_waited_for(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    group = group_of(ref)
+    assert await ref.ask(Add(0)) == 1
+    events = system.events()
+    leads = group.primary
+    assert leads is not None
+    pid = pid_of(system, ref, leads)
+    os.kill(pid_of(system, ref, other(group)), signal.SIGKILL)
+    await stop_process(pid)
+    async with asyncio.timeout(10):
+        while group.suspects.get(leads) is None:
+            await asyncio.sleep(0.005)
+    await asyncio.sleep(0.2)  # The manager has looked several times by now.
+    os.kill(pid, signal.SIGCONT)
+    assert await ref.ask(Add(1), timeout=30) == 2
+    seen = events.take()
+    assert not any(isinstance(event, FailedOver) for event in seen)
+    assert any(isinstance(event, WrongSuspicion) for event in seen)
+    await two_again(ref)
+    assert await ref.ask(Tags()) == [0, 1]
     events.close()
 
 

@@ -12,13 +12,9 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.ftm.application import Application
 from holdfast.ftm.coverage import coverage, selection_table, selection_text
+from holdfast.ftm.declaration import FAULTS, LAYERS, BadDeclaration, Cost, Entry
 from holdfast.ftm.model import (
-    FAULTS,
-    LAYERS,
-    BadDeclaration,
     Choice,
-    Cost,
-    Entry,
     Faults,
     Resources,
     check,

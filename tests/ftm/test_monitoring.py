@@ -9,25 +9,27 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import Event
-from holdfast.ftm.application import Application
-from holdfast.ftm.judge import Judge, Readings, Settings
-from holdfast.ftm.model import Faults, Resources
-from holdfast.ftm.monitoring import (
-    Adapt,
+from holdfast.ftm.adaptations import (
     AdaptationDecided,
     AdaptationDone,
     AdaptationFailed,
     AdaptationHeld,
     AdaptationWithdrawn,
+    MonitoringBlind,
+    NothingValid,
+)
+from holdfast.ftm.application import Application
+from holdfast.ftm.judge import Judge, Readings, Settings
+from holdfast.ftm.model import Faults, Resources
+from holdfast.ftm.monitoring import (
+    Adapt,
     Allow,
     ApplicationIs,
     Forbid,
     Measured,
     MechanismIs,
     Monitored,
-    MonitoringBlind,
     MonitoringEngine,
-    NothingValid,
     Object,
     Observe,
     Report,

@@ -10,7 +10,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.exits import SHUTDOWN, pack_exit
-from holdfast.checkpoint.records import OK, STASHED, Closed as LifeClosed, TurnEnd
+from holdfast.checkpoint.records import OK, STASHED, TurnEnd
+from holdfast.checkpoint.records import Closed as LifeClosed
 from holdfast.ftm.alarms import ProtectionLost
 from holdfast.ftm.bricks import Letter
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
@@ -344,3 +345,35 @@ def test_names_used_here_are_those_of_the_library() -> None:
     assert issubclass(Closed, Total)
     assert State(0, b"", [], [], [], False).base == -2
     assert Done(0, 0, 0, [], True).more == []
+
+
+class Unwilling(Total):
+    """Comes back from nothing."""
+
+    def on_start(self, restored: bool) -> None:
+        if restored:
+            raise RuntimeError("not again")
+
+
+async def test_a_backup_whose_life_cannot_begin_says_so_when_it_is_to_lead(system: hf.ActorSystem) -> None:
+    driver = await pair(system, Unwilling)
+    await driver.ask(Add(1))
+    gone = system.node.cell_at(driver.path("r2")).ended()
+    await driver.stop_replica("r1")
+    with pytest.raises((hf.RemoteCrash, hf.ActorStopped, hf.AskFailed)):
+        await driver.lead("r2")
+    async with asyncio.timeout(5):
+        await gone
+
+
+async def test_a_first_state_that_cannot_be_taken_up_ends_the_replica(system: hf.ActorSystem) -> None:
+    first = await pair(system, Unwilling)
+    await first.ask(Add(1))
+    exported = await first.protocol("r1").ask(Export(first.epoch))
+    await first.add("r3")
+    gone = system.node.cell_at(first.path("r3")).ended()
+    await first.protocol("r3").ask(Install(first.epoch + 1, exported.turn, exported.data, [], True, []))
+    with pytest.raises((hf.RemoteCrash, hf.ActorStopped, hf.AskFailed)):
+        await first.lead("r3")
+    async with asyncio.timeout(5):
+        await gone

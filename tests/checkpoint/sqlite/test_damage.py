@@ -50,6 +50,18 @@ def test_a_flipped_bit_in_an_entry_is_found(filled: Path) -> None:
     assert numbers(contents(filled)[1]) == []
 
 
+def test_each_bit_of_an_entry_counts(filled: Path) -> None:
+    """Also where another value would be read: 5 for 4."""
+    with closing(sqlite3.connect(filled)) as db:
+        ((data,),) = db.execute("SELECT data FROM entries WHERE position = 6")
+    for bit in range(8 * len(data)):
+        changed = bytearray(data)
+        changed[bit // 8] ^= 1 << bit % 8
+        edit(filled, f"UPDATE entries SET data = x'{changed.hex()}' WHERE position = 6")
+        with closing(SqliteJournal(filled)) as journal, pytest.raises(DamagedStore):
+            journal.load(B)
+
+
 def test_no_entry_goes_unmissed_not_even_the_last(filled: Path) -> None:
     intact = filled.read_bytes()
     with closing(sqlite3.connect(filled)) as db:
