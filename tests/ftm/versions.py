@@ -7,6 +7,8 @@ from typing import Any
 
 import holdfast as hf
 from holdfast.ftm.mechanism import load
+from tests.ftm.accounts import Add as Count
+from tests.ftm.accounts import Counter
 from tests.ftm.replicated import Add, Fetch, Total
 
 FAULTY: Any = load(Path(__file__).with_name("faulty.py"))
@@ -134,3 +136,17 @@ def add_again(self: Any, message: Add) -> int:
 def add_badly(self: Any, message: Add) -> int:
     self.seen.append(message.n)
     return -1
+
+
+class SameCounter(Counter):
+    """Another one, as far as anybody sees."""
+
+
+class OtherCounter(Counter):
+    """Counts in another way."""
+
+    @hf.on(Count)
+    def add(self, message: Count) -> int:
+        self.tags = [*self.tags, message.tag]
+        self.total = message.amount + self.total
+        return self.total
