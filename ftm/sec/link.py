@@ -21,10 +21,35 @@ import msgspec
 
 from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.message import Message, message_name
-from ..sealed import ORDERS, TELLS, Agree, Back, Call, FrameRefused, Greet, Handle, LinkLost, Part, Reach, Refused, Sealed, Still
+from ..sealed import (
+    ORDERS,
+    TELLS,
+    Agree,
+    Back,
+    Call,
+    FrameRefused,
+    Greet,
+    Handle,
+    LinkLost,
+    Part,
+    Reach,
+    Refused,
+    Sealed,
+    Still,
+)
 from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
 from .certificates import MOST_NAME, Trust, about, make_request, public_of
-from .errors import CLOSED, MALFORMED, REPLAYED, UNTRUSTED, WRONG_PEER, WRONG_SESSION, EnrolmentRefused, NoCertificate, Rejected
+from .errors import (
+    CLOSED,
+    MALFORMED,
+    REPLAYED,
+    UNTRUSTED,
+    WRONG_PEER,
+    WRONG_SESSION,
+    EnrolmentRefused,
+    NoCertificate,
+    Rejected,
+)
 from .handshake import Participant, Response
 from .keys import Secret, SigningKey, raw_public
 from .session import HEAD, Limits, Session
