@@ -187,6 +187,15 @@ from holdfast.system.transaction.operation import Operation, Step
 
 if TYPE_CHECKING:
     from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
+    from holdfast.ftm.detector import Detection
+    from holdfast.ftm.events import (
+        FailedOver,
+        MechanismAttached,
+        MechanismDetached,
+        ReplicaJoined,
+        ReplicaLost,
+        WrongSuspicion,
+    )
     from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.mechanisms.lfr import LFR
     from holdfast.ftm.mechanisms.pbr import PBR
@@ -232,6 +241,7 @@ __all__ = [
     "DamagedStore",
     "DeadLetter",
     "DeleteChild",
+    "Detection",
     "Diverged",
     "DynamicSupervisor",
     "Event",
@@ -239,6 +249,7 @@ __all__ = [
     "ExitReason",
     "Exited",
     "Failed",
+    "FailedOver",
     "Flags",
     "GetChildSpec",
     "Held",
@@ -264,6 +275,8 @@ __all__ = [
     "Masked",
     "MaxChildren",
     "Mechanism",
+    "MechanismAttached",
+    "MechanismDetached",
     "MechanismRefused",
     "Message",
     "MessageIn",
@@ -325,6 +338,8 @@ __all__ = [
     "RemoteCrash",
     "ReplayDiverged",
     "ReplayPaced",
+    "ReplicaJoined",
+    "ReplicaLost",
     "ReplyHandle",
     "ResizePartitions",
     "ResizePool",
@@ -384,6 +399,7 @@ __all__ = [
     "WhichChildren",
     "Wrapped",
     "WrongActor",
+    "WrongSuspicion",
     "bounded",
     "calls",
     "check_children",
@@ -418,15 +434,22 @@ __all__ = [
 
 # Most programs protect nobody: what they do not use is not imported.
 _LAZY = {
+    "Detection": "holdfast.ftm.detector",
     "Diverged": "holdfast.ftm.alarms",
+    "FailedOver": "holdfast.ftm.events",
     "LFR": "holdfast.ftm.mechanisms.lfr",
     "Masked": "holdfast.ftm.alarms",
     "Mechanism": "holdfast.ftm.mechanism",
+    "MechanismAttached": "holdfast.ftm.events",
+    "MechanismDetached": "holdfast.ftm.events",
     "MechanismRefused": "holdfast.ftm.mechanism",
     "NoMajority": "holdfast.ftm.voters",
     "PBR": "holdfast.ftm.mechanisms.pbr",
     "ProtectionLost": "holdfast.ftm.alarms",
+    "ReplicaJoined": "holdfast.ftm.events",
+    "ReplicaLost": "holdfast.ftm.events",
     "TR": "holdfast.ftm.mechanisms.tr",
+    "WrongSuspicion": "holdfast.ftm.events",
     "compose": "holdfast.ftm.mechanism",
 }
 

@@ -88,6 +88,7 @@ class StateUpdate(After):
         standing = self._standing
         await standing.until_ready()
         if message.state.turn < standing.server.turn:
+            standing.log.add(message.log)  # Else what it says of these requests would be known to nobody here.
             return standing.server.turn  # It was overtaken.
         turn = await self.state.ask(Apply(message.state), timeout=FOREVER)
         standing.log.add(message.log)
