@@ -19,6 +19,15 @@ class MechanismDetached(Event, frozen=True, eq=False):
     seconds: float
 
 
+class MechanismChanged(Event, frozen=True, eq=False):
+    """The actor is protected by other layers from now on, without having stopped; `seconds` it handled nothing."""
+
+    before: tuple[str, ...]
+    layers: tuple[str, ...]
+    config: int
+    seconds: float
+
+
 class FailedOver(Event, frozen=True, eq=False):
     """Another replica leads; `seconds` from when the end of the old one was noticed."""
 

@@ -55,6 +55,8 @@ class FailoverManager(Actor):
         """See what is to be done, until there is nothing."""
         group = self._group
         while not group.is_over and group.is_begun:
+            if group.is_changing:
+                return  # It is short, and whoever does it wakes us.
             if group.primary is not None and not group.is_well(group.primary):
                 if group.is_awaited(group.primary):  # To end it would lose what only it has.
                     self._later()
@@ -99,7 +101,7 @@ class FailoverManager(Actor):
             return True
         for name, life in list(group.condemned.items()):
             self._step("kill")
-            await self._bury(name, life)
+            await bury(group, name, life)
             group.condemned.pop(name, None)
         self._step("lead")
         try:
@@ -127,19 +129,6 @@ class FailoverManager(Actor):
         group.send_again(careful=True)
         group.node.emit(FailedOver(group.path, name, group.epoch, seconds, group.why))
 
-    async def _bury(self, name: str, life: int) -> None:
-        """Kill a replica's process, if it is that life, and wait until it has been reaped."""
-        cell = self._group.cell_of(name)
-        if cell is None or cell.life != life or cell.state is not RUNNING:
-            return
-        worker = cell.host.worker_of(cell) if isinstance(cell.host, ProcessHost) else None
-        if worker is None:
-            cell.kill()
-            await cell.ended()
-        else:
-            worker.kill(KILLED)
-            await worker.gone()
-
     async def _tidied(self) -> bool:
         """Backups that have ended, or are suspected, do not count, and nobody waits for them. Whether one was."""
         group, found = self._group, False
@@ -155,7 +144,7 @@ class FailoverManager(Actor):
             if is_suspect:
                 group.dropped.add(name)
                 self._step("kill")
-                await self._bury(name, life)
+                await bury(group, name, life)
                 found = True
         return await self._alone() or found
 
@@ -183,3 +172,17 @@ class FailoverManager(Actor):
         if self._timer is not None:
             self._timer.cancel()
         self._timer = self.ctx.cell.node.loop.call_later(AGAIN_AFTER, self._group.wake)
+
+
+async def bury(group: Group, name: str, life: int) -> None:
+    """Kill a replica's process, if it is that life, and wait until it has been reaped."""
+    cell = group.cell_of(name)
+    if cell is None or cell.life != life or cell.state is not RUNNING:
+        return
+    worker = cell.host.worker_of(cell) if isinstance(cell.host, ProcessHost) else None
+    if worker is None:
+        cell.kill()
+        await cell.ended()
+    else:
+        worker.kill(KILLED)
+        await worker.gone()

@@ -39,6 +39,7 @@ from .messages import Done, Ended, Inward, Outward, Request, Work
 if TYPE_CHECKING:
     from ..actors.node import Node
     from ..checkpoint.switch import Switch
+    from .adaptation import Reconfiguration
 
 MOST_REQUESTS, MOST_BYTES = 512, 1_000_000
 """Of one batch."""
@@ -92,9 +93,14 @@ class Group:
         self.is_live = self.has_gone = False
         self.is_held = False  # nothing new goes in: nobody could take over yet
         self.is_suspended = self.is_stopping = False
+        self.change: Reconfiguration | None = None  # that is being made
+        self.is_resting = False  # nothing new goes in: the mechanism is about to be changed
+        self.is_changing = False  # the replicas change it: nobody else may tell them anything
+        self.is_joining = False  # a replica is catching up
         self.is_poked = False
         self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
         self._quiet: list[asyncio.Future[None]] = []
+        self._stirred: list[asyncio.Future[None]] = []
         # Whom to tell.
         self.on_live: Callable[[Live], None] = switch.from_life
         self.on_over: Callable[[str], None] = lambda why: None  # nobody is left who could lead
@@ -172,14 +178,35 @@ class Group:
 
     def lost(self, name: str, why: str) -> None:
         """A replica does not count any more."""
+        self.stir()
         if self.members.pop(name, None) is not None:
             self.node.emit(ReplicaLost(self.path, name, self.epoch, why))
 
     def joined(self, name: str, life: int) -> None:
         """A replica has caught up, and could lead."""
         self.members[name] = life
+        self.stir()
         self.go_on()
         self.on_joined()
+
+    def stirred(self) -> asyncio.Future[None]:
+        """A future that ends when a replica begins or ceases to count."""
+        future: asyncio.Future[None] = self.node.loop.create_future()
+        self._stirred.append(future)
+        return future
+
+    def stir(self) -> None:
+        """One has, or whoever waits for that should look again."""
+        waiting, self._stirred = self._stirred, []
+        for future in waiting:
+            if not future.done():
+                future.set_result(None)
+
+    def is_steady(self) -> bool:
+        """Whether one replica leads, and nobody has to be told so, or of a death."""
+        primary = self.primary
+        is_led = primary is not None and self.leading is None and self.is_well(primary)
+        return self.is_live and is_led and not self.condemned and not self.dropped and not self.is_joining
 
     def go_on(self) -> None:
         """New inputs may go in."""
@@ -244,6 +271,8 @@ class Group:
     def next_work(self) -> Work | None:
         """The next batch, if there is something, and none is out."""
         if self.out is not None or self.primary is None or not self.waiting or self.is_suspended or self.is_stopping:
+            return None
+        if self.is_resting:
             return None
         if self.has_gone and self.is_held:
             return None

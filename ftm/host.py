@@ -25,12 +25,14 @@ from ..checkpoint.homes import HomeHost, Homes, parent_ended, seen
 from ..checkpoint.method import Method
 from ..checkpoint.records import Restore
 from ..supervision.backoff import Backoff
+from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags, child
 from ..supervision.supervisor import Supervisor
+from .adaptation import REST_WITHIN, AdaptationEngine, CannotAdapt, Reconfiguration
 from .detector import Detection, Detector
 from .events import ReplicaLost
 from .failover import FailoverManager
-from .group import Group, forget_ended
+from .group import Group, Look, forget_ended
 from .join import Joiner
 from .mechanism import compose
 from .messages import Lead
@@ -40,6 +42,7 @@ from .proxy import Proxy, Settle
 if TYPE_CHECKING:
     from ..checkpoint.records import TurnEnd
     from ..checkpoint.switch import Switch
+    from .mechanism import Mechanism
 
 UNKEPT = Method("protected", durability="memory")
 """Of a child without recovery, as long as it is protected."""
@@ -65,7 +68,9 @@ class GroupHost(HomeHost):
         self.config = 1
         self.detection: Detection = getattr(self.layers[0], "detection", None) or Detection()
         self.replica: Callable[..., Start[Any]] = replica
+        self.last_config = 1  # that was ever given to a stack of mechanisms
         self.on_step: Callable[[str], None] | None = None  # for tests: called before each step of a failover
+        self.on_switched: Callable[[], None] = lambda: None
         self._starting: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
@@ -164,31 +169,74 @@ class GroupHost(HomeHost):
         group.on_joining = lambda name: self._bind_all(cell, group, name)
 
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
-        start = cell.extra().start
-        assert start is not None
-        bindings = {port: target.path for port, target in cell.extra().bindings.items()}
         parts = (
             child("proxy", Start(Proxy, (group,))),
             child("detector", Start(Detector, (group,))),
             child("failover", Start(FailoverManager, (group, self._step))),
             child("join", Start(Joiner, (group,))),
+            child("adapt", Start(AdaptationEngine, (group, *self._adapting(cell, group), self._step))),
         )
-        replicas = tuple(
-            child(
-                name,
-                self.replica(
-                    Setting(
-                        cell.path, name, self.config, self.method.data(), bindings, self.detection.interval
-                    ),
-                    start,
-                    tuple(layer.describe() for layer in self.layers),
-                ),
-                isolation="process",
-                backoff=Backoff(initial=0.01, maximum=2.0, reset_after=5.0),
-            )
-            for name in group.names
-        )  # fmt: skip
-        return parts + replicas
+        return parts + tuple(self._replica_spec(cell, name, self.config, self.layers) for name in group.names)
+
+    def _replica_spec(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> ChildSpec:
+        return child(
+            name,
+            self._replica_start(cell, name, config, layers),
+            isolation="process",
+            backoff=Backoff(initial=0.01, maximum=2.0, reset_after=5.0),
+        )
+
+    def _replica_start(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> Start[Any]:
+        start = cell.extra().start
+        assert start is not None
+        bindings = {port: target.path for port, target in cell.extra().bindings.items()}
+        setting = Setting(cell.path, name, config, self.method.data(), bindings, self.detection.interval)
+        return self.replica(setting, start, tuple(layer.describe() for layer in layers))
+
+    # -- other mechanisms -------------------------------------------------------------------------------------------
+
+    async def adapt(
+        self, cell: Cell, mechanism: Any, switched: Callable[[], None], rest_within: float = REST_WITHIN
+    ) -> Reconfiguration:
+        """Go on with another stack of mechanisms.
+
+        Args:
+            cell: the address.
+            mechanism: the whole new stack.
+            switched: called at the instant from which on it is the one.
+            rest_within: seconds within which what is inside has to come to its end.
+
+        Raises:
+            CannotAdapt: why it stays as it was.
+        """
+        group = self.group
+        if group is None or group.is_over or self._ending is not None:
+            raise CannotAdapt(cell.path, "it is being recovered; try again")
+        if group.change is not None:
+            raise CannotAdapt(cell.path, "it is being changed already")
+        self.last_config += 1
+        change = group.change = Reconfiguration(group, self.last_config, compose(mechanism), rest_within)
+        self.on_switched = switched
+        group.tell("adapt", Look())
+        await asyncio.shield(change.outcome)
+        return change
+
+    def _adapting(self, cell: Cell, group: Group) -> tuple[Any, Any]:
+        """What the engine needs of us: the spec of a replica, and how a change is made to last."""
+
+        def spec(name: str, config: int, layers: tuple[Mechanism, ...]) -> ChildSpec:
+            return self._replica_spec(cell, name, config, layers)
+
+        def switched(change: Reconfiguration) -> None:
+            self.layers, self.config = change.layers, change.config
+            group.config = change.config
+            for name in group.names:
+                one = group.cell_of(name)
+                if one is not None:
+                    respec(one, self._replica_start(cell, name, change.config, change.layers))
+            self.on_switched()
+
+        return spec, switched
 
     def _step(self, name: str) -> None:
         if self.on_step is not None:
@@ -363,6 +411,8 @@ class GroupHost(HomeHost):
         group, self.group = self.group, None
         if group is not None:
             group.is_over = True
+            if group.change is not None:
+                group.change.close("its life has ended")
         ftm = (cell.children or {}).get("ftm")
         if ftm is None:
             return
@@ -379,6 +429,8 @@ class GroupHost(HomeHost):
         if ftm is not None and ftm.state is not GONE:
             if self.group is not None:
                 self.group.is_over = True
+                if self.group.change is not None:
+                    self.group.change.close("it has stopped")
             ftm.kill()
         start = cell.extra().start
         self.give_up(cell, start.kind._topics if start is not None else (), restarting=parent_ended(cell))

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 from ..actors.actor import Actor, on
 from ..actors.errors import HoldfastError
 from .events import ReplicaJoined
+from .failover import bury
 from .group import Look
-from .messages import Follow
+from .messages import ConfigMismatch, Follow
 from .orders import Join
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ class Joiner(Actor):
 
     def on_start(self, restored: bool) -> None:
         """Whoever was about to join begins anew."""
+        self._group.is_joining = False
         self._group.tell("join", Look())
 
     def on_stop(self, reason: object) -> None:
@@ -49,17 +51,25 @@ class Joiner(Actor):
         group = self._group
         for name in group.names:
             primary = group.primary
+            if group.is_changing or group.is_resting:
+                return  # Whoever does that wakes us.
             if group.is_over or not group.is_live or primary is None or name == primary or name in group.members:
                 continue
             life = group.life_of(name)
             if not life or group.up.get(name) != life or group.suspects.get(name) == life or group.dropped:
                 continue
+            group.is_joining = True
             try:
                 await self._join(primary, name, life)
+            except ConfigMismatch:  # It was started before the mechanism was changed; its next life knows better.
+                await bury(group, name, life)
             except HoldfastError:
                 self._later()  # If one of them has died, that is seen elsewhere.
             else:
                 self._delay = FIRST_RETRY
+            finally:
+                group.is_joining = False
+                group.stir()
 
     async def _join(self, primary: str, name: str, life: int) -> None:
         group, epoch, begin = self._group, self._group.epoch, time.monotonic()

@@ -6,6 +6,7 @@ group `holdfast.mechanisms`, or loaded from a file or module that the system has
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
 import importlib
@@ -14,7 +15,7 @@ import os
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
 import msgspec
 
@@ -23,10 +24,13 @@ from ..actors.errors import HoldfastError, type_name
 from ..actors.message import message_name
 
 if TYPE_CHECKING:
-    from .bricks import After, Before, Proceed
+    from .bricks import After, Before, Brick, Proceed
 
 M = TypeVar("M", bound="Mechanism")
 
+Part = Literal["before", "proceed", "after"]
+SCRIPTS = "holdfast_script_"
+"""How the modules of reconfiguration scripts are called: only the process that runs the script has them by name."""
 ENTRY_POINTS = "holdfast.mechanisms"
 BUILT_IN = ("pbr", "lfr", "tr")
 
@@ -53,13 +57,25 @@ class Role:
     """Whether the protected actor lives there; else its state is only kept, as bytes."""
 
 
+class Code(msgspec.Struct, array_like=True, frozen=True):
+    """A class by name, and the file if it came from one."""
+
+    kind: str
+    file: str = ""
+    sha256: str = ""
+
+
 class Description(msgspec.Struct, array_like=True, frozen=True):
-    """A mechanism on its way to another process: its class by name, its settings, and the file if it came from one."""
+    """A mechanism on its way to another process: its class by name, its settings, and the file if it came from one.
+
+    `bricks` were exchanged for others at run time: role, part, class.
+    """
 
     kind: str
     settings: dict[str, Any]
     file: str = ""
     sha256: str = ""
+    bricks: tuple[tuple[str, str, Code], ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,6 +95,8 @@ class Mechanism:
     """Its place in a composition, outermost first: link, assertion, replication, repetition."""
     roles: ClassVar[dict[str, Role]] = {}
     """The first is that of the replica that leads, the second that of the others."""
+    exchanged: ClassVar[dict[tuple[str, str], type[Brick]]] = {}
+    """Bricks of this very instance that are others than its class says, by role and part (`with_brick`)."""
 
     def check(self, kind: type[Actor], where: str = "") -> None:
         """Whether it suits this class.
@@ -96,19 +114,49 @@ class Mechanism:
     def role(self, *, leads: bool) -> Role:
         """What a replica does that leads, or does not."""
         roles = list(self.roles.values()) or [Role()]
-        return roles[0] if leads else roles[-1]
+        role, name = roles[0] if leads else roles[-1], self.role_name(leads=leads)
+        other: dict[str, Any] = {part: kind for (of, part), kind in self.exchanged.items() if of == name}
+        return dataclasses.replace(role, **other) if other else role
 
     def role_name(self, *, leads: bool) -> str:
         """How that is called."""
         names = list(self.roles) or ["single"]
         return names[0] if leads else names[-1]
 
+    def with_brick(self, role: str, part: str, kind: type[Brick]) -> Self:
+        """The same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
+        new = copy.copy(self)
+        object.__setattr__(new, "exchanged", {**self.exchanged, (role, part): kind})
+        return new
+
     def describe(self) -> Description:
         """For another process."""
-        module = sys.modules.get(type(self).__module__)
-        file, digest = getattr(module, "__holdfast_file__", ("", ""))
+        code = code_of(type(self))
         settings = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.init}
-        return Description(message_name(type(self)), settings, file, digest)
+        bricks = tuple((*key, code_of(kind)) for key, kind in sorted(self.exchanged.items(), key=lambda pair: pair[0]))
+        return Description(code.kind, settings, code.file, code.sha256, bricks)
+
+
+def code_of(kind: type[Any]) -> Code:
+    """How another process finds a class."""
+    module = sys.modules.get(kind.__module__)
+    file, digest = getattr(module, "__holdfast_file__", ("", ""))
+    if not file and kind.__module__.startswith(SCRIPTS) and getattr(module, "__file__", None):
+        file = str(getattr(module, "__file__", ""))
+        digest = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    return Code(message_name(kind), file, digest)
+
+
+def find_class(code: Code) -> Any:
+    """The class that is meant.
+
+    Raises:
+        MechanismRefused: its file is another one. What importing it raises.
+    """
+    module, _, path = code.kind.partition(":")
+    if code.file:
+        return _attribute(load_module(code.file, sha256=code.sha256), path)
+    return _attribute(sys.modules.get(module) or importlib.import_module(module), path)
 
 
 def has_state_access(kind: type[Actor]) -> bool:
@@ -141,20 +189,20 @@ def revive(description: Description) -> Mechanism:
     """
     name = description.kind
     try:
-        if description.file:
-            kind: Any = load(description.file, sha256=description.sha256)
-            if message_name(kind) != name:
-                kind = _attribute(sys.modules[kind.__module__], name.partition(":")[2])
-        else:
-            module, _, path = name.partition(":")
-            kind = _attribute(sys.modules.get(module) or importlib.import_module(module), path)
-        made = kind(**description.settings)
+        made = find_class(Code(name, description.file, description.sha256))(**description.settings)
     except MechanismRefused:
         raise
     except Exception as error:  # Importing runs the file: anything may be raised.
         raise MechanismRefused(name, f"it cannot be loaded: {type_name(type(error))}: {error}") from error
     if not isinstance(made, Mechanism):
         raise MechanismRefused(name, "it is no Mechanism")
+    for role, part, code in description.bricks:
+        try:
+            made = made.with_brick(role, part, find_class(code))
+        except MechanismRefused:
+            raise
+        except Exception as error:  # The same.
+            raise MechanismRefused(name, f"{code.kind} cannot be loaded: {error}") from error
     return made
 
 
@@ -203,6 +251,15 @@ def load(source: str | Path, *, sha256: str = "") -> type[Mechanism]:
             raise
         except Exception as error:
             raise MechanismRefused(text, f"it cannot be loaded: {type_name(type(error))}: {error}") from error
+    return only(load_module(text, sha256=sha256), text)
+
+
+def load_module(text: str, *, sha256: str = "") -> Any:
+    """The module that a file makes.
+
+    Raises:
+        MechanismRefused: it cannot be loaded, is another one, or not safe from others.
+    """
     path = Path(text).resolve()
     try:
         about = path.stat()
@@ -214,7 +271,7 @@ def load(source: str | Path, *, sha256: str = "") -> type[Mechanism]:
     digest = hashlib.sha256(code).hexdigest()
     if sha256 and sha256 != digest:
         raise MechanismRefused(text, f"the file has changed: its SHA-256 is {digest}, not {sha256}")
-    return only(_run(path, code, digest), text)
+    return _run(path, code, digest)
 
 
 def _run(path: Path, code: bytes, digest: str) -> Any:

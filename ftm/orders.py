@@ -58,6 +58,22 @@ class Join(Message[int]):
     peer: str
 
 
+class Stand(msgspec.Struct, array_like=True):
+    """How a replica stands when nothing is inside."""
+
+    epoch: int
+    config: int
+    turn: int
+    leads: bool
+
+
+class Quiesce(Message[Stand]):
+    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in."""
+
+    epoch: int
+    config: int
+
+
 class Finish(Message[None]):
     """End in good order: a last snapshot (if the method takes any), then `on_stop` of the protected actor."""
 

@@ -21,7 +21,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
-from .bricks import FOREVER, Abandon, Brick, Flush, Where
+from .bricks import FOREVER, Abandon, Brick, Drain, Flush, Where
 from .messages import (
     CannotJoin,
     ConfigMismatch,
@@ -38,7 +38,7 @@ from .messages import (
     Taken,
     Work,
 )
-from .orders import Export, Exported, Finish, Install, Join, Peer
+from .orders import Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
 from .standing import PeerLost
 
 if TYPE_CHECKING:
@@ -418,6 +418,29 @@ class RequestProtocol(Brick):
             assert life.cell.actor is not None
             stash = [fed.feed.id for fed in life.stash]
             return Exported(life.turn, save_state(life.cell.actor), stash)
+        finally:
+            self._holds -= 1
+            self._go_on()
+
+    @on(Quiesce)
+    def _quiesce(self, message: Quiesce) -> Any:
+        self._check(message.epoch, message.config)
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._come_to_rest(handle))  # Not in line with other orders: one of them may unblock it.
+        return handle
+
+    async def _come_to_rest(self, handle: ReplyHandle[Any]) -> None:
+        standing = self._standing
+        self._holds += 1
+        try:
+            await self._quiet()
+            await self.proceed.ask(Flush(), timeout=FOREVER)
+            for path in list(standing.paths.values()):
+                if path != self.ctx.path:
+                    await standing.node.cell_at(path).ref.ask(Drain(), timeout=FOREVER)
+            handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads))
+        except HoldfastError as error:
+            handle.fail(error)
         finally:
             self._holds -= 1
             self._go_on()

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from ..actors.actor import Actor, Start, on, start
 from ..actors.bindings import Binding
 from ..actors.cell import Cell
-from ..actors.errors import HoldfastError
+from ..actors.errors import HoldfastError, type_name
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.message import Message
 from ..checkpoint.method import Method
@@ -50,6 +50,12 @@ class Abort(Message[None]):
     config: int
 
 
+class EndBricks(Message):
+    """From the replica to itself: these are not needed any more."""
+
+    names: list[str]
+
+
 class Tick(Message):
     """It is time for a heartbeat."""
 
@@ -84,6 +90,9 @@ class Place(NamedTuple):
     name: str  # that it would like
 
 
+PARTS: dict[str, type[Brick]] = {"before": Before, "proceed": Proceed, "after": After}
+
+
 def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
     """The bricks of a composition, by slot, outermost layer first.
 
@@ -98,6 +107,8 @@ def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
             raise MechanismRefused(one.name, "it stands in the composition twice")
         if index:
             places[f"{one.name}.protocol"] = Place(InnerProtocol, None, f"{prefix}protocol")
+        for part, kind in PARTS.items():
+            check_brick(one, part, getattr(role, part) or kind)
         before, after = role.before or Before, role.after or After
         places[f"{one.name}.before"] = Place(before, one if role.before else None, f"{prefix}before")
         places[f"{one.name}.after"] = Place(after, one if role.after else None, f"{prefix}after")
@@ -107,6 +118,20 @@ def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
             proceed = role.proceed, one
     places["proceed"] = Place(proceed[0], proceed[1], "proceed")
     return places
+
+
+def check_brick(mechanism: Mechanism, part: str, kind: object) -> None:
+    """Whether a class can stand there.
+
+    Raises:
+        MechanismRefused: it is no brick of that sort, or lacks a binding.
+    """
+    base = PARTS[part]
+    if not isinstance(kind, type) or not issubclass(kind, base):
+        raise MechanismRefused(mechanism.name, f"its {part} must be a {base.__name__}, not {kind!r}")
+    missing = [port for port in base._bindings if port not in kind._bindings]
+    if missing:
+        raise MechanismRefused(mechanism.name, f"{type_name(kind)} has no binding {', '.join(missing)}")
 
 
 @dataclasses.dataclass
@@ -229,8 +254,8 @@ class Replica(Supervisor):
                 self._give_up_address(one, SHUTDOWN)
                 self._forget(one)
 
-    async def _take_up(self, woven: Woven, *, leads: bool | None = None) -> None:
-        """Have this stack be the one: bind everything, end what is not needed."""
+    async def _take_up(self, woven: Woven, *, leads: bool | None = None, behind: bool = False) -> None:
+        """Have this stack be the one: bind everything, end what is not needed (`behind`: when we have answered)."""
         old, self._woven, standing = self._woven, woven, self._standing
         kept = set(woven.names.values())
         left = [name for name in old.names.values() if name not in kept and name in self._children]
@@ -248,7 +273,10 @@ class Replica(Supervisor):
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         standing.forget_bricks()
         self._bind_all(woven)
-        await self._end_bricks(left)
+        if behind:
+            self.ctx.ref.tell(EndBricks(left))
+        else:
+            await self._end_bricks(left)
         if not standing.computes:
             await self._keep_state()
         elif standing.leads or standing.is_ready:
@@ -262,7 +290,37 @@ class Replica(Supervisor):
         await server.drop_life()
 
     def _bind_all(self, woven: Woven) -> None:
+        node = self.ctx.cell.node
+        for owner, port, target in self._wiring(woven):
+            node.bind(owner, port, target)
+        proceed = self._cell(woven.names["proceed"]).actor
+        assert isinstance(proceed, Proceed)
+        proceed.take_over()
+
+    def _check_wiring(self, woven: Woven) -> None:
+        """Whether all bindings can be made, and nothing that is needed is left unbound.
+
+        Raises:
+            MechanismRefused: which one.
+        """
+        bound: dict[Cell, set[str]] = {}
+        for owner, port, target in self._wiring(woven):
+            kind: Any = owner.extra().start
+            if port not in kind.kind._bindings:
+                raise MechanismRefused(owner.path, f"{type_name(kind.kind)} has no binding {port!r}")
+            if target.is_dead and owner.parent is target.parent:
+                raise MechanismRefused(owner.path, f"its {port!r} would be bound to {target.path}, which has ended")
+            bound.setdefault(owner, {"peer"}).add(port)
+        for slot, name in woven.names.items():
+            cell, kind = self._cell(name), woven.places[slot].kind
+            left = sorted(set(kind._bindings) - bound.get(cell, set()))
+            if left:
+                raise MechanismRefused(cell.path, f"nothing would be bound to its {', '.join(left)}")
+
+    def _wiring(self, woven: Woven) -> list[tuple[Cell, str, Cell]]:
+        """All bindings of a stack: owner, port, target."""
         node, names, layers = self.ctx.cell.node, woven.names, woven.layers
+        found: list[tuple[Cell, str, Cell]] = []
         proxy = node.cell_at(f"{self._setting.address}/ftm/proxy")
         state, server = self._cell(STATE), self._cell(SERVER)
         cell = {slot: self._cell(name) for slot, name in names.items()}
@@ -270,21 +328,22 @@ class Replica(Supervisor):
             protocol = cell[PROTOCOL if index == 0 else f"{one.name}.protocol"]
             before, after = cell[f"{one.name}.before"], cell[f"{one.name}.after"]
             inner = layers[index + 1].name if index + 1 < len(layers) else None
-            node.bind(protocol, "before", before)
-            node.bind(protocol, "next", proxy if index == 0 else cell[f"{layers[index - 1].name}.after"])
-            node.bind(before, "next", cell["proceed"] if inner is None else cell[f"{inner}.protocol"])
-            node.bind(after, "next", protocol)
-            for brick in (protocol, before, after):
-                node.bind(brick, "state", state)
+            found += [
+                (protocol, "before", before),
+                (protocol, "next", proxy if index == 0 else cell[f"{layers[index - 1].name}.after"]),
+                (before, "next", cell["proceed"] if inner is None else cell[f"{inner}.protocol"]),
+                (after, "next", protocol),
+            ]
+            found += [(brick, "state", state) for brick in (protocol, before, after)]
         proceed = cell["proceed"]
-        node.bind(cell[PROTOCOL], "proceed", proceed)
-        node.bind(proceed, "next", cell[f"{layers[-1].name}.after"])
-        node.bind(proceed, "server", server)
-        node.bind(proceed, "state", state)
-        node.bind(proceed, "out", proxy)
-        computing = proceed.actor
-        assert isinstance(computing, Proceed)
-        computing.take_over()
+        return [
+            *found,
+            (cell[PROTOCOL], "proceed", proceed),
+            (proceed, "next", cell[f"{layers[-1].name}.after"]),
+            (proceed, "server", server),
+            (proceed, "state", state),
+            (proceed, "out", proxy),
+        ]
 
     # -- orders -----------------------------------------------------------------------------------------------------
 
@@ -309,7 +368,9 @@ class Replica(Supervisor):
                 one.check(self._recipe.kind, self._setting.address)
             leads = self._standing.leads
             self._prepared = await self._start_bricks(message.config, layers, leads=leads)
+            self._check_wiring(self._prepared)
         except HoldfastError as error:
+            await self._drop_prepared()
             return self._fail(error)
         return None
 
@@ -322,7 +383,7 @@ class Replica(Supervisor):
             self._prepared = woven
             return self._fail(MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared"))
         await self._catch_up()
-        await self._take_up(woven)
+        await self._take_up(woven, behind=True)
         self._standing.peer_turn = -2  # What the other one has is not known to the new bricks.
         return None
 
@@ -332,6 +393,10 @@ class Replica(Supervisor):
         for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
             await self._cell(names[slot]).ref.ask(Settle(), timeout=FOREVER)
         await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
+
+    @on(EndBricks)
+    async def _end(self, message: EndBricks) -> None:
+        await self._end_bricks(message.names)
 
     @on(Abort)
     async def _abort(self, message: Abort) -> None:

@@ -151,6 +151,40 @@ class Moves:
         if before.isolation == "process":
             await self._settle_in(cell, "process", before.limits, timeout)
 
+    async def adapt(self, cell: Cell, mechanism: Any, timeout: float) -> None:
+        """Have a protected actor go on with another stack of mechanisms, all of it given.
+
+        Raises:
+            CannotAdapt, ActorStopped, AskTimeout: it stays as it was.
+        """
+        await self._alone(cell, self._adapted(cell, mechanism, timeout), f"adaptation of {cell.path}")
+
+    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float) -> None:
+        from ..ftm.adaptation import CannotAdapt
+        from ..ftm.events import MechanismChanged
+        from ..ftm.host import GroupHost
+
+        before: ChildSpec = cell.spec
+        wanted = dataclasses.replace(before, mechanism=mechanism)
+        end = self._node.loop.time() + timeout
+        while True:
+            if not cell.host.is_up(cell):
+                await order(cell, Ready(), timeout)  # It is being recovered: its next life is changed.
+            host = cell.host
+            if not isinstance(host, GroupHost):
+                raise CannotAdapt(cell.path, "it has no mechanism")
+            old, life = host.layers, cell.life
+            try:
+                change = await host.adapt(cell, mechanism, lambda: replace_mechanism(cell, wanted))
+                break
+            except CannotAdapt:
+                if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
+                    raise
+        if self._node.watched:
+            was, names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
+            seconds = change.gone_on_at - change.rest_at
+            self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
+
     async def _alone(self, cell: Cell, change: Coroutine[Any, Any, None], name: str) -> None:
         """Carry out a change of where an actor lives while no other is; it comes to its end in any case."""
 

@@ -39,6 +39,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .protection import Protection
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
@@ -153,6 +154,9 @@ class ActorSystem(Recorded, Controls):
         node.keeper = self._homes
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
+        self.protection = Protection(self._homes)
+        if self.protection.is_needed:
+            node.complete = self.protection.completing(node.complete)
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
         up = lives.begin(root, Start(Supervisor, (self._flags, ())))

@@ -64,9 +64,20 @@ def digest(end: TurnEnd, released: list[int]) -> int:
 class Sender(Brick):
     """A brick that tells its peer things in order, and waits for the answers when it wants."""
 
+    _under_way: set[asyncio.Task[bool]] | None = None
+
     def send_peer(self, message: Message[Any]) -> asyncio.Task[bool]:
         """Tell the peer; the result says whether it has it, False if it does not count any more."""
-        return self.ctx.create_task(self._sent(message))
+        under_way = self._under_way = self._under_way or set()
+        task = self.ctx.create_task(self._sent(message))
+        under_way.add(task)
+        task.add_done_callback(under_way.discard)
+        return task
+
+    async def drain(self) -> None:
+        """Wait until the peer has all of it."""
+        for task in list(self._under_way or ()):
+            await asyncio.wait((task,))
 
     async def _sent(self, message: Message[Any]) -> bool:
         try:

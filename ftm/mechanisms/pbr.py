@@ -65,6 +65,11 @@ class Checkpointing(After):
             self._send(checkpoint)
         return done
 
+    async def drain(self) -> None:
+        """Wait until the backup has all states."""
+        for task in list(self._out):
+            await asyncio.wait((task,))
+
     async def _hand_over(self, checkpoint: Checkpoint) -> None:
         try:
             await self.ask_peer(checkpoint)
