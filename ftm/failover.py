@@ -39,7 +39,7 @@ class FailoverManager(Actor):
 
     def __init__(self, group: Group, step: Callable[[str], None] | None = None) -> None:
         self._group = group
-        self._step = step or (lambda name: None)
+        self._step = step or nothing
         self._timer: asyncio.TimerHandle | None = None
 
     def on_start(self, restored: bool) -> None:
@@ -186,3 +186,7 @@ async def bury(group: Group, name: str, life: int) -> None:
     else:
         worker.kill(KILLED)
         await worker.gone()
+
+
+def nothing(step: str) -> None:
+    """Nobody wants to know of the steps."""

@@ -134,8 +134,8 @@ class Moves:
 
     async def _unprotected(self, cell: Cell, timeout: float) -> None:
         from ..ftm.events import MechanismDetached
+        from ..ftm.leaving import from_group
         from ..ftm.mechanism import compose
-        from ..ftm.moving import from_group
 
         before: ChildSpec = cell.spec
         wanted = dataclasses.replace(before, mechanism=None, isolation="task")

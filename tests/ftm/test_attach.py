@@ -197,7 +197,7 @@ async def test_if_the_new_life_cannot_begin_the_old_one_goes_on(
     await attach(system, ref)
     await load.reached(10)
     veto.touch()
-    with pytest.raises(hf.TransactionFailed, match="not now"):
+    with pytest.raises(hf.TransactionFailed, match="could not begin"):
         await detach(system, ref)
     assert isinstance(ref._cell.host, GroupHost)
     await load.reached(10)
