@@ -22,6 +22,7 @@ from ..actors.errors import HoldfastError
 from ..actors.message import Message
 from ..supervision.admin import AlreadyPresent, DeleteChild, StartChild, TerminateChild
 from ..supervision.spec import ChildSpec
+from .failover import bury
 from .group import Look
 from .messages import ConfigMismatch, StaleEpoch
 from .orders import Quiesce, Stand
@@ -76,6 +77,7 @@ class Reconfiguration:
         self.prepared: dict[str, int] = {}  # name to life, of those that have the new bricks
         self.epoch = -1  # in which they were prepared
         self.behind: set[str] = set()  # those that have not got all that the primary had
+        self.failed: dict[str, int] = {}  # name to life, of those that have not changed though they should have
         self.started: list[str] = []  # replicas that are new
         self.why = ""  # it is given up
         self.rest_at = self.gone_on_at = 0.0
@@ -279,6 +281,7 @@ class AdaptationEngine(Actor):
         done = [name for name, error in found.items() if error is None]
         for name, error in found.items():
             if error is not None and group.life_of(name) == change.prepared[name]:
+                change.failed[name] = change.prepared[name]
                 group.suspect(name, change.prepared[name], f"it did not change its mechanism: {error}")
         if not done:
             change.stage, change.why = UNDOING, f"no replica could: {'; '.join(str(one) for one in found.values())}"
@@ -300,6 +303,8 @@ class AdaptationEngine(Actor):
         group = self._group
         self._step("tidy")
         self._go_on()
+        for name, life in change.failed.items():
+            await bury(group, name, life)
         left = [name for name in group.names if name not in change.names]
         if group.primary is None and left:
             await self._wait_for_change(LOOK_AGAIN)

@@ -132,6 +132,9 @@ def check_brick(mechanism: Mechanism, part: str, kind: object) -> None:
     missing = [port for port in base._bindings if port not in kind._bindings]
     if missing:
         raise MechanismRefused(mechanism.name, f"{type_name(kind)} has no binding {', '.join(missing)}")
+    more = sorted(set(kind._bindings) - set(base._bindings))
+    if more:
+        raise MechanismRefused(mechanism.name, f"nothing would be bound to {', '.join(more)} of {type_name(kind)}")
 
 
 @dataclasses.dataclass

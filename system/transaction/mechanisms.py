@@ -68,7 +68,10 @@ class OnProtection(OnLiving):
         await self._run(system, cell, self._after)
 
     def verify(self, system: ActorSystem) -> None:
-        if described(self.cell(system).spec.mechanism) != described(self._after):
+        place = self._place  # With what all steps have made of it.
+        assert place is not None
+        assert place.spec is not None
+        if described(self.cell(system).spec.mechanism) != described(place.spec.mechanism):
             raise wrong(self.target, "its mechanism is another one again")
 
     def seal(self, system: ActorSystem) -> None:
