@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from ..actors import lives, mailbox
 from ..actors.cell import Cell, Host
@@ -39,9 +39,6 @@ from ..checkpoint.records import DOWN, EXIT, MESSAGE, PIPE, START, TICK
 from ..checkpoint.switch import Switch
 from .host import GroupHost, is_unkept
 from .orders import Export
-
-if TYPE_CHECKING:
-    pass
 
 
 class FromGroup(Move):
