@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import importlib
 import inspect
@@ -9,6 +10,8 @@ import os
 import pkgutil
 import re
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +20,7 @@ import pytest
 
 import holdfast as hf
 import holdfast.ftm
+from holdfast.console.endpoint import control_endpoint
 from holdfast.ftm.coverage import coverage, selection_table
 from holdfast.ftm.declaration import FAULTS, NEEDS
 from holdfast.ftm.mechanism import BUILT_IN, MechanismRefused, find, load
@@ -27,6 +31,7 @@ from tests.ftm.accounts import Add, Closed, Counter, Load, Tags
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "mechanisms.md").read_text("utf-8")
 TROUBLE = (ROOT / "docs" / "mechanisms-trouble.md").read_text("utf-8")
+SCRIPT = ROOT / "examples" / "scripts" / "protect.py"
 AUDIT_TRAIL = ROOT / "examples" / "mechanisms" / "audit_trail.py"
 
 
@@ -121,6 +126,26 @@ async def test_the_mechanism_of_the_example_runs_from_its_file(system: hf.ActorS
     assert all(lines.index(f"{number} Add from ") < at for number, at in first.items())
 
 
+async def test_the_script_of_the_example_is_applied_from_another_process(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """A76."""
+    await system.start(hf.supervisor("bank", children=[hf.child("alice", hf.start(Counter))]))
+    alice = system.ref("/app/bank/alice", Counter)
+    assert await alice.ask(Add(0)) == 1
+    async with control_endpoint(system, tmp_path / "app.sock") as socket:
+        command = (sys.executable, "-m", "holdfast.console.cli", "apply", SCRIPT, "--socket", socket)
+        for more, mechanism in (("--dry-run",), None), ((), hf.LFR()):
+            process = await asyncio.create_subprocess_exec(*map(str, (*command, *more)), stdout=subprocess.PIPE)
+            output, _ = await process.communicate()
+            assert process.returncode == 0
+            assert [line[:12] for line in output.decode().splitlines()[:4]] == [
+                "1. attach PB", "2. compose /", "3. transitio", "4. detach tr",
+            ]  # fmt: skip
+            assert alice._cell.spec.mechanism == mechanism
+    assert await alice.ask(Add(1)) == 2
+
+
 def modules() -> list[Any]:
     """All of holdfast.ftm, and what keeps mechanisms over a restart of the root."""
     names = [one.name for one in pkgutil.walk_packages(holdfast.ftm.__path__, "holdfast.ftm.")]
@@ -147,7 +172,6 @@ def test_each_reason_of_a_rejection_is_explained() -> None:
     table = TROUBLE[TROUBLE.index("| `Rejected.reason`") :]
     reasons = {value for key, value in vars(sec_errors).items() if key.isupper() and not key.startswith("_")}
     assert not {reason for reason in reasons if f"`{reason}`" not in table}
-
 
 
 REFUSED: dict[str, Callable[[Any], None]] = {
