@@ -13,7 +13,7 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
@@ -24,7 +24,9 @@ from ..actors.errors import HoldfastError, type_name
 from ..actors.message import message_name
 
 if TYPE_CHECKING:
+    from ..actors.node import Node
     from .bricks import After, Before, Brick, Proceed
+    from .sealed import SecuredLink
 
 M = TypeVar("M", bound="Mechanism")
 
@@ -32,7 +34,7 @@ Part = Literal["before", "proceed", "after"]
 SCRIPTS = "holdfast_script_"
 """How the modules of reconfiguration scripts are called: only the process that runs the script has them by name."""
 ENTRY_POINTS = "holdfast.mechanisms"
-BUILT_IN = ("pbr", "lfr", "tr")
+BUILT_IN = ("pbr", "lfr", "tr", "sec")
 
 
 class MechanismRefused(HoldfastError):
@@ -122,6 +124,17 @@ class Mechanism:
         """How that is called."""
         names = list(self.roles) or ["single"]
         return names[0] if leads else names[-1]
+
+    def open_link(
+        self,
+        node: Node,
+        address: str,
+        path: str,
+        epoch: Callable[[], int],
+        enrols: Callable[[], list[str]] | None = None,
+    ) -> SecuredLink | None:
+        """One that secures the links (`layer` "link"): the end of them that is at `path`."""
+        return None
 
     def with_brick(self, role: str, part: str, kind: type[Brick]) -> Self:
         """The same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
