@@ -49,7 +49,7 @@ class AuditTrail(Mechanism):
     """
 
     name: ClassVar[str] = "audit_trail"
-    layer: ClassVar[str] = "assertion"  # outside of what replicates: it sees each request once
+    layer: ClassVar[str] = "assertion"  # it stands outside of what runs a request more than once
     roles: ClassVar[dict[str, Role]] = {"leader": Role(before=NoteRequests, after=NoteOutcomes), "other": Role()}
 
     file: str = "audit.log"
