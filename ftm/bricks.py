@@ -68,10 +68,6 @@ class Settle(Message[None]):
     """Answered when all that came before it was handled."""
 
 
-class Drain(Message[None]):
-    """Answered when the other replica has all that was sent to it."""
-
-
 class Flush(Message[None]):
     """Answered when all that is ready was handed over."""
 
@@ -284,10 +280,6 @@ class Brick(Actor):
     async def drain(self) -> None:
         """Wait until the other replica has what it was sent, if that is not waited for anyway; nothing new comes."""
 
-    @on(Drain)
-    async def _drain(self, message: Drain) -> None:
-        await self.drain()
-
     def _refuses(self, epoch: int | None = None) -> bool:
         """Whether this comes from an earlier epoch, or nothing from here counts any more.
 
@@ -357,6 +349,7 @@ class Proceed(Brick):
         self._works: deque[Work] = deque()
         self._task: asyncio.Task[None] | None = None
         self._number = -1
+        self._last, self._last_epoch = -1, -1  # batch that came last
         self._at_home: asyncio.Future[None] | None = None
         self._flushes: list[ReplyHandle[None]] = []
         self._work_now: Work | None = None
@@ -375,10 +368,21 @@ class Proceed(Brick):
 
     @on(Work)
     def _take(self, work: Work) -> None:
-        if self._refuses():
+        if self._refuses() or self._knows(work):
             return
         self._works.append(work)
         self._go_on()
+
+    def _knows(self, work: Work) -> bool:
+        """Whether this is a batch that came before (a duplicate on its way here): to run it again is to do it twice."""
+        if work.number < 0:  # Forwarded by a leader, or a marker.
+            return False
+        is_known = work.number <= self._last and work.epoch == self._last_epoch
+        if is_known:
+            self._standing.refused += 1
+        else:
+            self._last, self._last_epoch = work.number, work.epoch
+        return is_known
 
     @on(Abandon)
     def _abandon(self, message: Abandon) -> Any:

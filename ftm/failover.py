@@ -105,7 +105,7 @@ class FailoverManager(Actor):
             group.condemned.pop(name, None)
         self._step("lead")
         try:
-            await group.protocol(leading).ask(Lead(group.epoch, group.config), ANSWERED_WITHIN)
+            await group.protocol(leading).ask(Lead(group.epoch, group.config, group.least_turn()), ANSWERED_WITHIN)
         except AskTimeout:
             return True
         except HoldfastError as error:

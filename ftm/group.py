@@ -28,6 +28,7 @@ from ..checkpoint.records import (
     Go,
     Live,
     Outcome,
+    Released,
     SnapshotNow,
     ToLife,
     TurnEnd,
@@ -377,10 +378,16 @@ class Group:
         self.out, self.is_again = None, True
         self.poke()
 
+    def least_turn(self) -> int:
+        """The turn after which another one that leads goes on, if turns that are lost do not come again; else -1."""
+        return -1 if self.switch.method.replays else self.switch.turn
+
     def forget_answers(self) -> None:
         """Another one is to lead: what it asks again is answered again."""
         self.inward.clear()
         self.finished.clear()
+        self.switch.arrival.cancel()  # The last one may have died in the middle of a snapshot,
+        self.switch.due.restarted()  # or before it began with it.
 
     def only_suspect_input(self) -> int:
         """The input in whose turn a replica must have died, if only one was inside; else -1."""
@@ -397,6 +404,8 @@ class Group:
             return
         for end in done.ends:
             self._end(end)
+        if self.is_over:
+            return
         for record in done.more:
             if isinstance(record, Closed):
                 self.on_ended(record.reason)
@@ -432,7 +441,28 @@ class Group:
         """What left in the middle of a turn, or beside it."""
         if self._is_of_now(outward.epoch):
             for record in outward.records:
+                if isinstance(record, Released) and not self._is_front(record):
+                    self._is_behind(record.turn)
+                    return
                 self.switch.from_life(record)
+
+    def _is_front(self, record: Released) -> bool:
+        """Whether it is of the turn that comes next, or of one that is known."""
+        return not self.is_live or record.turn > self.switch.turn or self._is_known(record.turn, record.id)
+
+    def _is_known(self, turn: int, number: int) -> bool:
+        """Whether this input was handled in this turn, as far as the home knows it."""
+        past = self.switch.turns.get(turn)
+        return past.input.id == number if past is not None else number in self.switch.stashed()
+
+    def _is_behind(self, turn: int) -> None:
+        """Whoever leads has handled something in a turn in which the home knows something else to be handled.
+
+        It must never count: from the snapshot and the journal the life is as it was.
+        """
+        self.out = None  # It is nobody's fault that is inside.
+        self.is_over, self.why = True, f"{self.primary} has not got the state that was acknowledged at turn {turn}"
+        self.on_over(self.why)
 
     def _is_of_now(self, epoch: int) -> bool:
         if epoch == self.epoch and not self.is_over and (self.primary or self.leading) is not None:
@@ -453,6 +483,8 @@ class Group:
             self.doubled += 1
             if end.id not in switch.open:
                 self.ledger.pop(end.id, None)
+            elif not self._is_known(end.turn, end.id):
+                self._is_behind(end.turn)
             return
         source = switch.open.get(end.id)
         if source is not None and source.kind == START and end.status == FAILED:

@@ -77,6 +77,9 @@ class Joiner(Actor):
         group.on_joining(name)
         turn = await group.protocol(primary).ask(Join(epoch, group.place(name)), JOINED_WITHIN)
         if group.epoch != epoch or group.primary != primary or group.life_of(name) != life or group.is_over:
+            if group.epoch == epoch and group.primary == primary and group.life_of(name) != life:
+                group.dropped.add(name)  # The primary may wait for the life that has ended.
+                group.wake()
             return  # It has caught up with one that does not lead any more.
         group.joined(name, life)
         group.node.emit(ReplicaJoined(group.path, name, epoch, turn, time.monotonic() - begin))

@@ -140,10 +140,15 @@ class State(msgspec.Struct, array_like=True):
 
 
 class Lead(Message[int]):
-    """Be primary (leader) from now on; the reply is the turn of the state it goes on from."""
+    """Be primary (leader) from now on; the reply is the turn of the state it goes on from.
+
+    `turn`: the last one that home knows of. Those that are lost (which only a mechanism that does not wait for its
+    backup admits) are not numbered anew.
+    """
 
     epoch: int
     config: int
+    turn: int = -1
 
 
 class Follow(Message[int]):

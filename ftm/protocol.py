@@ -21,7 +21,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message, message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
-from .bricks import FOREVER, Abandon, Brick, Drain, Flush, Where
+from .bricks import FOREVER, Abandon, Brick, Flush, Where
 from .messages import (
     CannotJoin,
     ConfigMismatch,
@@ -106,6 +106,7 @@ class RequestProtocol(Brick):
         self._pieces: list[bytes] = []
         self._lock = asyncio.Lock()
         self._marker: int | None = None  # what the last leader gave us to compute is over when this comes back
+        self._least = -1  # the turn after which we go on, if those up to it have left nothing here
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
         self._later: list[Any] = []  # what goes home behind that
         self.paths: dict[str, str] = {}
@@ -236,6 +237,8 @@ class RequestProtocol(Brick):
         self._later += done.more
         if done.number == self._marker:
             self._marker = self._wanted = None
+            if self._standing.server.turn < self._least:
+                self._standing.server.skip_to(self._least)
         elif done.wait:
             self._flush_known(done.part)
 
@@ -315,9 +318,9 @@ class RequestProtocol(Brick):
     @on(Lead)
     def _lead(self, message: Lead) -> Any:
         self._check(message.epoch, message.config)
-        return self._answer(self._begin_to_lead(message.epoch))
+        return self._answer(self._begin_to_lead(message.epoch, message.turn))
 
-    async def _begin_to_lead(self, epoch: int) -> int:
+    async def _begin_to_lead(self, epoch: int, least: int) -> int:
         standing, server = self._standing, self._standing.server
         if standing.leads and standing.leading == epoch:
             return server.turn
@@ -328,6 +331,7 @@ class RequestProtocol(Brick):
         standing.leading = epoch
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
         self._current = self._marker = marker = -2 - epoch
+        self._least = least
         self.before.tell(Work(epoch, standing.config, marker, []))
         server.lead()
         return server.turn
@@ -370,10 +374,10 @@ class RequestProtocol(Brick):
     async def _bring(self, path: str) -> int:
         """Bring another replica to our state; requests wait only while that is captured."""
         standing, server = self._standing, self._standing.server
-        if standing.peer == path and standing.peer_state == "live":
-            return server.turn
         if not standing.leads:
             raise CannotJoin(path=path, why=f"{standing.path} does not lead")
+        if standing.peer == path:  # It follows anew, or has lived anew: whatever it had, it does not count on that.
+            standing.set_peer(path, "joining")
         self._holds += 1
         try:
             await self._quiet()
@@ -397,7 +401,16 @@ class RequestProtocol(Brick):
             raise CannotJoin(path=path, why=str(turn))
         if standing.peer == path:
             standing.peer_state = "live"
+            await self._drain_bricks()  # What left while it joined may have gone home ahead of the state behind it.
+        if standing.peer != path:
+            raise CannotJoin(path=path, why="another one has taken its place, or it was given up meanwhile")
         return turn
+
+    async def _drain_bricks(self) -> None:
+        for path in list(self._standing.paths.values()):
+            cell = self._standing.node.find(path)
+            if cell is not None and isinstance(cell.actor, Brick):
+                await cell.actor.drain()  # No ask: one of them may be waiting for us.
 
     async def _offer(self, take: Take) -> int | HoldfastError:
         try:
@@ -416,8 +429,6 @@ class RequestProtocol(Brick):
     async def _again(self, path: str) -> None:
         async with self._lock:
             try:
-                if self._standing.peer == path:
-                    self._standing.set_peer(path, "joining")
                 await self._bring(path)
             except HoldfastError:
                 return  # The manager will see that it does not count, and why.
@@ -493,9 +504,7 @@ class RequestProtocol(Brick):
         try:
             await self._quiet()
             await self.proceed.ask(Flush(), timeout=FOREVER)
-            for path in list(standing.paths.values()):
-                if path != self.ctx.path:
-                    await standing.node.cell_at(path).ref.ask(Drain(), timeout=FOREVER)
+            await self._drain_bricks()
             handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads))
         except HoldfastError as error:
             handle.fail(error)

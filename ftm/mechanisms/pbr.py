@@ -38,6 +38,8 @@ class Checkpointing(After):
         super().__init__(*args)
         self._out: set[asyncio.Task[None]] = set()  # checkpoints that nobody waits for
         self._was_alone: str | None = None
+        self._unheard: list[Logged] = []  # outcomes that the backup may not have: each checkpoint says them again
+        self._heard = 0  # how many have stood there before these
 
     async def after(self, done: Done) -> Done | None:
         """Capture, send, and wait for the acknowledgement."""
@@ -45,6 +47,7 @@ class Checkpointing(After):
             return done
         standing = self._standing
         if standing.peer is None:
+            self._forget_unheard(self._heard + len(self._unheard))  # Whoever joins is given all of them.
             if self._was_alone != standing.path:
                 self._was_alone = standing.path
                 standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
@@ -52,17 +55,18 @@ class Checkpointing(After):
         self._was_alone = None
         state = await self.state.ask(Capture(standing.peer_turn), timeout=FOREVER)
         standing.peer_turn = state.turn
-        checkpoint = Checkpoint(state, standing.entries(done.ends))
+        self._unheard += standing.entries(done.ends)
+        checkpoint, said = Checkpoint(state, list(self._unheard)), self._heard + len(self._unheard)
         self.taken()
         assert isinstance(self.mechanism, PBR)
         if standing.peer_state == "joining":
-            self._send(checkpoint)  # It does not count yet: what it has not got does not hold up anybody.
+            self._send(checkpoint, said)  # It does not count yet: what it has not got does not hold up anybody.
         elif self.mechanism.acknowledge:
-            await self._hand_over(checkpoint)
+            await self._hand_over(checkpoint, said)
         else:
             while len(self._out) >= self.mechanism.window:
                 await asyncio.wait(self._out, return_when=asyncio.FIRST_COMPLETED)
-            self._send(checkpoint)
+            self._send(checkpoint, said)
         return done
 
     async def drain(self) -> None:
@@ -70,14 +74,20 @@ class Checkpointing(After):
         for task in list(self._out):
             await asyncio.wait((task,))
 
-    async def _hand_over(self, checkpoint: Checkpoint) -> None:
+    async def _hand_over(self, checkpoint: Checkpoint, said: int) -> None:
         try:
             await self.ask_peer(checkpoint)
         except PeerLost:
-            return  # The manager has said so: we are alone, or another one is brought to our state.
+            said = self._heard + len(self._unheard)  # We are alone, or another one is brought to our state.
+        self._forget_unheard(said)
 
-    def _send(self, checkpoint: Checkpoint) -> None:
-        task = self.ctx.create_task(self._hand_over(checkpoint))
+    def _forget_unheard(self, said: int) -> None:
+        if said > self._heard:  # Else a later one has overtaken this, and has said all of it too.
+            del self._unheard[: said - self._heard]
+            self._heard = said
+
+    def _send(self, checkpoint: Checkpoint, said: int) -> None:
+        task = self.ctx.create_task(self._hand_over(checkpoint, said))
         self._out.add(task)
         task.add_done_callback(self._out.discard)
 

@@ -1,0 +1,386 @@
+"""Fault-tolerance mechanisms: what becomes of each fault, and what protection, failover and adaptation cost.
+
+Baseline: the same actor unprotected, in a process of its own; a change by stopping the child and starting it with the
+new spec; one comparison plus one encoding of the state.
+Command: python benchmarks/bench_ftm.py [--quick] [--only JOB]; HOLDFAST_CAMPAIGN=10000 requests for each row of the
+campaign, HOLDFAST_SOAK=60 seconds of soak.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import random
+import signal
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from harness import Run, ask_all, main
+
+import holdfast as hf
+from holdfast.checkpoint.keys import save_state
+from holdfast.ftm import host
+from holdfast.ftm.detector import Detection
+from holdfast.ftm.events import FailedOver
+
+sys.path.append(str(Path(__file__).resolve().parents[1]))
+
+import ftm_timing  # noqa: E402
+from ftm_workload import Bump, Change, Count, Parts, Whole  # noqa: E402
+
+from tests.ftm import campaign, soak  # noqa: E402  (found by the line above)
+
+STACKS: dict[str, tuple[Any, ...]] = {
+    "PBR": (hf.PBR(),),
+    "LFR": (hf.LFR(),),
+    "TR": (hf.TR(),),
+    "PBR+TR": (hf.PBR(), hf.TR()),
+    "LFR+TR": (hf.LFR(), hf.TR()),
+}
+CHANGES: dict[str, tuple[tuple[Any, ...], tuple[Any, ...]]] = {
+    "PBR to LFR and back": (STACKS["PBR"], STACKS["LFR"]),
+    "PBR to PBR+TR and back": (STACKS["PBR"], STACKS["PBR+TR"]),
+}
+PACE = 1000  # requests per second while mechanisms are changed
+WINDOW = 0.25  # seconds around a change, and of the quiet time beside it
+
+
+@contextlib.asynccontextmanager
+async def _system() -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("bench", log=False, intensity=100_000) as system:
+        yield system
+
+
+async def _protected(system: hf.ActorSystem, name: str, layers: Sequence[Any], start: Any = None) -> hf.ActorRef[Any]:
+    ref = await system.start(hf.child(name, start or hf.start(Count), mechanism=tuple(layers)))
+    await campaign.whole(ref)
+    return ref
+
+
+def _pid(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> int:
+    """The process of the replica that leads."""
+    group = campaign.group_of(ref)
+    assert group is not None
+    return system._workers.processes()[f"{ref.path}/ftm/{group.primary}"]
+
+
+# -- latency and throughput -------------------------------------------------------------------------------------------
+
+
+async def latency(run: Run) -> None:
+    """An ask of each mechanism beside the unprotected one, and where its time goes."""
+    count = run.size(3000)
+    async with _system() as system:
+        plain = await system.start(hf.child("plain", hf.start(Count), isolation="process"))
+        await ask_all(plain.ask, Bump(), 500)
+        for name, layers in STACKS.items():
+            ref = await _protected(system, f"c{len(name)}{name[0].lower()}", layers)
+            await ask_all(ref.ask, Bump(), 500)
+
+            async def ours(ref: Any = ref) -> float:
+                return (await ask_all(ref.ask, Bump(), count)).p50 * 1e6
+
+            async def limit() -> float:
+                return (await ask_all(plain.ask, Bump(), count)).p50 * 1e6
+
+            await run.compare(f"ask, {name}, beside unprotected in a process", ours, limit, unit="us", target=0.1)
+    for name, layers in STACKS.items():
+        await _print_bricks(name, layers, run.size(1000))
+
+
+async def _print_bricks(name: str, layers: Sequence[Any], count: int) -> None:
+    marks, asks = ftm_timing.root_marks(), list[tuple[float, float]]()
+    with tempfile.TemporaryDirectory() as folder:
+        before, host.replica = host.replica, ftm_timing.recipe(Path(folder))
+        try:
+            async with _system() as system:
+                ref = await _protected(system, "timed", layers)
+                await ask_all(ref.ask, Bump(), 300)
+                for _ in range(count):
+                    begin = time.perf_counter()
+                    await ref.ask(Bump())
+                    asks.append((begin, time.perf_counter()))
+        finally:
+            host.replica = before
+        seen = list(marks.seen)
+        for file in Path(folder).iterdir():
+            seen += [(moment, step) for moment, step in json.loads(file.read_text())]
+    steps = ftm_timing.by_brick(asks, seen)
+    print(f"# {name}: us until each step  " + "  ".join(f"{step} {seconds * 1e6:.0f}" for step, seconds in steps))
+
+
+async def throughput(run: Run) -> None:
+    """PBR in process pairs beside the unprotected process actor, 100 asks outstanding."""
+    count = run.size(20_000)
+    async with _system() as system:
+        plain = await system.start(hf.child("plain", hf.start(Count), isolation="process"))
+        for name in ("PBR", "LFR", "PBR+TR"):
+            ref = await _protected(system, name.lower().replace("+", ""), STACKS[name])
+            await ask_all(ref.ask, Bump(), 2000, outstanding=100)
+            await ask_all(plain.ask, Bump(), 2000, outstanding=100)
+
+            async def ours(ref: Any = ref) -> float:
+                return (await ask_all(ref.ask, Bump(), count, outstanding=100)).rate
+
+            async def limit() -> float:
+                return (await ask_all(plain.ask, Bump(), count, outstanding=100)).rate
+
+            target = 0.3 if name == "PBR" else 0.1
+            await run.compare(f"asks per second, {name}, 100 outstanding", ours, limit, unit="1/s", target=target)
+
+
+# -- failover ---------------------------------------------------------------------------------------------------------
+
+
+async def failover(run: Run) -> None:
+    """From SIGKILL of the primary to the next reply; from the detector's suspicion, if it only stands still."""
+    for name in ("PBR", "LFR"):
+        async with _system() as system:
+            ref, events = await _protected(system, "c", STACKS[name]), system.events()
+            await ask_all(ref.ask, Bump(), 300)
+            waits, inner = list[float](), list[float]()
+            for _ in range(run.size(50)):
+                await campaign.whole(ref)
+                await asyncio.sleep(0.1)
+                events.take()
+                pid, began = _pid(system, ref), time.perf_counter()
+                os.kill(pid, signal.SIGKILL)
+                await ref.ask(Bump(), timeout=30.0)
+                waits.append((time.perf_counter() - began) * 1e3)
+                inner += [one.seconds * 1e3 for one in events.take() if isinstance(one, FailedOver)]
+            print(f"# {name}: within the manager {statistics.median(inner):.2f} ms, the slowest {max(inner):.2f} ms")
+            run.bound(f"SIGKILL to the next reply, {name}, median", statistics.median(waits), unit="ms", target=20.0)
+            run.bound(f"SIGKILL to the next reply, {name}, slowest", max(waits), unit="ms", target=20.0)
+            events.close()
+    await _stopped(run)
+
+
+async def _stopped(run: Run) -> None:
+    before, host.Detection = host.Detection, lambda: Detection(interval=0.02, pause=0.2)  # type: ignore[misc, assignment]
+    try:
+        async with _system() as system:
+            ref = await _protected(system, "c", STACKS["PBR"])
+            waits = []
+            for _ in range(run.size(20)):
+                await campaign.whole(ref)
+                await asyncio.sleep(0.2)
+                group = campaign.group_of(ref)
+                assert group is not None
+                os.kill(_pid(system, ref), signal.SIGSTOP)
+                await ref.ask(Bump(), timeout=30.0)
+                waits.append((asyncio.get_running_loop().time() - group.suspected_at) * 1e3)
+    finally:
+        host.Detection = before  # type: ignore[misc]
+    job = "SIGSTOP to the next reply beyond the detector's time-out"
+    run.bound(f"{job}, median", statistics.median(waits), unit="ms", target=20.0)
+    run.bound(f"{job}, slowest", max(waits), unit="ms", target=20.0)
+
+
+# -- adaptation -------------------------------------------------------------------------------------------------------
+
+
+class Paced:
+    """Clients that ask so many times a second; each reply's moment is noted."""
+
+    def __init__(self, find: Any) -> None:
+        self.find, self.replies, self.failed = find, list[float](), 0
+        self._stopping = False
+        self._task = asyncio.create_task(self._run())
+        self._asked: set[asyncio.Task[None]] = set()
+
+    async def _run(self) -> None:
+        begin, sent = time.perf_counter(), 0
+        while not self._stopping:
+            due = int((time.perf_counter() - begin) * PACE)
+            for _ in range(min(50, due - sent)):
+                task = asyncio.create_task(self._one())
+                self._asked.add(task)
+                task.add_done_callback(self._asked.discard)
+            sent = max(sent, due)
+            await asyncio.sleep(0.0005)
+
+    async def _one(self) -> None:
+        try:
+            await self.find().ask(Bump(), timeout=10.0)
+        except hf.HoldfastError:
+            self.failed += 1
+        else:
+            self.replies.append(time.perf_counter())
+
+    async def stop(self) -> None:
+        self._stopping = True
+        await self._task
+        if self._asked:
+            await asyncio.wait(self._asked)
+
+    def longest(self, begin: float, end: float) -> float:
+        """Seconds of the longest gap between two replies in a window, in ms."""
+        inside = [begin, *(moment for moment in self.replies if begin <= moment <= end), end]
+        return max(b - a for a, b in zip(inside, inside[1:], strict=False)) * 1e3
+
+
+async def _windows(clients: Paced, change: Any) -> float:
+    """The longest gap around a change minus that of the quiet window before it."""
+    quiet = time.perf_counter()
+    await asyncio.sleep(WINDOW)
+    begin = time.perf_counter()
+    await change()
+    rest = WINDOW - (time.perf_counter() - begin)
+    if rest > 0:
+        await asyncio.sleep(rest)
+    end = time.perf_counter()
+    gap = clients.longest(begin, end) - clients.longest(quiet, begin)
+    del clients.replies[:-10]
+    return gap
+
+
+async def transitions(run: Run) -> None:
+    """Client gaps while mechanisms are changed, beside stopping the child and starting it with the new spec."""
+    for name, (first, second) in CHANGES.items():
+        gaps = await _transitions(first, second, run.size(200))
+        restarts = await _restarts(first, second, run.size(20))
+        p99 = statistics.quantiles(gaps, n=100)[98]
+        print(
+            f"# {name}: longest client gap beyond the quiet one, ms: median {statistics.median(gaps):.2f} p90 "
+            f"{statistics.quantiles(gaps, n=10)[8]:.2f} p99 {p99:.2f} worst {max(gaps):.2f}; by stopping and starting "
+            f"the child: median {statistics.median(restarts):.1f} worst {max(restarts):.1f}"
+        )
+        run.bound(f"transition, {name}, client gap, p99 of {len(gaps)}", p99, unit="ms", target=5.0)
+
+
+async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) -> list[float]:
+    async with _system() as system:
+        ref = await _protected(system, "c", first)
+        clients, gaps = Paced(lambda: ref), list[float]()
+        await asyncio.sleep(0.3)
+        for number in range(count):
+            target = first if number % 2 else second
+
+            async def change(target: Sequence[Any] = target) -> None:
+                async with system.transaction(timeout=30) as steps:
+                    steps.transition(ref, tuple(target))
+
+            gaps.append(await _windows(clients, change))
+        await clients.stop()
+        assert clients.failed == 0, f"{clients.failed} asks have failed"
+        assert len(await _tags(ref)) == 0
+    return gaps
+
+
+async def _tags(ref: hf.ActorRef[Any]) -> list[int]:
+    await ref.ask(Bump())
+    return []
+
+
+async def _restarts(first: Sequence[Any], second: Sequence[Any], count: int) -> list[float]:
+    async with _system() as system:
+        holder = [await _protected(system, "c", first)]
+        clients, gaps = Paced(lambda: holder[0]), list[float]()
+        await asyncio.sleep(0.3)
+        for number in range(count):
+            target = first if number % 2 else second
+
+            async def change(target: Sequence[Any] = target) -> None:
+                root = system.ref("/app", hf.Actor) if False else None
+                assert root is None
+                await system.stop(holder[0])
+                holder[0] = await system.start(hf.child("c", hf.start(Count), mechanism=tuple(target)))
+
+            gaps.append(await _windows(clients, change))
+        await clients.stop()
+    return gaps
+
+
+# -- size of the state ------------------------------------------------------------------------------------------------
+
+
+async def state_size(run: Run) -> None:
+    """One request after the other under PBR, as the state grows to 10 MB."""
+    sizes = (10_000, 100_000, 1_000_000, 10_000_000)
+    times: dict[type, list[float]] = {Whole: [], Parts: []}
+    bounds: list[float] = []
+    for kind in (Parts, Whole):
+        for size in sizes:
+            start = hf.start(kind, size // 1000, 1000)
+            async with _system() as system:
+                ref = await _protected(system, "big", STACKS["PBR"], start)
+                count = run.size(200 if size < 10**7 or kind is Parts else 40)
+                await _changes(ref, 5)
+                times[kind].append(min([await _changes(ref, max(5, count // 2)) for _ in range(run.n)]))
+            if kind is Whole:
+                bounds.append(_encoded_and_compared(size))
+    print("# size of the state: " + ", ".join(f"{size / 1000:g} kB" for size in sizes))
+    print("#   with deltas, us a request: " + ", ".join(f"{one * 1e6:.0f}" for one in times[Parts]))
+    print("#   whole, us a request: " + ", ".join(f"{one * 1e6:.0f}" for one in times[Whole]))
+    print("#   one comparison plus one encoding, us: " + ", ".join(f"{one * 1e6:.0f}" for one in bounds))
+    growth = times[Parts][-1] / times[Parts][0]
+    run.bound("cost of a request with deltas, state of 10 MB over 10 kB", growth, unit="x", target=2.0)
+    added = (times[Whole][-1] - times[Whole][0]) / bounds[-1]
+    job = "cost of a request beyond that with 10 kB, whole state of 10 MB, over one comparison plus one encoding"
+    run.bound(job, added, unit="x", target=1.5)
+
+
+async def _changes(ref: hf.ActorRef[Any], count: int) -> float:
+    begin = time.perf_counter()
+    for key in range(count):
+        await ref.ask(Change(key), timeout=30.0)
+    return (time.perf_counter() - begin) / count
+
+
+def _encoded_and_compared(size: int) -> float:
+    actor = Whole(size // 1000, 1000)
+    before = save_state(actor)
+    best = 1e9
+    for _ in range(5):
+        begin = time.perf_counter()
+        data = save_state(actor)
+        assert data == before
+        best = min(best, time.perf_counter() - begin)
+    return best
+
+
+# -- faults -----------------------------------------------------------------------------------------------------------
+
+
+async def faults(run: Run) -> None:
+    """The fault-injection campaign, as a table."""
+    requests = int(os.environ.get("HOLDFAST_CAMPAIGN", "300" if run.quick else "2000"))
+    print(f"# {campaign.HEAD}", flush=True)
+    missed, injected = 0, 0
+    for name, layers in STACKS.items():
+        for kind in campaign.KINDS:
+            for workload in campaign.WORKLOADS:
+                if not campaign.makes_sense(layers, kind):
+                    continue
+                if workload != "counter" and not kind.startswith(("nothing", "crash", "SIGSTOP", "message d")):
+                    continue
+                most = 10 if run.quick else max(20, requests // 50)
+                row = await campaign.run_row(
+                    name, layers, kind, workload, requests=requests, most=most, seed=str(run.seed)
+                )
+                injected += row.injected
+                missed += not row.is_kept
+                print(f"# {row}", flush=True)
+                for line in row.trouble[:5]:
+                    print(f"#     {line}", flush=True)
+    print(f"# {injected} faults")
+    run.bound("rows of the campaign in which a mechanism did not keep what it claims", missed, unit="rows", target=0)
+
+
+async def soaking(run: Run) -> None:
+    """Random attach, compose, transition, update, detach under full load, and random kills."""
+    seconds = float(os.environ.get("HOLDFAST_SOAK", "5" if run.quick else "60"))
+    found = await soak.run(seconds, random.Random(run.seed))
+    print(f"# soak: {found}")
+    run.bound("soak: lost, wrong or doubled", len(found.bad.all()), unit="requests", target=0)
+
+
+if __name__ == "__main__":
+    main([latency, throughput, failover, transitions, state_size, faults, soaking])
