@@ -199,7 +199,10 @@ if TYPE_CHECKING:
     from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.mechanisms.lfr import LFR
     from holdfast.ftm.mechanisms.pbr import PBR
+    from holdfast.ftm.mechanisms.sec import SEC
     from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.sealed import FrameRefused
+    from holdfast.ftm.sec.authority import CertificationAuthority
     from holdfast.ftm.voters import NoMajority
 
 __all__ = [
@@ -224,6 +227,7 @@ __all__ = [
     "Bus",
     "Calls",
     "CannotMove",
+    "CertificationAuthority",
     "Change",
     "ChangeSupervisor",
     "CheckpointFailed",
@@ -251,6 +255,7 @@ __all__ = [
     "Failed",
     "FailedOver",
     "Flags",
+    "FrameRefused",
     "GetChildSpec",
     "Held",
     "HeldMessages",
@@ -347,6 +352,7 @@ __all__ = [
     "RolledBack",
     "Route",
     "Rule",
+    "SEC",
     "SHUTDOWN",
     "SafeState",
     "SafeStateEntered",
@@ -434,9 +440,11 @@ __all__ = [
 
 # Most programs protect nobody: what they do not use is not imported.
 _LAZY = {
+    "CertificationAuthority": "holdfast.ftm.sec.authority",
     "Detection": "holdfast.ftm.detector",
     "Diverged": "holdfast.ftm.alarms",
     "FailedOver": "holdfast.ftm.events",
+    "FrameRefused": "holdfast.ftm.sealed",
     "LFR": "holdfast.ftm.mechanisms.lfr",
     "Masked": "holdfast.ftm.alarms",
     "Mechanism": "holdfast.ftm.mechanism",
@@ -448,6 +456,7 @@ _LAZY = {
     "ProtectionLost": "holdfast.ftm.alarms",
     "ReplicaJoined": "holdfast.ftm.events",
     "ReplicaLost": "holdfast.ftm.events",
+    "SEC": "holdfast.ftm.mechanisms.sec",
     "TR": "holdfast.ftm.mechanisms.tr",
     "WrongSuspicion": "holdfast.ftm.events",
     "compose": "holdfast.ftm.mechanism",

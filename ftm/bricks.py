@@ -14,16 +14,18 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 from ..actors import lives
 from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
-from ..actors.errors import HoldfastError
+from ..actors.errors import AskTimeout, HoldfastError
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
 from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
+from .sealed import Back, Call, LinkLost, Part, Refused, Sealed
 from .standing import PeerLost
 
 if TYPE_CHECKING:
     from .mechanism import Mechanism
+    from .sealed import SecuredLink
     from .standing import Standing
 
 R = TypeVar("R")
@@ -32,6 +34,8 @@ FOREVER = 10.0 * 86400.0
 """Seconds: the bricks of one replica wait for each other as long as it takes; a death is told otherwise."""
 AGAIN = 0.02
 """Seconds after which the other replica is asked again, if it could not be reached and still counts."""
+SEALED = "sealed"
+"""The name of a letter that says it inside."""
 LETTER_BYTES = 8 * 1024 * 1024
 """What is said to the other replica in one message; more goes in sheets."""
 
@@ -90,6 +94,7 @@ class Brick(Actor):
         self._standing, self.mechanism, self.slot = standing, mechanism, slot
         self._sheets: dict[int, list[bytes]] = {}
         self._numbers = itertools.count(1)
+        self._sending = asyncio.Lock()
         self._handle: ReplyHandle[Any] | None = None
 
     @property
@@ -128,12 +133,18 @@ class Brick(Actor):
         codec = standing.node.codec
         body = codec.encoder.encode(message)
         peer = standing.peer
+        if standing.link is not None:
+            back = await self._ask_sealed(standing.link, peer, message, body)
+            return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
         while True:
             if peer is None or standing.peer != peer:
                 raise PeerLost("there is none")
             try:
-                ref = await self._find_peer(peer)
-                asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
+                async with self._sending:  # In order: finding the peer takes the first one longer than the others.
+                    if standing.peer != peer:
+                        continue
+                    ref = await self._find_peer(peer)
+                    asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
                 reply = await standing.wait_for(asked)
             except (PeerLost, ConfigMismatch):
                 raise
@@ -145,6 +156,74 @@ class Brick(Actor):
                 await standing.changes(AGAIN)
                 continue
             return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
+
+    async def _ask_sealed(self, link: SecuredLink, peer: str | None, message: Message[Any], body: bytes) -> bytes:
+        """The same over a secured link, which does again what has to be."""
+        standing = self._standing
+
+        async def reach(said: Message[Any], seconds: float) -> Any:
+            if peer is None or standing.peer != peer:
+                raise PeerLost("there is none")
+            if not isinstance(said, Sealed):
+                cell = standing.node.cell_at(f"{peer}/protocol")
+                return await standing.wait_for(cell.ref.ask(said, timeout=seconds))
+            try:
+                ref = await self._find_peer(peer)
+                return await standing.wait_for(ref.ask(self._sheets_of(ref, said.frame), timeout=seconds))
+            except (PeerLost, AskTimeout, Refused):
+                raise
+            except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
+                standing.lost(self.slot)
+                raise
+
+        part = Part(message_name(type(message)), body)
+        try:
+            back = await link.call(
+                peer or "", self.slot, part, reach, lambda: peer is not None and standing.peer == peer,
+                standing.epoch, standing.config,
+            )  # fmt: skip
+        except LinkLost:
+            raise PeerLost("it was replaced, or is gone") from None
+        if back.kind == "reply":
+            return back.body
+        error = standing.node.codec.decode_error(back.kind, back.name, back.body)
+        if isinstance(error, StaleEpoch):
+            standing.fence()
+        raise error
+
+    def _sheets_of(self, ref: ActorRef[Any], frame: bytes) -> Letter:
+        number = 0
+        if len(frame) > LETTER_BYTES:
+            number = next(self._numbers)
+            for part in pieces(frame):
+                ref.tell(Sheet(number, part))
+            frame = b""
+        return Letter(-1, -1, SEALED, frame, number)
+
+    async def ask_at(self, path: str, slot: str, message: Message[R]) -> R:
+        """Ask a brick of a certain replica, once.
+
+        Raises:
+            HoldfastError: it cannot be reached, or has died. PeerLost: who is our peer has changed meanwhile.
+        """
+        standing, key = self._standing, f"{path}#{slot}"
+        codec = standing.node.codec
+        ref = standing.brick(key)
+        try:
+            if ref is None:
+                where = Where(standing.config, slot)
+                asked = standing.node.cell_at(f"{path}/protocol").ref.ask(where, timeout=FOREVER)
+                ref = standing.node.cell_at(await standing.wait_for(asked)).ref
+                standing.found(key, ref)
+            body = codec.encoder.encode(message)
+            reply = await standing.wait_for(ref.ask(self._letter(ref, message, body), timeout=FOREVER))
+        except StaleEpoch:
+            standing.fence()
+            raise
+        except HoldfastError:
+            standing.lost(key)
+            raise
+        return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
 
     def _letter(self, ref: ActorRef[Any], message: Message[Any], body: bytes) -> Letter:
         standing, number = self._standing, 0
@@ -175,6 +254,10 @@ class Brick(Actor):
     async def _take_letter(self, letter: Letter) -> bytes | ReplyHandle[bytes]:
         sheets = self._sheets.pop(letter.sheets, []) if letter.sheets else []
         standing = self._standing
+        if standing.link is not None:
+            return await self._take_sealed(standing.link, b"".join(sheets) if sheets else letter.body)
+        if letter.name == SEALED:
+            raise Refused(path=standing.path, reason="closed")
         standing.check(letter.epoch, letter.config)
         kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
         if kind is None:
@@ -186,6 +269,32 @@ class Brick(Actor):
         handle: ReplyHandle[bytes] = self.ctx.reply_handle()
         self.ctx.create_task(self._answer_letter(handle, message))
         return handle
+
+    async def _take_sealed(self, link: SecuredLink, frame: bytes) -> bytes | ReplyHandle[bytes]:
+        if not self.answers_later:
+            return await link.take(frame, self._read)
+        handle: ReplyHandle[bytes] = self.ctx.reply_handle()
+        self.ctx.create_task(self._answer_sealed(handle, link, frame))
+        return handle
+
+    async def _answer_sealed(self, handle: ReplyHandle[bytes], link: SecuredLink, frame: bytes) -> None:
+        try:
+            handle.reply(await link.take(frame, self._read))
+        except Refusal as no:
+            handle.fail(no)
+
+    async def _read(self, call: Call) -> Back:
+        """What was in a sealed letter."""
+        standing, codec = self._standing, self._standing.node.codec
+        try:
+            standing.check(call.epoch, call.config)
+            kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
+            if kind is None or call.stream != self.slot:
+                raise Refused(path=self.ctx.path, reason="malformed")
+            reply = await self.from_peer(codec.decode(kind, call.parts[0].body))
+        except Refusal as no:
+            return Back(*codec.encode_error(no))
+        return Back("reply", "", codec.encode(reply, self.ctx.path))
 
     async def _answer_letter(self, handle: ReplyHandle[bytes], message: Message[Any]) -> None:
         try:

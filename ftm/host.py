@@ -146,6 +146,9 @@ class GroupHost(HomeHost):
         group.careful = {key for key in self._careful if key in switch.open}
         self.take_over(cell, group)
         group.is_held = len(names) > 1
+        group.secure(self.layers[0])
+        if group.link is not None:
+            await group.link.ready()
         ftm = cell.node.cell_below(cell, "ftm")
         ftm.extra()
         recipe = Start(
@@ -232,6 +235,7 @@ class GroupHost(HomeHost):
         def switched(change: Reconfiguration) -> None:
             self.layers, self.config = change.layers, change.config
             group.config = change.config
+            group.secure(change.layers[0])
             for name in group.names:
                 one = group.cell_of(name)
                 if one is not None:
@@ -413,6 +417,8 @@ class GroupHost(HomeHost):
         group, self.group = self.group, None
         if group is not None:
             group.is_over = True
+            if group.link is not None:
+                group.link.close()
             if group.change is not None:
                 group.change.close("its life has ended")
         ftm = (cell.children or {}).get("ftm")

@@ -13,7 +13,7 @@ import importlib
 import importlib.util
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self, TypeVar
 
@@ -24,7 +24,9 @@ from ..actors.errors import HoldfastError, type_name
 from ..actors.message import message_name
 
 if TYPE_CHECKING:
+    from ..actors.node import Node
     from .bricks import After, Before, Brick, Proceed
+    from .sealed import SecuredLink
 
 M = TypeVar("M", bound="Mechanism")
 
@@ -32,7 +34,7 @@ Part = Literal["before", "proceed", "after"]
 SCRIPTS = "holdfast_script_"
 """How the modules of reconfiguration scripts are called: only the process that runs the script has them by name."""
 ENTRY_POINTS = "holdfast.mechanisms"
-BUILT_IN = ("pbr", "lfr", "tr")
+BUILT_IN = ("pbr", "lfr", "tr", "ad", "rb", "nvp", "tmr", "sec")
 
 
 class MechanismRefused(HoldfastError):
@@ -123,6 +125,17 @@ class Mechanism:
         names = list(self.roles) or ["single"]
         return names[0] if leads else names[-1]
 
+    def open_link(
+        self,
+        node: Node,
+        address: str,
+        path: str,
+        epoch: Callable[[], int],
+        enrols: Callable[[], list[str]] | None = None,
+    ) -> SecuredLink | None:
+        """One that secures the links (`layer` "link"): the end of them that is at `path`."""
+        return None
+
     def with_brick(self, role: str, part: str, kind: type[Brick]) -> Self:
         """The same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
         new = copy.copy(self)
@@ -132,7 +145,7 @@ class Mechanism:
     def describe(self) -> Description:
         """For another process."""
         code = code_of(type(self))
-        settings = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.init}
+        settings = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self) if field.init}
         bricks = tuple((*key, code_of(kind)) for key, kind in sorted(self.exchanged.items(), key=lambda pair: pair[0]))
         return Description(code.kind, settings, code.file, code.sha256, bricks)
 
@@ -157,6 +170,11 @@ def find_class(code: Code) -> Any:
     if code.file:
         return _attribute(load_module(code.file, sha256=code.sha256), path)
     return _attribute(sys.modules.get(module) or importlib.import_module(module), path)
+
+
+def _plain(value: Any) -> Any:
+    """A setting as it travels; a mechanism that has structs among its settings takes them back as dicts."""
+    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else value
 
 
 def has_state_access(kind: type[Actor]) -> bool:

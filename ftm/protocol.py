@@ -18,7 +18,7 @@ from ..actors.bindings import Binding
 from ..actors.errors import ActorStopped, HoldfastError
 from ..actors.exits import unpack_exit
 from ..actors.mail import ReplyHandle
-from ..actors.message import Message
+from ..actors.message import Message, message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
 from .bricks import FOREVER, Abandon, Brick, Flush, Where
@@ -39,6 +39,7 @@ from .messages import (
     Work,
 )
 from .orders import Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
+from .sealed import Agree, Back, Greet, Opened, Refused, Sealed
 from .standing import PeerLost
 
 if TYPE_CHECKING:
@@ -93,6 +94,7 @@ class RequestProtocol(Brick):
     answers_later = True
 
     before: Binding[Actor]
+    gate: Binding[Actor]
     proceed: Binding[Actor]
 
     def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
@@ -108,12 +110,61 @@ class RequestProtocol(Brick):
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
         self._later: list[Any] = []  # what goes home behind that
         self.paths: dict[str, str] = {}
+        self._is_opened = False  # what is being handled has come over a secured link
+
+    # -- a secured link ---------------------------------------------------------------------------------------------
+
+    @on(Greet)
+    def _greet(self, message: Greet) -> Any:
+        return self._to_gate(message)
+
+    @on(Agree)
+    def _agree(self, message: Agree) -> Any:
+        return self._to_gate(message)
+
+    @on(Sealed)
+    def _sealed(self, message: Sealed) -> Any:
+        return self._to_gate(message)
+
+    def _to_gate(self, message: Message[Any]) -> Any:
+        if self._standing.link is None:
+            raise Refused(path=self._standing.path, reason="closed")
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._passed(handle, self.gate.ask(message, timeout=FOREVER)))
+        return handle
+
+    async def _passed(self, handle: ReplyHandle[Any], asked: Awaitable[Any]) -> None:
+        try:
+            handle.reply(await asked)
+        except HoldfastError as error:
+            handle.fail(error)
+
+    @on(Opened)
+    def _opened(self, message: Opened) -> Any:
+        real = self._standing.take_opened(message.key)
+        if real is None:
+            raise Refused(path=self._standing.path, reason="forged")
+        self._is_opened = True
+        try:
+            return getattr(self, HANDLERS[type(real)])(real)
+        finally:
+            self._is_opened = False
+
+    def _admits(self) -> bool:
+        """Whether this may come as it does: with a secured link, over that only."""
+        link = self._standing.link
+        if link is None or self._is_opened:
+            return True
+        link.plain()
+        return False
 
     # -- requests ---------------------------------------------------------------------------------------------------
 
     @on(Work)
     def _work(self, work: Work) -> None:
         standing = self._standing
+        if not self._admits():
+            return
         if work.epoch != standing.epoch or work.config != standing.config or not standing.leads or standing.is_fenced:
             standing.refused += 1
             return
@@ -210,11 +261,13 @@ class RequestProtocol(Brick):
 
     @on(Inward)
     def _inward(self, message: Inward) -> None:
-        self.proceed.tell(message)
+        if self._admits():
+            self.proceed.tell(message)
 
     @on(Ended)
     def _ended(self, message: Ended) -> None:
-        self.proceed.tell(message)
+        if self._admits():
+            self.proceed.tell(message)
 
     # -- orders -----------------------------------------------------------------------------------------------------
 
@@ -243,12 +296,17 @@ class RequestProtocol(Brick):
 
     def _check(self, epoch: int, config: int | None = None) -> None:
         standing = self._standing
+        if not self._admits():
+            raise Refused(path=standing.path, reason="plain")
         standing.check(epoch, config)
         standing.epoch = epoch
 
     @on(Install)
-    async def _install(self, message: Install) -> None:
+    def _install(self, message: Install) -> Any:
         self._check(message.epoch)
+        return self._answer(self._installed(message))
+
+    async def _installed(self, message: Install) -> None:
         self._pieces.append(message.data)
         if message.is_last:
             data, self._pieces = b"".join(self._pieces), []
@@ -394,6 +452,9 @@ class RequestProtocol(Brick):
     async def _taken(self, take: Take) -> int:
         standing, server = self._standing, self._standing.server
         standing.set_peer(take.leader, "live")
+        if take.state is not None and standing.kept > (standing.epoch, take.state.turn):
+            standing.ready()  # It has computed with the leader meanwhile, and is further than that.
+            return server.turn
         await self.proceed.ask(Abandon(), timeout=FOREVER)
         await server.drop_life()
         server.install(take.state)
@@ -467,3 +528,25 @@ class RequestProtocol(Brick):
             server.finish(unpack_exit(reason))
             await gone
         await self.proceed.ask(Flush(), timeout=FOREVER)
+
+
+HANDLERS: dict[type[Message[Any]], str] = {
+    Work: "_work",
+    Inward: "_inward",
+    Ended: "_ended",
+    Install: "_install",
+    Lead: "_lead",
+    Follow: "_follow",
+    Peer: "_peer",
+    Join: "_join",
+    Export: "_export",
+    Quiesce: "_quiesce",
+    Finish: "_finish",
+}
+"""What the root says to a replica."""
+OPENED = {message_name(kind): kind for kind in HANDLERS}
+
+
+def encode_reply(codec: Any, value: Any) -> Back:
+    """A reply, on its way over a secured link."""
+    return Back("reply", "", codec.encode(value, ""))

@@ -6,12 +6,18 @@ from typing import TYPE_CHECKING, Any
 
 from ..actors.actor import Actor, on
 from ..actors.errors import HoldfastError
-from ..actors.message import Message
+from ..actors.message import Message, message_name
 from .group import Flush
 from .messages import Done, Outward
+from .sealed import Agree, Back, Call, Greet, Refused, Sealed
 
 if TYPE_CHECKING:
     from .group import Group
+    from .sealed import SecuredLink
+
+
+SAID: dict[str, type[Message[Any]]] = {message_name(kind): kind for kind in (Done, Outward)}
+"""What replicas say to it."""
 
 
 class Settle(Message[None]):
@@ -41,13 +47,47 @@ class Proxy(Actor):
     @on(Done)
     def done(self, done: Done) -> Any:
         """Outcomes have come."""
-        self._group.take_done(done)
-        self._send()
+        if self._group.is_plain():
+            self._group.take_done(done)
+            self._send()
 
     @on(Outward)
     def outward(self, outward: Outward) -> None:
         """Something leaves in the middle of a turn."""
-        self._group.take_outward(outward)
+        if self._group.is_plain():
+            self._group.take_outward(outward)
+
+    @on(Greet)
+    async def greet(self, message: Greet) -> bytes:
+        """A replica begins a hand-shake."""
+        return await self._link().greet(message.hello)
+
+    @on(Agree)
+    async def agree(self, message: Agree) -> None:
+        """Its end."""
+        await self._link().agree(message.hello, message.finish)
+
+    @on(Sealed)
+    async def sealed(self, message: Sealed) -> bytes:
+        """What a replica says over a secured link."""
+        return await self._link().take(message.frame, self._take)
+
+    def _link(self) -> SecuredLink:
+        link = self._group.link
+        if link is None:
+            raise Refused(path=self.ctx.path, reason="closed")
+        return link
+
+    async def _take(self, call: Call) -> Back:
+        group, codec = self._group, self.ctx.cell.node.codec
+        for part in call.parts:
+            message = codec.decode(SAID[part.name], part.body)
+            if isinstance(message, Done):
+                group.take_done(message)
+            else:
+                group.take_outward(message)
+        self._send()
+        return Back("", "", b"")
 
     @on(Settle)
     def settle(self, message: Settle) -> None:
@@ -68,6 +108,9 @@ class Proxy(Actor):
 
     def _tell(self, message: Message[Any]) -> None:
         name = self._group.primary
+        if self._group.link is not None:
+            self._group.tell_sealed(message)
+            return
         cell = None if name is None else self._group.cell_of(f"{name}/protocol")
         if cell is None:
             return  # It has died: all of it goes to the next one.

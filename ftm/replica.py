@@ -93,6 +93,20 @@ class Place(NamedTuple):
 PARTS: dict[str, type[Brick]] = {"before": Before, "proceed": Proceed, "after": After}
 
 
+def nested(layers: tuple[Mechanism, ...]) -> tuple[Mechanism, ...]:
+    """The same layers as they are woven: assertions stand inside replication, so that no state leaves unchecked.
+
+    For whoever reads a composition they stand outside: what they check is what the replicas have come to.
+    """
+    replication = [one for one in layers if one.layer == "replication"]
+    if not replication:
+        return layers
+    moved = [one for one in layers if one.layer == "assertion"]
+    kept = [one for one in layers if one.layer != "assertion"]
+    at = kept.index(replication[-1]) + 1
+    return (*kept[:at], *moved, *kept[at:])
+
+
 def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
     """The bricks of a composition, by slot, outermost layer first.
 
@@ -107,6 +121,8 @@ def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
             raise MechanismRefused(one.name, "it stands in the composition twice")
         if index:
             places[f"{one.name}.protocol"] = Place(InnerProtocol, None, f"{prefix}protocol")
+            if one.layer == "link":
+                raise MechanismRefused(one.name, "it secures the links: it stands outermost, and once")
         for part, kind in PARTS.items():
             check_brick(one, part, getattr(role, part) or kind)
         before, after = role.before or Before, role.after or After
@@ -157,7 +173,7 @@ class Replica(Supervisor):
         made = tuple(one if isinstance(one, Mechanism) else revive(one) for one in layers)
         for one in made:
             one.check(start.kind, setting.address)
-        self._made = made
+        self._made = nested(made)
 
     def init(self) -> Plan:
         """The protected actor and its state manager; the bricks follow."""
@@ -199,7 +215,7 @@ class Replica(Supervisor):
 
     def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Any:
         """The lives of the protected actor begin and end as the bricks want it; the end of a brick is ours."""
-        if cell.name == SERVER:
+        if cell.name == SERVER or isinstance(cell.host, Server):
             return None
         return super().child_exited(cell, life, reason)
 
@@ -288,6 +304,7 @@ class Replica(Supervisor):
             server.capture()  # From here on, the last part is what was handled since the last point.
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         standing.forget_bricks()
+        self._secure()
         self._bind_all(woven)
         if behind:
             self.ctx.ref.tell(EndBricks(left))
@@ -297,6 +314,18 @@ class Replica(Supervisor):
             await self._keep_state()
         elif standing.leads or standing.is_ready:
             await self._server.ensure()
+
+    def _secure(self) -> None:
+        """Have the link that the outermost mechanism wants."""
+        standing = self._standing
+        outermost = standing.layers[0] if standing.layers else None
+        old = standing.link
+        if old is not None and old.mechanism == outermost:
+            return
+        if old is not None:
+            old.close()
+        path, epoch = self.ctx.path, lambda: max(0, standing.epoch)
+        standing.link = None if outermost is None else outermost.open_link(standing.node, standing.address, path, epoch)
 
     async def _keep_state(self) -> None:
         """The protected actor does not live here any more: its state stays, as bytes."""
@@ -340,25 +369,41 @@ class Replica(Supervisor):
         proxy = node.cell_at(f"{self._setting.address}/ftm/proxy")
         state, server = self._cell(STATE), self._cell(SERVER)
         cell = {slot: self._cell(name) for slot, name in names.items()}
+        # A mechanism that secures the links stands around the protocol, all others stand behind it.
+        is_secured = bool(layers) and layers[0].layer == "link"
+        gate = cell[f"{layers[0].name}.before"]
+        outlet = cell[f"{layers[0].name}.after"] if is_secured else proxy
+        entries = [cell[PROTOCOL if index == 0 else f"{one.name}.protocol"] for index, one in enumerate(layers)]
+        exits = [
+            entries[0] if is_secured and index == 0 else cell[f"{one.name}.after"] for index, one in enumerate(layers)
+        ]
+        found += [(entries[0], "gate", gate)]
         for index, one in enumerate(layers):
-            protocol = cell[PROTOCOL if index == 0 else f"{one.name}.protocol"]
-            before, after = cell[f"{one.name}.before"], cell[f"{one.name}.after"]
-            inner = layers[index + 1].name if index + 1 < len(layers) else None
-            found += [
-                (protocol, "before", before),
-                (protocol, "next", proxy if index == 0 else cell[f"{layers[index - 1].name}.after"]),
-                (before, "next", cell["proceed"] if inner is None else cell[f"{inner}.protocol"]),
-                (after, "next", protocol),
-            ]
+            protocol, before, after = entries[index], cell[f"{one.name}.before"], cell[f"{one.name}.after"]
+            onward = entries[index + 1] if index + 1 < len(layers) else cell["proceed"]
+            if is_secured and index == 0:
+                found += [
+                    (protocol, "before", onward),
+                    (protocol, "next", after),
+                    (before, "next", protocol),
+                    (after, "next", proxy),
+                ]
+            else:
+                found += [
+                    (protocol, "before", before),
+                    (protocol, "next", proxy if index == 0 else exits[index - 1]),
+                    (before, "next", onward),
+                    (after, "next", protocol),
+                ]
             found += [(brick, "state", state) for brick in (protocol, before, after)]
         proceed = cell["proceed"]
         return [
             *found,
             (cell[PROTOCOL], "proceed", proceed),
-            (proceed, "next", cell[f"{layers[-1].name}.after"]),
+            (proceed, "next", exits[-1]),
             (proceed, "server", server),
             (proceed, "state", state),
-            (proceed, "out", proxy),
+            (proceed, "out", outlet),
         ]
 
     # -- orders -----------------------------------------------------------------------------------------------------
@@ -379,7 +424,7 @@ class Replica(Supervisor):
         try:
             if self._prepared is not None:
                 await self._drop_prepared()
-            layers = tuple(revive(one) for one in message.layers)
+            layers = nested(tuple(revive(one) for one in message.layers))
             for one in layers:
                 one.check(self._recipe.kind, self._setting.address)
             leads = self._standing.leads

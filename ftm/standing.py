@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import itertools
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..actors.errors import HoldfastError
@@ -13,7 +14,9 @@ from .replylog import ReplyLog
 
 if TYPE_CHECKING:
     from ..actors.node import Node
+    from ..actors.message import Message
     from .mechanism import Mechanism
+    from .sealed import SecuredLink
     from .server import Server
 
 PeerState = Literal["none", "joining", "live"]
@@ -33,9 +36,11 @@ class Standing:
         self.is_fenced = False  # another one leads: nothing that is said here counts
         self.log = ReplyLog()
         self.inside: dict[int, Request] = {}  # requests that are being handled
+        self.inputs: dict[int, Request] = {}  # requests as they came in, for whoever runs them once more
         self.peer: str | None = None  # the path of the other replica
         self.peer_state: PeerState = "none"
         self.peer_turn = -2  # the last turn whose state it has acknowledged, -2 if that is not known
+        self.kept = (-1, -1)  # epoch and turn of the state that was last computed here for the one that leads
         self.leading = -1  # the epoch in which it has begun to lead
         self.computes = False  # whether the protected actor lives here
         self.is_ready = False  # whether it has the state of the one that leads
@@ -43,6 +48,9 @@ class Standing:
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to a follower
         self.refused = 0  # messages of other epochs or configurations
         self.server: Server = None  # type: ignore[assignment]  # made with it, by the replica
+        self.link: SecuredLink | None = None  # what comes and goes has to be sealed
+        self._opened: dict[int, Message[Any]] = {}  # came over it, and waits for its handler
+        self._opened_keys = itertools.count()
         self._bricks: dict[str, ActorRef[Any]] = {}  # of the other replica, by slot
         self._unready: list[asyncio.Future[None]] = []
         self._waiting: set[asyncio.Future[Any]] = set()
@@ -59,6 +67,16 @@ class Standing:
         if config is not None and config != self.config:
             self.refused += 1
             raise ConfigMismatch(self.path, self.config, config)
+
+    def put_opened(self, message: Message[Any]) -> int:
+        """What has come over the secured link; the number is for `take_opened`."""
+        key = next(self._opened_keys)
+        self._opened[key] = message
+        return key
+
+    def take_opened(self, key: int) -> Message[Any] | None:
+        """What has come, once."""
+        return self._opened.pop(key, None)
 
     def entries(self, ends: list[TurnEnd]) -> list[Logged]:
         """Outcomes as the reply log has them."""
