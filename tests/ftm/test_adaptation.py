@@ -278,7 +278,7 @@ async def test_two_at_a_time_are_done_one_after_the_other(system: hf.ActorSystem
 
 async def test_a_brick_without_its_bindings_is_refused_by_the_replicas(system: hf.ActorSystem) -> None:
     ref = await protected(system)
-    with pytest.raises(hf.TransactionRefused, match="nothing would be bound|no binding"):
+    with pytest.raises(hf.TransactionRefused, match="nothing would be bound"):
         async with system.transaction() as change:
             change.update(ref, "after", NeedsMore, role="primary")
             change.add("/app", hf.child("never", hf.start(Counter)))
