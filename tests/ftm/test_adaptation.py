@@ -173,6 +173,7 @@ async def test_one_brick_gets_new_code(system: hf.ActorSystem, tmp_path: Path) -
     assert ref._cell.spec.mechanism == PBR()
     (brick,) = ref._cell.spec.mechanism.exchanged.values()
     assert brick.__name__ == "Counting"
+    await two_again(ref)
     primary = group_of(ref).primary
     assert primary is not None
     os.kill(pid_of(system, ref, primary), signal.SIGKILL)
