@@ -186,11 +186,13 @@ from holdfast.system.transaction.events import (
 from holdfast.system.transaction.operation import Operation, Step
 
 if TYPE_CHECKING:
+    from holdfast.ftm.adaptation import CannotAdapt
     from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
     from holdfast.ftm.detector import Detection
     from holdfast.ftm.events import (
         FailedOver,
         MechanismAttached,
+        MechanismChanged,
         MechanismDetached,
         ReplicaJoined,
         ReplicaLost,
@@ -204,6 +206,7 @@ if TYPE_CHECKING:
     from holdfast.ftm.sealed import FrameRefused
     from holdfast.ftm.sec.authority import CertificationAuthority
     from holdfast.ftm.voters import NoMajority
+    from holdfast.system.protection import AdaptationUndone
 
 __all__ = [
     "Actor",
@@ -214,6 +217,7 @@ __all__ = [
     "ActorStarted",
     "ActorStopped",
     "ActorSystem",
+    "AdaptationUndone",
     "AlreadyPresent",
     "AlreadyRegistered",
     "AlreadyStarted",
@@ -226,6 +230,7 @@ __all__ = [
     "Binding",
     "Bus",
     "Calls",
+    "CannotAdapt",
     "CannotMove",
     "CertificationAuthority",
     "Change",
@@ -281,6 +286,7 @@ __all__ = [
     "MaxChildren",
     "Mechanism",
     "MechanismAttached",
+    "MechanismChanged",
     "MechanismDetached",
     "MechanismRefused",
     "Message",
@@ -450,6 +456,9 @@ _LAZY = {
     "Mechanism": "holdfast.ftm.mechanism",
     "MechanismAttached": "holdfast.ftm.events",
     "MechanismDetached": "holdfast.ftm.events",
+    "CannotAdapt": "holdfast.ftm.adaptation",
+    "MechanismChanged": "holdfast.ftm.events",
+    "AdaptationUndone": "holdfast.system.protection",
     "MechanismRefused": "holdfast.ftm.mechanism",
     "NoMajority": "holdfast.ftm.voters",
     "PBR": "holdfast.ftm.mechanisms.pbr",

@@ -94,6 +94,20 @@ class Place(NamedTuple):
 PARTS: dict[str, type[Brick]] = {"before": Before, "proceed": Proceed, "after": After}
 
 
+def nested(layers: tuple[Mechanism, ...]) -> tuple[Mechanism, ...]:
+    """The same layers as they are woven: assertions stand inside replication, so that no state leaves unchecked.
+
+    For whoever reads a composition they stand outside: what they check is what the replicas have come to.
+    """
+    replication = [one for one in layers if one.layer == "replication"]
+    if not replication:
+        return layers
+    moved = [one for one in layers if one.layer == "assertion"]
+    kept = [one for one in layers if one.layer != "assertion"]
+    at = kept.index(replication[-1]) + 1
+    return (*kept[:at], *moved, *kept[at:])
+
+
 def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
     """The bricks of a composition, by slot, outermost layer first.
 
@@ -160,7 +174,7 @@ class Replica(Supervisor):
         made = tuple(one if isinstance(one, Mechanism) else revive(one) for one in layers)
         for one in made:
             one.check(start.kind, setting.address)
-        self._made = made
+        self._made = nested(made)
 
     def init(self) -> Plan:
         """The protected actor and its state manager; the bricks follow."""
@@ -203,7 +217,7 @@ class Replica(Supervisor):
 
     def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Any:
         """The lives of the protected actor begin and end as the bricks want it; the end of a brick is ours."""
-        if cell.name == SERVER:
+        if cell.name == SERVER or isinstance(cell.host, Server):
             return None
         return super().child_exited(cell, life, reason)
 
@@ -261,13 +275,26 @@ class Replica(Supervisor):
                 self._give_up_address(one, SHUTDOWN)
                 self._forget(one)
 
+    async def _settled(self, name: str) -> None:
+        """Wait until a brick has handled what has come so far.
+
+        Raises:
+            HoldfastError: it has crashed; we hear of that only behind this turn, and then all of us ends.
+        """
+        cell = self._cell(name)
+        asked, ended = cell.ref.ask(Settle(), timeout=FOREVER), cell.ended()
+        await asyncio.wait((asked, ended), return_when=asyncio.FIRST_COMPLETED)
+        if not asked.done():
+            raise HoldfastError(f"{cell.path} has crashed")
+        await asked
+
     async def _take_up(self, woven: Woven, *, leads: bool | None = None, behind: bool = False) -> None:
         """Have this stack be the one: bind everything, end what is not needed (`behind`: when we have answered)."""
         old, self._woven, standing = self._woven, woven, self._standing
         kept = set(woven.names.values())
         left = [name for name in old.names.values() if name not in kept and name in self._children]
         for name in left:  # What is in their mailboxes belongs to the time before.
-            await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
+            await self._settled(name)
         standing.config, standing.layers = woven.config, woven.layers
         if leads is not None:
             standing.leads = leads
@@ -389,7 +416,7 @@ class Replica(Supervisor):
         places = weave(old.layers, leads=message.leads)
         left = [name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]]
         for name in left:  # What is in their mailboxes belongs to the time before.
-            await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
+            await self._settled(name)
         await self._end_bricks(left)  # First: the new ones have their names.
         woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         await self._take_up(woven, leads=message.leads)
@@ -399,7 +426,7 @@ class Replica(Supervisor):
         try:
             if self._prepared is not None:
                 await self._drop_prepared()
-            layers = tuple(revive(one) for one in message.layers)
+            layers = nested(tuple(revive(one) for one in message.layers))
             for one in layers:
                 one.check(self._recipe.kind, self._setting.address)
             leads = self._standing.leads
@@ -427,7 +454,7 @@ class Replica(Supervisor):
         """Nothing is inside the one that leads, but a follower may be behind it."""
         names = self._woven.names
         for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
-            await self._cell(names[slot]).ref.ask(Settle(), timeout=FOREVER)
+            await self._settled(names[slot])
         await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
 
     @on(EndBricks)

@@ -23,7 +23,7 @@ from holdfast.ftm.mechanisms.sec import SEC
 from holdfast.ftm.messages import Done, Follow, Lead, Work
 from holdfast.ftm.orders import Export, Join, Peer
 from holdfast.ftm.replica import weave
-from holdfast.ftm.sealed import Greet, Opened, Refused, Sealed
+from holdfast.ftm.sealed import TELLS, Agree, Back, Call, Greet, LinkLost, Opened, Part, Refused, Sealed
 from holdfast.ftm.sec.authority import CertificationAuthority, Enrol, GetRoot
 from holdfast.ftm.sec.certificates import Trust, make_request
 from holdfast.ftm.sec.errors import EnrolmentRefused
@@ -352,3 +352,36 @@ except hf.MechanismRefused as error:
 """
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60).stdout
     assert "holdfast[sec]" in out
+
+
+async def test_what_comes_twice_is_done_once_in_order(secured: hf.ActorSystem) -> None:
+    """A frame whose answer was lost, or that came before another one, is sealed anew and sent again."""
+    sec, node = SEC(CA), secured.node
+    inner = sec.open_link(node, "/app/c", "/app/c/ftm/r1", lambda: 1)
+    outer = sec.open_link(node, "/app/c", "/app/c/ftm/proxy", lambda: 1, lambda: ["/app/c/ftm/r1"])
+    await outer.ready()
+    done: list[bytes] = []
+    lost: list[bool] = []
+
+    async def handle(call: Call) -> Back:
+        done.extend(part.body for part in call.parts)
+        return Back("reply", "", call.parts[0].body)
+
+    async def reach(message: Any, seconds: float) -> Any:
+        if isinstance(message, Greet):
+            return await inner.greet(message.hello)
+        if isinstance(message, Agree):
+            return await inner.agree(message.hello, message.finish)
+        reply = await inner.take(message.frame, handle)
+        lost.append(len(lost) % 3 != 2)
+        if lost[-1]:
+            raise hf.AskTimeout("r1", seconds)
+        return reply
+
+    asked = [outer.call("/app/c/ftm/r1", TELLS, Part("", b"%d" % n), reach, lambda: True) for n in range(9)]
+    backs = await asyncio.gather(*asked)
+    assert [back.body for back in backs] == [b"%d" % n for n in range(9)] == done
+    assert len(lost) > 9
+    outer.close()
+    with pytest.raises(LinkLost):
+        await outer.call("/app/c/ftm/r1", TELLS, Part("", b""), reach, lambda: True)
