@@ -9,25 +9,24 @@ from __future__ import annotations
 import asyncio
 import itertools
 from collections import deque
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..actors import lives
 from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
-from ..actors.errors import AskTimeout, HoldfastError
+from ..actors.errors import HoldfastError
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
-from .letters import Letters
+from .letters import LETTER_BYTES, SEALED, Letter, Letters, Sheet
 from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
-from .sealed import LinkLost, Part, Refused, Sealed
+from .sealed import Part, Refused
 from .sealing import sealed
 from .standing import PeerLost
 
 if TYPE_CHECKING:
     from .mechanism import Mechanism
-    from .sealed import SecuredLink
     from .standing import Standing
 
 R = TypeVar("R")
@@ -36,27 +35,6 @@ FOREVER = 10.0 * 86400.0
 """Seconds: the bricks of one replica wait for each other as long as it takes; a death is told otherwise."""
 AGAIN = 0.02
 """Seconds after which the other replica is asked again, if it could not be reached and still counts."""
-SEALED = "sealed"
-"""The name of a letter that says it inside."""
-LETTER_BYTES = 8 * 1024 * 1024
-"""What is said to the other replica in one message; more goes in sheets."""
-
-
-class Letter(Message[bytes]):
-    """What a brick says to the same brick of the other replica; sheets with its number come before it."""
-
-    epoch: int
-    config: int
-    name: str
-    body: bytes
-    sheets: int = 0
-
-
-class Sheet(Message):
-    """A piece of a letter that is too large for one message."""
-
-    sheets: int
-    data: bytes
 
 
 class Where(Message[str]):
@@ -82,11 +60,6 @@ class Brick(Letters):
     """What all bricks have in common."""
 
     deterministic = False
-    peer_messages: ClassVar[tuple[type[Message[Any]], ...]] = ()
-    """What `from_peer` understands."""
-
-    answers_later: ClassVar[bool] = False
-    """Whether other messages are handled while `from_peer` waits for something."""
 
     next: Binding[Actor]
     peer: Binding[Actor]
@@ -136,7 +109,12 @@ class Brick(Letters):
         body = codec.encoder.encode(message)
         peer = standing.peer
         if standing.link is not None:
-            back = await self._ask_sealed(standing.link, peer, message, body)
+            if peer is None:
+                raise PeerLost("there is none")
+            back = await self._ask_sealed(
+                standing.link, peer, self.slot, Part(message_name(type(message)), body),
+                lambda: self._find_peer(peer), lambda error: standing.lost(self.slot), lambda: standing.peer == peer,
+            )  # fmt: skip
             return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
         while True:
             if peer is None or standing.peer != peer:
@@ -159,49 +137,6 @@ class Brick(Letters):
                 continue
             return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
 
-    async def _ask_sealed(self, link: SecuredLink, peer: str | None, message: Message[Any], body: bytes) -> bytes:
-        """The same over a secured link, which does again what has to be."""
-        standing = self._standing
-
-        async def reach(said: Message[Any], seconds: float) -> Any:
-            if peer is None or standing.peer != peer:
-                raise PeerLost("there is none")
-            if not isinstance(said, Sealed):
-                cell = standing.node.cell_at(f"{peer}/protocol")
-                return await standing.wait_for(cell.ref.ask(said, timeout=seconds))
-            try:
-                ref = await self._find_peer(peer)
-                return await standing.wait_for(ref.ask(self._sheets_of(ref, said.frame), timeout=seconds))
-            except (PeerLost, AskTimeout, Refused):
-                raise
-            except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
-                standing.lost(self.slot)
-                raise
-
-        part = Part(message_name(type(message)), body)
-        try:
-            back = await link.call(
-                peer or "", self.slot, part, reach, lambda: peer is not None and standing.peer == peer,
-                standing.epoch, standing.config,
-            )  # fmt: skip
-        except LinkLost:
-            raise PeerLost("it was replaced, or is gone") from None
-        if back.kind == "reply":
-            return back.body
-        error = standing.node.codec.decode_error(back.kind, back.name, back.body)
-        if isinstance(error, StaleEpoch):
-            standing.fence()
-        raise error
-
-    def _sheets_of(self, ref: ActorRef[Any], frame: bytes) -> Letter:
-        number = 0
-        if len(frame) > LETTER_BYTES:
-            number = next(self._numbers)
-            for part in pieces(frame):
-                ref.tell(Sheet(number, part))
-            frame = b""
-        return Letter(-1, -1, SEALED, frame, number)
-
     async def ask_at(self, path: str, slot: str, message: Message[R]) -> R:
         """Ask a brick of a certain replica, once.
 
@@ -210,14 +145,20 @@ class Brick(Letters):
         """
         standing, key = self._standing, f"{path}#{slot}"
         codec = standing.node.codec
-        ref = standing.brick(key)
+        body = codec.encoder.encode(message)
+        if standing.link is not None:
+            errors: list[HoldfastError] = []
+            part = Part(message_name(type(message)), body)
+            try:
+                back = await self._ask_sealed(
+                    standing.link, path, slot, part, lambda: self._find(path, slot), errors.append, lambda: not errors
+                )
+            except PeerLost as lost:
+                standing.lost(key)
+                raise (errors or [lost])[0] from None
+            return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
         try:
-            if ref is None:
-                where = Where(standing.config, slot)
-                asked = standing.node.cell_at(f"{path}/protocol").ref.ask(where, timeout=FOREVER)
-                ref = standing.node.cell_at(await standing.wait_for(asked)).ref
-                standing.found(key, ref)
-            body = codec.encoder.encode(message)
+            ref = await self._find(path, slot)
             reply = await standing.wait_for(ref.ask(self._letter(ref, message, body), timeout=FOREVER))
         except StaleEpoch:
             standing.fence()
@@ -226,6 +167,16 @@ class Brick(Letters):
             standing.lost(key)
             raise
         return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
+
+    async def _find(self, path: str, slot: str) -> ActorRef[Any]:
+        standing, key = self._standing, f"{path}#{slot}"
+        ref = standing.brick(key)
+        if ref is None:
+            where = Where(standing.config, slot)
+            asked = standing.node.cell_at(f"{path}/protocol").ref.ask(where, timeout=FOREVER)
+            ref = standing.node.cell_at(await standing.wait_for(asked)).ref
+            standing.found(key, ref)
+        return ref
 
     def _letter(self, ref: ActorRef[Any], message: Message[Any], body: bytes) -> Letter:
         standing, number = self._standing, 0

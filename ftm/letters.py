@@ -1,17 +1,46 @@
-"""What comes to a brick from the other replica over a secured link."""
+"""Letters: what bricks of two replicas say to each other, and how over a secured link."""
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ..actors.actor import Actor
+from ..actors.errors import AskTimeout, HoldfastError
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal, message_name
-from .sealed import Back, Call, Refused
+from ..actors.ref import ActorRef
+from ..checkpoint.records import pieces
+from .messages import StaleEpoch
+from .sealed import Back, Call, LinkLost, Part, Refused, Sealed
+from .standing import PeerLost
 
 if TYPE_CHECKING:
     from .sealed import SecuredLink
     from .standing import Standing
+
+
+SEALED = "sealed"
+"""The name of a letter that says it inside."""
+LETTER_BYTES = 8 * 1024 * 1024
+"""What is said to the other replica in one message; more goes in sheets."""
+
+
+class Letter(Message[bytes]):
+    """What a brick says to the same brick of the other replica; sheets with its number come before it."""
+
+    epoch: int
+    config: int
+    name: str
+    body: bytes
+    sheets: int = 0
+
+
+class Sheet(Message):
+    """A piece of a letter that is too large for one message."""
+
+    sheets: int
+    data: bytes
 
 
 class Letters(Actor):
@@ -24,10 +53,64 @@ class Letters(Actor):
 
     slot: str
     _standing: Standing
+    _numbers: Iterator[int]
 
     async def from_peer(self, message: Message[Any]) -> Any:
         """Take what the same brick of the other replica says."""
         raise NotImplementedError
+
+    async def _ask_sealed(
+        self,
+        link: SecuredLink,
+        path: str,
+        slot: str,
+        part: Part,
+        find: Callable[[], Awaitable[ActorRef[Any]]],
+        failed: Callable[[HoldfastError], None],
+        still: Callable[[], bool],
+    ) -> bytes:
+        """Ask a brick over a secured link, which does again what has to be; `failed` hears when it is not there.
+
+        Raises:
+            PeerLost: nobody waits any longer. What the brick has raised.
+        """
+        standing = self._standing
+
+        async def reach(said: Message[Any], seconds: float) -> Any:
+            if not still():
+                raise PeerLost("it does not count any more")
+            try:
+                if not isinstance(said, Sealed):
+                    ref, out = standing.node.cell_at(f"{path}/protocol").ref, said
+                else:
+                    ref = await find()
+                    out = self._sheets_of(ref, said.frame)
+                return await standing.wait_for(ref.ask(out, timeout=seconds))
+            except (PeerLost, AskTimeout, Refused):
+                raise
+            except HoldfastError as error:  # It has died, which we shall be told, or its brick was exchanged.
+                failed(error)
+                raise
+
+        try:
+            back = await link.call(path, slot, part, reach, still, standing.epoch, standing.config)
+        except LinkLost:
+            raise PeerLost("it was replaced, or is gone") from None
+        if back.kind == "reply":
+            return back.body
+        error = standing.node.codec.decode_error(back.kind, back.name, back.body)
+        if isinstance(error, StaleEpoch):
+            standing.fence()
+        raise error
+
+    def _sheets_of(self, ref: ActorRef[Any], frame: bytes) -> Letter:
+        number = 0
+        if len(frame) > LETTER_BYTES:
+            number = next(self._numbers)
+            for part in pieces(frame):
+                ref.tell(Sheet(number, part))
+            frame = b""
+        return Letter(-1, -1, SEALED, frame, number)
 
     async def _take_sealed(self, link: SecuredLink, frame: bytes) -> bytes | ReplyHandle[bytes]:
         if not self.answers_later:

@@ -483,7 +483,7 @@ class RequestProtocol(Gate):
         await self.proceed.ask(Flush(), timeout=FOREVER)
 
 
-HANDLERS: dict[type[Message[Any]], str] = {
+RequestProtocol.handlers = {
     Work: "_work",
     Inward: "_inward",
     Ended: "_ended",
@@ -496,6 +496,4 @@ HANDLERS: dict[type[Message[Any]], str] = {
     Quiesce: "_quiesce",
     Finish: "_finish",
 }
-"""What the root says to a replica."""
-OPENED = {message_name(kind): kind for kind in HANDLERS}
-RequestProtocol.handlers = HANDLERS
+OPENED = {message_name(kind): kind for kind in RequestProtocol.handlers}

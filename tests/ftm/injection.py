@@ -23,10 +23,11 @@ import msgspec
 import holdfast as hf
 from holdfast.actors.actor import Start
 from holdfast.actors.mail import Envelope
-from holdfast.ftm.bricks import Brick, Letter
+from holdfast.ftm.bricks import Brick
 from holdfast.ftm.detector import Detector
 from holdfast.ftm.failover import FailoverManager
 from holdfast.ftm.join import Joiner
+from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanism import BUILT_IN, find
 from holdfast.ftm.messages import Work
 from holdfast.ftm.proxy import Proxy

@@ -14,7 +14,7 @@ from holdfast.actors.exits import SHUTDOWN, pack_exit
 from holdfast.checkpoint.records import OK, STASHED, TurnEnd
 from holdfast.checkpoint.records import Closed as LifeClosed
 from holdfast.ftm.alarms import ProtectionLost
-from holdfast.ftm.bricks import Letter
+from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
 from holdfast.ftm.messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
 from holdfast.ftm.orders import Export, Finish, Install, Join, Peer

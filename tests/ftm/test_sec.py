@@ -20,6 +20,7 @@ from holdfast.actors.codec import Parcel
 from holdfast.actors.process.inner import Inner
 from holdfast.ftm.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.sec import SEC
+from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.messages import Done, Follow, Lead, Work
 from holdfast.ftm.orders import Export, Join, Peer
 from holdfast.ftm.replica import weave
@@ -65,6 +66,7 @@ STACKS: dict[str, Callable[[], tuple[Any, ...]]] = {
     "SEC over PBR": lambda: (SEC(CA), hf.PBR()),
     "SEC over LFR": lambda: (SEC(CA), hf.LFR()),
     "SEC over PBR over TR": lambda: (SEC(CA), hf.PBR(), hf.TR()),
+    "SEC over TMR": lambda: (SEC(CA), TMR()),
 }
 
 
