@@ -30,3 +30,19 @@ class Masked(Event, frozen=True, eq=False):
 
     replica: str
     turns: str
+
+
+class Objected(Event, frozen=True, eq=False):
+    """An assertion or acceptance test did not hold here; `by` says who has computed the request instead, "" if nobody."""
+
+    replica: str
+    why: str
+    by: str
+
+
+class Outvoted(Event, frozen=True, eq=False):
+    """The other replicas agree on something else than this one: it ends, and joins again with their state."""
+
+    replica: str
+    epoch: int
+    turns: str

@@ -94,6 +94,7 @@ class Brick(Actor):
         self._standing, self.mechanism, self.slot = standing, mechanism, slot
         self._sheets: dict[int, list[bytes]] = {}
         self._numbers = itertools.count(1)
+        self._sending = asyncio.Lock()
         self._handle: ReplyHandle[Any] | None = None
 
     @property
@@ -139,8 +140,11 @@ class Brick(Actor):
             if peer is None or standing.peer != peer:
                 raise PeerLost("there is none")
             try:
-                ref = await self._find_peer(peer)
-                asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
+                async with self._sending:  # In order: finding the peer takes the first one longer than the others.
+                    if standing.peer != peer:
+                        continue
+                    ref = await self._find_peer(peer)
+                    asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
                 reply = await standing.wait_for(asked)
             except (PeerLost, ConfigMismatch):
                 raise
@@ -195,6 +199,31 @@ class Brick(Actor):
                 ref.tell(Sheet(number, part))
             frame = b""
         return Letter(-1, -1, SEALED, frame, number)
+
+    async def ask_at(self, path: str, slot: str, message: Message[R]) -> R:
+        """Ask a brick of a certain replica, once.
+
+        Raises:
+            HoldfastError: it cannot be reached, or has died. PeerLost: who is our peer has changed meanwhile.
+        """
+        standing, key = self._standing, f"{path}#{slot}"
+        codec = standing.node.codec
+        ref = standing.brick(key)
+        try:
+            if ref is None:
+                where = Where(standing.config, slot)
+                asked = standing.node.cell_at(f"{path}/protocol").ref.ask(where, timeout=FOREVER)
+                ref = standing.node.cell_at(await standing.wait_for(asked)).ref
+                standing.found(key, ref)
+            body = codec.encoder.encode(message)
+            reply = await standing.wait_for(ref.ask(self._letter(ref, message, body), timeout=FOREVER))
+        except StaleEpoch:
+            standing.fence()
+            raise
+        except HoldfastError:
+            standing.lost(key)
+            raise
+        return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
 
     def _letter(self, ref: ActorRef[Any], message: Message[Any], body: bytes) -> Letter:
         standing, number = self._standing, 0

@@ -231,7 +231,11 @@ class Group:
                 return
             self.link.close()
         self.link = outermost.open_link(
-            self.node, self.path, self.place("proxy"), lambda: self.epoch, lambda: [self.place(one) for one in self.names]
+            self.node,
+            self.path,
+            self.place("proxy"),
+            lambda: self.epoch,
+            lambda: [self.place(one) for one in self.names],
         )
 
     def is_plain(self) -> bool:

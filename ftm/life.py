@@ -12,6 +12,8 @@ from ..checkpoint.context import RecordedContext
 from ..checkpoint.life import Life
 from ..checkpoint.method import Method
 from ..checkpoint.records import (
+    Answer,
+    Feed,
     ToHome,
     TurnEnd,
 )
@@ -49,12 +51,17 @@ class ServerLife(Life):
     def __init__(self, cell: Cell, server: Server, method: Method) -> None:
         super().__init__(cell, server, method, None)
         self.server = server
+        self.ended: Feed | None = None  # what the last turn has handled
         self.saves = server.has_access
 
     def _context(self, cell: Cell) -> RecordedContext:
         made = self._context_made = ServerContext(cell, self.server.address)
         made.recorded = self
         return made
+
+    def close_turn(self, status: str, answer: Answer) -> None:
+        self.ended = self.feed
+        super().close_turn(status, answer)
 
     def release(self) -> None:
         if self.feed is not None and self.outs:

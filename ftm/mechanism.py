@@ -34,7 +34,7 @@ Part = Literal["before", "proceed", "after"]
 SCRIPTS = "holdfast_script_"
 """How the modules of reconfiguration scripts are called: only the process that runs the script has them by name."""
 ENTRY_POINTS = "holdfast.mechanisms"
-BUILT_IN = ("pbr", "lfr", "tr", "sec")
+BUILT_IN = ("pbr", "lfr", "tr", "ad", "rb", "nvp", "tmr", "sec")
 
 
 class MechanismRefused(HoldfastError):
@@ -145,7 +145,7 @@ class Mechanism:
     def describe(self) -> Description:
         """For another process."""
         code = code_of(type(self))
-        settings = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.init}
+        settings = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self) if field.init}
         bricks = tuple((*key, code_of(kind)) for key, kind in sorted(self.exchanged.items(), key=lambda pair: pair[0]))
         return Description(code.kind, settings, code.file, code.sha256, bricks)
 
@@ -170,6 +170,11 @@ def find_class(code: Code) -> Any:
     if code.file:
         return _attribute(load_module(code.file, sha256=code.sha256), path)
     return _attribute(sys.modules.get(module) or importlib.import_module(module), path)
+
+
+def _plain(value: Any) -> Any:
+    """A setting as it travels; a mechanism that has structs among its settings takes them back as dicts."""
+    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else value
 
 
 def has_state_access(kind: type[Actor]) -> bool:

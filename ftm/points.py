@@ -50,6 +50,8 @@ UNKNOWN: Final = -3
 """In place of the turn that a delta begins after."""
 
 HandOver = Callable[[list[TurnEnd], bool], Awaitable[None]]
+TurnHook = Callable[[Any, TurnEnd], TurnEnd]
+"""Takes the server and the end of a turn, and returns what the end is to be."""
 
 
 class Points(lives.LocalHost):
@@ -75,6 +77,8 @@ class Points(lives.LocalHost):
         self.begun: list[Request] = []
         self.alone: set[tuple[str, str]] = set()  # inputs that have wanted to be at the front once
         self.handed = self.confirmed = 0  # parts: handed over, known to be at home
+        self.hooks: list[TurnHook] = []  # see each end while the actor is as the turn has left it; the innermost first
+        self.objections: dict[int, str] = {}  # what hooks have against turns, by number of the request
         self.hand_over: HandOver | None = None  # Proceed's, while a batch runs
         self.on_more: Callable[[], None] = lambda: None
         self.outward: Callable[[Released], None] = lambda record: None

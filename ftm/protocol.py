@@ -452,6 +452,9 @@ class RequestProtocol(Brick):
     async def _taken(self, take: Take) -> int:
         standing, server = self._standing, self._standing.server
         standing.set_peer(take.leader, "live")
+        if take.state is not None and standing.kept > (standing.epoch, take.state.turn):
+            standing.ready()  # It has computed with the leader meanwhile, and is further than that.
+            return server.turn
         await self.proceed.ask(Abandon(), timeout=FOREVER)
         await server.drop_life()
         server.install(take.state)

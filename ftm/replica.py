@@ -93,6 +93,20 @@ class Place(NamedTuple):
 PARTS: dict[str, type[Brick]] = {"before": Before, "proceed": Proceed, "after": After}
 
 
+def nested(layers: tuple[Mechanism, ...]) -> tuple[Mechanism, ...]:
+    """The same layers as they are woven: assertions stand inside replication, so that no state leaves unchecked.
+
+    For whoever reads a composition they stand outside: what they check is what the replicas have come to.
+    """
+    replication = [one for one in layers if one.layer == "replication"]
+    if not replication:
+        return layers
+    moved = [one for one in layers if one.layer == "assertion"]
+    kept = [one for one in layers if one.layer != "assertion"]
+    at = kept.index(replication[-1]) + 1
+    return (*kept[:at], *moved, *kept[at:])
+
+
 def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
     """The bricks of a composition, by slot, outermost layer first.
 
@@ -159,7 +173,7 @@ class Replica(Supervisor):
         made = tuple(one if isinstance(one, Mechanism) else revive(one) for one in layers)
         for one in made:
             one.check(start.kind, setting.address)
-        self._made = made
+        self._made = nested(made)
 
     def init(self) -> Plan:
         """The protected actor and its state manager; the bricks follow."""
@@ -201,7 +215,7 @@ class Replica(Supervisor):
 
     def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Any:
         """The lives of the protected actor begin and end as the bricks want it; the end of a brick is ours."""
-        if cell.name == SERVER:
+        if cell.name == SERVER or isinstance(cell.host, Server):
             return None
         return super().child_exited(cell, life, reason)
 
@@ -347,7 +361,9 @@ class Replica(Supervisor):
         gate = cell[f"{layers[0].name}.before"]
         outlet = cell[f"{layers[0].name}.after"] if is_secured else proxy
         entries = [cell[PROTOCOL if index == 0 else f"{one.name}.protocol"] for index, one in enumerate(layers)]
-        exits = [entries[0] if is_secured and index == 0 else cell[f"{one.name}.after"] for index, one in enumerate(layers)]
+        exits = [
+            entries[0] if is_secured and index == 0 else cell[f"{one.name}.after"] for index, one in enumerate(layers)
+        ]
         found += [(entries[0], "gate", gate)]
         for index, one in enumerate(layers):
             protocol, before, after = entries[index], cell[f"{one.name}.before"], cell[f"{one.name}.after"]
@@ -395,7 +411,7 @@ class Replica(Supervisor):
         try:
             if self._prepared is not None:
                 await self._drop_prepared()
-            layers = tuple(revive(one) for one in message.layers)
+            layers = nested(tuple(revive(one) for one in message.layers))
             for one in layers:
                 one.check(self._recipe.kind, self._setting.address)
             leads = self._standing.leads

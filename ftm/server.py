@@ -10,6 +10,8 @@ import time
 from collections import deque
 from typing import Any, Final
 
+import msgspec
+
 from ..actors import mailbox
 from ..actors.cell import RUNNING, Cell
 from ..actors.errors import StartFailed
@@ -293,13 +295,23 @@ class Server(Points):
 
     # -- the last part once more -----------------------------------------------------------------------------------
 
-    async def again(self) -> tuple[list[TurnEnd], State]:
+    async def again(
+        self, since: State | None = None, feeds: list[Request] | None = None
+    ) -> tuple[list[TurnEnd], State]:
         """Rewind to the point before the last part, and run that part again; returns ends and state.
 
         Nothing is handed over. Asks get the outcomes that they had.
+
+        Args:
+            since: rewind to this state instead.
+            feeds: run these requests instead.
         """
-        assert self.previous is not None
-        before, requests = self.previous
+        previous = self.previous
+        before, requests = previous if previous is not None else (since, feeds)
+        before, requests = since or before, requests if feeds is None else feeds
+        assert before is not None
+        assert requests is not None
+        self.objections.clear()
         if self.life is None:
             self.point, self.tail = before, []
             await self._begin()
@@ -319,8 +331,15 @@ class Server(Points):
             await self._begin()
         self._skips.clear()
         state = self.capture()
-        self.previous = before, requests
+        self.previous = previous
         return ends, state
+
+    async def adopt(self, state: State) -> None:
+        """Go on from this state, with a life of its own; what led to it has happened elsewhere."""
+        live = state.live or (self.life is not None and self.life.is_live)
+        await self.drop_life()
+        self.install(msgspec.structs.replace(state, live=live))
+        await self.ensure()
 
     async def back(self) -> State:
         """Rewind to the point before the last part, for good: it leaves no trace but its numbers."""
@@ -340,6 +359,9 @@ class Server(Points):
         match record:
             case TurnEnd():
                 self._withheld = []
+                if self.hooks and not self._is_quiet and record.id not in self._skips:
+                    for hook in self.hooks:
+                        record = hook(self, record)
                 if record.status == FAILED and not self._is_quiet and record.id not in self._skips:
                     self._failed = record.id
                 if not self._is_quiet:

@@ -21,10 +21,35 @@ import msgspec
 
 from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.message import Message, message_name
-from ..sealed import TELLS, Agree, Back, Call, FrameRefused, Greet, Handle, LinkLost, Part, Reach, Refused, Sealed, Still
+from ..sealed import (
+    ORDERS,
+    TELLS,
+    Agree,
+    Back,
+    Call,
+    FrameRefused,
+    Greet,
+    Handle,
+    LinkLost,
+    Part,
+    Reach,
+    Refused,
+    Sealed,
+    Still,
+)
 from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
 from .certificates import MOST_NAME, Trust, about, make_request, public_of
-from .errors import CLOSED, MALFORMED, REPLAYED, UNTRUSTED, WRONG_SESSION, EnrolmentRefused, NoCertificate, Rejected
+from .errors import (
+    CLOSED,
+    MALFORMED,
+    REPLAYED,
+    UNTRUSTED,
+    WRONG_PEER,
+    WRONG_SESSION,
+    EnrolmentRefused,
+    NoCertificate,
+    Rejected,
+)
 from .handshake import Participant, Response
 from .keys import Secret, SigningKey, raw_public
 from .session import HEAD, Limits, Session
@@ -41,6 +66,7 @@ FIRST_PAUSE, LONGEST_PAUSE = 0.002, 0.25
 """Seconds until a frame that was refused is sent again; the same."""
 MOST_BYTES = 1_000_000
 """Of messages in one frame, if there are several."""
+MOST_REPLICAS = 64
 MOST_RESPONSES = 32
 """Hand-shakes that others have begun, and not ended: the oldest are forgotten."""
 AUTHORITY_WITHIN = 5.0
@@ -118,6 +144,8 @@ class Link(Secret):
         self.mechanism, self.path = mechanism, path
         self._node, self._address, self._epoch, self._enrols = node, address, epoch, enrols
         self.rejected: Counter[str] = Counter()
+        self._proxy = certified(f"{address}/ftm/proxy")
+        self._replicas = frozenset(certified(f"{address}/ftm/r{number}") for number in range(1, MOST_REPLICAS + 1))
         self._me: Participant | None = None
         self._lock = asyncio.Lock()
         self._enrolled: set[str] = set()
@@ -247,11 +275,13 @@ class Link(Secret):
             me = await self._identity()
             try:
                 response = me.answer(hello)
+                self._check_peer(response.peer.name)
             except Rejected as error:
                 if error.reason != UNTRUSTED or not self._has_other_root(me):
                     raise
                 self._me = None  # The authority has begun a new life, with another key.
                 response = (await self._identity()).answer(hello)
+                self._check_peer(response.peer.name)
         except Rejected as error:
             raise self._refused(error.reason) from None
         except (HoldfastError, OSError) as error:
@@ -260,6 +290,18 @@ class Link(Secret):
             del self._responses[next(iter(self._responses))]
         self._responses[digest_of(hello)] = response
         return response.answer
+
+    def _check_peer(self, name: str) -> None:
+        """Who has a certificate may still have no business here."""
+        if name not in self._replicas and (self._enrols is not None or name != self._proxy):
+            self.rejected[WRONG_PEER] += 1
+            raise Rejected(WRONG_PEER, f"a hand-shake of {name!r}")
+
+    def _may(self, name: str, stream: str) -> bool:
+        """Whether this participant may say such things: orders and requests are the proxy's."""
+        if self._enrols is not None:
+            return name in self._replicas and stream == TELLS
+        return name == self._proxy if stream in (TELLS, ORDERS) else name in self._replicas
 
     def _has_other_root(self, me: Participant) -> bool:
         file = root_file(self.mechanism.keys, self.mechanism.authority)
@@ -274,7 +316,7 @@ class Link(Secret):
         self._check_open()
         response = self._responses.pop(hello, None)
         if response is None:
-            raise self._refused(CLOSED)
+            raise self._refused(CLOSED, counts=True)
         try:
             session = response.complete(finish)
         except Rejected as error:
@@ -378,15 +420,17 @@ class Link(Secret):
         me = self._me
         if me is not None:
             me.raise_epoch(self._epoch())
-        session = self._sessions.get(bytes(frame[5 - 4 : 9])) if len(frame) >= HEAD.size else None
+        session = self._sessions.get(bytes(frame[1:9])) if len(frame) >= HEAD.size else None
         if session is None:
-            raise self._refused(WRONG_SESSION)
+            raise self._refused(WRONG_SESSION, counts=True)
         try:
             call = msgspec.msgpack.decode(session.open(frame, CALL), type=Call)
         except Rejected as error:
             raise self._refused(error.reason) from None
         except msgspec.MsgspecError:
-            raise self._refused(MALFORMED) from None
+            raise self._refused(MALFORMED, counts=True) from None
+        if not self._may(session.peer.name, call.stream):
+            raise self._refused(WRONG_PEER, counts=True)
         back = await self._once(session, call, handle)
         try:
             return session.seal(msgspec.msgpack.encode(back), BACK + call.number.to_bytes(8, "big"))
@@ -402,12 +446,12 @@ class Link(Secret):
         if known is not None:
             return await asyncio.shield(known)
         if call.number < stream.floor:
-            raise self._refused(REPLAYED)
+            raise self._refused(REPLAYED, counts=True)
         if call.floor > stream.floor:
             stream.floor = call.floor
             stream.answers = {key: one for key, one in stream.answers.items() if key >= call.floor}
         stream.next = max(stream.next, stream.floor)
-        if call.stream != "order" and call.number > stream.next:
+        if call.stream != ORDERS and call.number > stream.next:
             raise Refused(path=self.path, reason=OUT_OF_ORDER)  # One before it was lost, and comes again.
         answer: asyncio.Future[Back] = self._node.loop.create_future()
         stream.answers[call.number] = answer
@@ -427,8 +471,8 @@ class Link(Secret):
         self.rejected[PLAIN] += 1
         self._refuse(PLAIN)
 
-    def _refused(self, reason: str) -> Refused:
-        if reason in (WRONG_SESSION, CLOSED, REPLAYED, MALFORMED) and not self.rejected[reason]:
+    def _refused(self, reason: str, *, counts: bool = False) -> Refused:
+        if counts:
             self.rejected[reason] += 1
         self._refuse(reason)
         return Refused(path=self.path, reason=reason)
