@@ -73,7 +73,9 @@ class Assertion:
         self._function: Callable[..., Any] = imported(name)
         self._takes = tuple(inspect.signature(self._function).parameters)
         if not self._takes or not PARAMETERS.issuperset(self._takes):
-            raise ValueError(f"{name} takes {', '.join(self._takes) or 'nothing'}; it may take reply, message and state")
+            raise ValueError(
+                f"{name} takes {', '.join(self._takes) or 'nothing'}; it may take reply, message and state"
+            )
         self.takes_reply = "reply" in self._takes
 
     def objection(self, **given: Any) -> str:
