@@ -30,6 +30,8 @@ from ..versions import version
 from ..voters import AnyVoter, Majority, Median, NoMajority, Undecided
 from .rb import protected_class
 
+MAJORITY = Majority()
+
 
 class Versions(Deciding):
     """After: has the other versions compute, and votes."""
@@ -90,7 +92,7 @@ class NVP(Mechanism):
     roles: ClassVar[dict[str, Role]] = {"single": Role(before=Remembering, after=Versions)}
 
     versions: Any = ()
-    voter: Any = Majority()
+    voter: Any = MAJORITY
     compare_state: bool = True
     within: float = 5.0
 
