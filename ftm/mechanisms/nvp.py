@@ -22,9 +22,9 @@ from ...actors.actor import Actor
 from ...actors.errors import HoldfastError
 from ..alarms import Masked
 from ..assertions import names_of
+from ..declaration import Cost
 from ..mechanism import Mechanism, Role
 from ..messages import Request, State
-from ..model import Cost
 from ..runs import Deciding, Remembering, Run, Shadow, turns_of, vote
 from ..versions import version
 from ..voters import AnyVoter, Majority, Median, NoMajority, Undecided

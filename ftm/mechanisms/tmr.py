@@ -21,10 +21,10 @@ import msgspec
 
 from ...actors.errors import HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
+from ..declaration import Cost
 from ..helping import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..mechanism import Mechanism, Role
 from ..messages import Done, Request, StaleEpoch, State
-from ..model import Cost
 from ..runs import Deciding, Run, digest_of_state, turns_of, vote
 from ..standing import PeerLost
 from ..voters import Majority, NoMajority, Undecided
