@@ -121,6 +121,7 @@ class FailoverManager(Actor):
         """From here on it is the one."""
         group = self._group
         group.primary, group.leading = name, None
+        group.bind_proxy()
         for other in [one for one in group.members if one != name]:
             group.lost(other, "it has to catch up with the new primary")
         group.failovers += 1

@@ -125,6 +125,12 @@ class Group:
         """The cell of an actor of the mechanism, if there is one now."""
         return self.node.find(self.place(name))
 
+    def bind_proxy(self) -> None:
+        """Show who leads: the proxy is bound to its RequestProtocol."""
+        proxy = self.cell_of("proxy")
+        if proxy is not None and self.primary is not None:
+            self.node.bind(proxy, "protocol", self.node.cell_at(self.place(f"{self.primary}/protocol")))
+
     def life_of(self, name: str) -> int:
         """The number of the life that a replica lives now; 0 if none."""
         cell = self.cell_of(name)

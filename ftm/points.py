@@ -91,6 +91,8 @@ class Points(lives.LocalHost):
         self._pending: deque[Request] = deque()
         self._resting: asyncio.Future[str] | None = None
         self._chunk = 8
+        self._singles = 0  # requests that are run one at a time: one of them has left what cannot be saved
+        self.can_save = True  # as far as is known, where nobody looks at the state after each part
         self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None

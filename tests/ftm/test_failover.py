@@ -102,9 +102,47 @@ async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSy
     ref = await started(system)
     seen = {path.removeprefix(f"{ref.path}/ftm/") for path in system.tree() if path.startswith(f"{ref.path}/ftm/")}
     bricks = {
-        f"{name}/{brick}" for name in ("r1", "r2") for brick in ("protocol", "before", "proceed", "state", "beat")
+        f"{name}/{brick}"
+        for name in ("r1", "r2")
+        for brick in ("protocol", "before", "proceed", "state", "server", "beat")
     }
     assert {*PARTS, "r1", "r2"} | bricks <= seen
+    backup = other(group_of(ref))
+    os.kill(pid_of(system, ref, backup), signal.SIGKILL)
+    async with asyncio.timeout(10):
+        while is_complete(ref):
+            await asyncio.sleep(0.001)
+    await two_again(ref)
+    assert f"{ref.path}/ftm/{backup}/server" in system.tree()
+
+
+async def test_the_bindings_of_the_bricks_are_seen_from_outside(system: hf.ActorSystem) -> None:
+    """A44 to A51: from the proxy to the protected actor, and back."""
+    ref = await started(system)
+    group = group_of(ref)
+    first, second = group.primary, other(group)
+
+    async def bound(brick: str) -> dict[str, str]:
+        status = await system.get_status(system.ref(f"{ref.path}/ftm/{brick}", hf.Actor))
+        return {port: path.removeprefix(f"{ref.path}/ftm/") for port, path in status.bindings.items()}
+
+    assert await ref.ask(Add(0)) == 1
+    assert await bound("proxy") == {"protocol": f"{first}/protocol"}
+    assert (await bound(f"{first}/protocol")).items() >= {"before": f"{first}/before", "next": "proxy"}.items()
+    assert (await bound(f"{first}/before"))["next"] == f"{first}/proceed"
+    found = await bound(f"{first}/proceed")
+    assert (found["next"], found["server"]) == (f"{first}/after", f"{first}/server")
+    found = await bound(f"{first}/after")
+    assert (found["next"], found["peer"], found["state"]) == (
+        f"{first}/protocol", f"{second}/after", f"{first}/state")  # fmt: skip
+    assert await bound(f"{first}/state") == {"server": f"{first}/server"}
+    status = await system.get_status(system.ref(f"{ref.path}/ftm/{first}/server", hf.Actor))
+    assert status.kind.endswith("Counter")
+    assert status.state == "running"
+    assert first is not None
+    os.kill(pid_of(system, ref, first), signal.SIGKILL)
+    assert await ref.ask(Add(1)) == 2
+    assert await bound("proxy") == {"protocol": f"{second}/protocol"}
 
 
 @pytest.mark.parametrize("method", METHODS)
