@@ -64,10 +64,6 @@ class Settle(Message[None]):
     """Answered when all that came before it was handled."""
 
 
-class Drain(Message[None]):
-    """Answered when the other replica has all that was sent to it."""
-
-
 class Flush(Message[None]):
     """Answered when all that is ready was handed over."""
 
@@ -207,10 +203,6 @@ class Brick(Actor):
 
     async def drain(self) -> None:
         """Wait until the other replica has what it was sent, if that is not waited for anyway; nothing new comes."""
-
-    @on(Drain)
-    async def _drain(self, message: Drain) -> None:
-        await self.drain()
 
     def _refuses(self, epoch: int | None = None) -> bool:
         """Whether this comes from an earlier epoch, or nothing from here counts any more.

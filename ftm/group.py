@@ -397,11 +397,14 @@ class Group:
         """What left in the middle of a turn, or beside it."""
         if self._is_of_now(outward.epoch):
             for record in outward.records:
-                is_old = isinstance(record, Released) and self.is_live and record.turn <= self.switch.turn
-                if is_old and not self._is_known(record.turn, record.id):
+                if isinstance(record, Released) and not self._is_front(record):
                     self._is_behind(record.turn)
                     return
                 self.switch.from_life(record)
+
+    def _is_front(self, record: Released) -> bool:
+        """Whether it is of the turn that comes next, or of one that is known."""
+        return not self.is_live or record.turn > self.switch.turn or self._is_known(record.turn, record.id)
 
     def _is_known(self, turn: int, number: int) -> bool:
         """Whether this input was handled in this turn, as far as the home knows it."""

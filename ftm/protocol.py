@@ -21,7 +21,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
-from .bricks import FOREVER, Abandon, Brick, Drain, Flush, Where
+from .bricks import FOREVER, Abandon, Brick, Flush, Where
 from .messages import (
     CannotJoin,
     ConfigMismatch,
@@ -446,9 +446,7 @@ class RequestProtocol(Brick):
         try:
             await self._quiet()
             await self.proceed.ask(Flush(), timeout=FOREVER)
-            for path in list(standing.paths.values()):
-                if path != self.ctx.path:
-                    await standing.node.cell_at(path).ref.ask(Drain(), timeout=FOREVER)
+            await self._drain_bricks()
             handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads))
         except HoldfastError as error:
             handle.fail(error)
