@@ -291,6 +291,8 @@ class Brick(Actor):
         standing, codec = self._standing, self._standing.node.codec
         try:
             standing.check(call.epoch, call.config)
+            if call.epoch > standing.epoch:
+                raise NotFollowing(standing.path, standing.epoch, call.epoch)
             kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
             if kind is None or call.stream != self.slot:
                 raise Refused(path=self.ctx.path, reason="malformed")
