@@ -186,11 +186,13 @@ from holdfast.system.transaction.events import (
 from holdfast.system.transaction.operation import Operation, Step
 
 if TYPE_CHECKING:
+    from holdfast.ftm.adaptation import CannotAdapt
     from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
     from holdfast.ftm.detector import Detection
     from holdfast.ftm.events import (
         FailedOver,
         MechanismAttached,
+        MechanismChanged,
         MechanismDetached,
         ReplicaJoined,
         ReplicaLost,
@@ -208,6 +210,7 @@ if TYPE_CHECKING:
     from holdfast.ftm.sealed import FrameRefused
     from holdfast.ftm.sec.authority import CertificationAuthority
     from holdfast.ftm.voters import NoMajority
+    from holdfast.system.protection import AdaptationUndone
 
 __all__ = [
     "AD",
@@ -219,6 +222,7 @@ __all__ = [
     "ActorStarted",
     "ActorStopped",
     "ActorSystem",
+    "AdaptationUndone",
     "AlreadyPresent",
     "AlreadyRegistered",
     "AlreadyStarted",
@@ -231,6 +235,7 @@ __all__ = [
     "Binding",
     "Bus",
     "Calls",
+    "CannotAdapt",
     "CannotMove",
     "CertificationAuthority",
     "Change",
@@ -286,6 +291,7 @@ __all__ = [
     "MaxChildren",
     "Mechanism",
     "MechanismAttached",
+    "MechanismChanged",
     "MechanismDetached",
     "MechanismRefused",
     "Message",
@@ -459,6 +465,9 @@ _LAZY = {
     "Mechanism": "holdfast.ftm.mechanism",
     "MechanismAttached": "holdfast.ftm.events",
     "MechanismDetached": "holdfast.ftm.events",
+    "CannotAdapt": "holdfast.ftm.adaptation",
+    "MechanismChanged": "holdfast.ftm.events",
+    "AdaptationUndone": "holdfast.system.protection",
     "MechanismRefused": "holdfast.ftm.mechanism",
     "NVP": "holdfast.ftm.mechanisms.nvp",
     "NoMajority": "holdfast.ftm.voters",

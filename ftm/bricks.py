@@ -19,7 +19,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
-from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
+from .messages import ConfigMismatch, Done, Ended, Inward, NotFollowing, Outward, StaleEpoch, Taken, Work
 from .sealed import Back, Call, LinkLost, Part, Refused, Sealed
 from .sealing import sealed
 from .standing import PeerLost
@@ -260,6 +260,8 @@ class Brick(Actor):
         if letter.name == SEALED:
             raise Refused(path=standing.path, reason="closed")
         standing.check(letter.epoch, letter.config)
+        if letter.epoch > standing.epoch:
+            raise NotFollowing(standing.path, standing.epoch, letter.epoch)
         kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
         if kind is None:
             raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")
@@ -289,6 +291,8 @@ class Brick(Actor):
         standing, codec = self._standing, self._standing.node.codec
         try:
             standing.check(call.epoch, call.config)
+            if call.epoch > standing.epoch:
+                raise NotFollowing(standing.path, standing.epoch, call.epoch)
             kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
             if kind is None or call.stream != self.slot:
                 raise Refused(path=self.ctx.path, reason="malformed")

@@ -15,7 +15,7 @@ from ..actors import lives
 from ..actors.actor import Start
 from ..actors.cell import DOWN, GONE, RUNNING, Cell
 from ..actors.control.calls import Call, send_call
-from ..actors.control.orders import ReplaceCode, ReplaceState, Resume, Suspend
+from ..actors.control.orders import Ready, ReplaceCode, ReplaceState, Resume, Suspend
 from ..actors.errors import ControlFailed, HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
@@ -52,6 +52,8 @@ JOINED_WITHIN = 10.0
 """Seconds that a start waits for another replica to catch up; after that the first one goes on alone."""
 FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
+AGAIN_AFTER = 0.01
+"""Seconds after which an order is given again that nobody could take."""
 BRICKS_INTENSITY = 100
 """Ends of parts and replicas within `BRICKS_PERIOD` seconds after which the whole group is given up."""
 BRICKS_PERIOD = 5.0
@@ -458,8 +460,11 @@ class GroupHost(HomeHost):
             why = "it is protected: detach its mechanism first, for all replicas have to have the same"
             ask.fail(ControlFailed(cell.path, call.order.verb, why))
             return
-        if group is None or group.is_over or group.primary is None:
-            cell.extra().calls.append(call)
+        if group is None or group.is_over or group.primary is None or not self.is_up(cell):
+            cell.node.loop.call_later(AGAIN_AFTER, give_again, cell, call)
+            return
+        if isinstance(call.order, Ready):
+            call.give(None)
             return
         if isinstance(call.order, (Suspend, Resume)):
             self._hold(cell, group, is_suspended=isinstance(call.order, Suspend))
@@ -504,6 +509,16 @@ def replica(setting: Setting, start: Start[Any], layers: tuple[Any, ...]) -> Sta
     from .replica import Replica
 
     return Start(Replica, (setting, start, layers))
+
+
+def give_again(cell: Cell, call: Call) -> None:
+    """An order had to wait until somebody leads: give it to whoever lives there now, if it is still waited for."""
+    if call.ask.is_done:
+        return
+    if cell.is_dead:
+        call.ask.undelivered(cell, "it has ended")
+    else:
+        cell.host.control(cell, call)
 
 
 def is_unkept(method: Method) -> bool:

@@ -275,13 +275,26 @@ class Replica(Supervisor):
                 self._give_up_address(one, SHUTDOWN)
                 self._forget(one)
 
+    async def _settled(self, name: str) -> None:
+        """Wait until a brick has handled what has come so far.
+
+        Raises:
+            HoldfastError: it has crashed; we hear of that only behind this turn, and then all of us ends.
+        """
+        cell = self._cell(name)
+        asked, ended = cell.ref.ask(Settle(), timeout=FOREVER), cell.ended()
+        await asyncio.wait((asked, ended), return_when=asyncio.FIRST_COMPLETED)
+        if not asked.done():
+            raise HoldfastError(f"{cell.path} has crashed")
+        await asked
+
     async def _take_up(self, woven: Woven, *, leads: bool | None = None, behind: bool = False) -> None:
         """Have this stack be the one: bind everything, end what is not needed (`behind`: when we have answered)."""
         old, self._woven, standing = self._woven, woven, self._standing
         kept = set(woven.names.values())
         left = [name for name in old.names.values() if name not in kept and name in self._children]
         for name in left:  # What is in their mailboxes belongs to the time before.
-            await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
+            await self._settled(name)
         standing.config, standing.layers = woven.config, woven.layers
         if leads is not None:
             standing.leads = leads
@@ -403,7 +416,7 @@ class Replica(Supervisor):
         places = weave(old.layers, leads=message.leads)
         left = [name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]]
         for name in left:  # What is in their mailboxes belongs to the time before.
-            await self._cell(name).ref.ask(Settle(), timeout=FOREVER)
+            await self._settled(name)
         await self._end_bricks(left)  # First: the new ones have their names.
         woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         await self._take_up(woven, leads=message.leads)
@@ -441,7 +454,7 @@ class Replica(Supervisor):
         """Nothing is inside the one that leads, but a follower may be behind it."""
         names = self._woven.names
         for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
-            await self._cell(names[slot]).ref.ask(Settle(), timeout=FOREVER)
+            await self._settled(names[slot])
         await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
 
     @on(EndBricks)

@@ -19,9 +19,11 @@ from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.messages import Done
-from tests.ftm.accounts import Account, Add, Bank, Closed, Counter, Load, Tags, Total, Transfer
+from tests.ftm.accounts import Account, Add, Bank, Closed, Counter, Load, Put, Tags, Total, Transfer
 from tests.ftm.test_failover import METHODS, group_of, other, pid_of, two_again
 
+# Processes do not care which event loop the root has.
+pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 # A refused or failed transaction ends with its block.
 # ruff: noqa: PT012
 
@@ -33,8 +35,6 @@ class Counting(Checkpointing):
     """The same, and it says that it is there."""
 
     async def after(self, done):
-        if done.more is None:
-            raise RuntimeError("never")
         return await super().after(done)
 '''
 
@@ -126,13 +126,7 @@ async def test_money_is_moved_once_while_mechanisms_change(system: hf.ActorSyste
     await load.stop()
     tags = await ref.ask(Tags())
     load.check(tags)
-    assert (await one.ask(hf_put(0)), await two.ask(hf_put(0))) == (1000 - len(tags), 1000 + len(tags))
-
-
-def hf_put(amount: int) -> Any:
-    from tests.ftm.accounts import Put
-
-    return Put(amount)
+    assert (await one.ask(Put(0)), await two.ask(Put(0))) == (1000 - len(tags), 1000 + len(tags))
 
 
 async def test_compose_and_detach_a_layer(system: hf.ActorSystem) -> None:
@@ -179,6 +173,7 @@ async def test_one_brick_gets_new_code(system: hf.ActorSystem, tmp_path: Path) -
     assert ref._cell.spec.mechanism == PBR()
     (brick,) = ref._cell.spec.mechanism.exchanged.values()
     assert brick.__name__ == "Counting"
+    await two_again(ref)
     primary = group_of(ref).primary
     assert primary is not None
     os.kill(pid_of(system, ref, primary), signal.SIGKILL)
@@ -284,7 +279,7 @@ async def test_two_at_a_time_are_done_one_after_the_other(system: hf.ActorSystem
 
 async def test_a_brick_without_its_bindings_is_refused_by_the_replicas(system: hf.ActorSystem) -> None:
     ref = await protected(system)
-    with pytest.raises(hf.TransactionRefused, match="nothing would be bound|no binding"):
+    with pytest.raises(hf.TransactionRefused, match="nothing would be bound"):
         async with system.transaction() as change:
             change.update(ref, "after", NeedsMore, role="primary")
             change.add("/app", hf.child("never", hf.start(Counter)))
