@@ -203,8 +203,8 @@ if TYPE_CHECKING:
     from holdfast.ftm.mechanisms.lfr import LFR
     from holdfast.ftm.mechanisms.nvp import NVP
     from holdfast.ftm.mechanisms.pbr import PBR
-    from holdfast.ftm.mechanisms.sec import SEC
     from holdfast.ftm.mechanisms.rb import RB
+    from holdfast.ftm.mechanisms.sec import SEC
     from holdfast.ftm.mechanisms.tmr import TMR
     from holdfast.ftm.mechanisms.tr import TR
     from holdfast.ftm.sealed import FrameRefused
