@@ -32,10 +32,10 @@ from holdfast.ftm.events import FailedOver
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
-import ftm_timing  # noqa: E402
-from ftm_workload import Bump, Change, Count, Parts, Whole  # noqa: E402
+import ftm_timing
+from ftm_workload import Bump, Change, Count, Parts, Whole
 
-from tests.ftm import campaign, soak  # noqa: E402  (found by the line above)
+from tests.ftm import campaign, soak
 
 STACKS: dict[str, tuple[Any, ...]] = {
     "PBR": (hf.PBR(),),

@@ -13,8 +13,8 @@ from .messages import ConfigMismatch, Logged, Request, StaleEpoch
 from .replylog import ReplyLog
 
 if TYPE_CHECKING:
-    from ..actors.node import Node
     from ..actors.message import Message
+    from ..actors.node import Node
     from .mechanism import Mechanism
     from .sealed import SecuredLink
     from .server import Server

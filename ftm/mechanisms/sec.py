@@ -176,7 +176,7 @@ class SEC(Mechanism):
         """Whether the extra is installed, and the directory is safe."""
         super().check(kind, where)
         try:
-            from ..sec import link  # noqa: F401, PLC0415
+            from ..sec import link  # noqa: F401
         except ImportError as error:
             raise MechanismRefused(self.name, str(error)) from error
         try:
@@ -195,7 +195,7 @@ class SEC(Mechanism):
         enrols: Callable[[], list[str]] | None = None,
     ) -> SecuredLink:
         """This participant's end of its links."""
-        from ..sec.link import Link  # noqa: PLC0415
+        from ..sec.link import Link
 
         return Link(node, address, path, self, epoch, enrols)
 
