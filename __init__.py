@@ -199,9 +199,13 @@ if TYPE_CHECKING:
         WrongSuspicion,
     )
     from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
+    from holdfast.ftm.mechanisms.ad import AD
     from holdfast.ftm.mechanisms.lfr import LFR
+    from holdfast.ftm.mechanisms.nvp import NVP
     from holdfast.ftm.mechanisms.pbr import PBR
+    from holdfast.ftm.mechanisms.rb import RB
     from holdfast.ftm.mechanisms.sec import SEC
+    from holdfast.ftm.mechanisms.tmr import TMR
     from holdfast.ftm.mechanisms.tr import TR
     from holdfast.ftm.sealed import FrameRefused
     from holdfast.ftm.sec.authority import CertificationAuthority
@@ -209,6 +213,7 @@ if TYPE_CHECKING:
     from holdfast.system.protection import AdaptationUndone
 
 __all__ = [
+    "AD",
     "Actor",
     "ActorContext",
     "ActorCrashed",
@@ -298,6 +303,7 @@ __all__ = [
     "Moved",
     "NOPROC",
     "NORMAL",
+    "NVP",
     "NameTaken",
     "NoMajority",
     "NoPartitions",
@@ -335,6 +341,7 @@ __all__ = [
     "ProtectionLost",
     "Quarantined",
     "QuarantinedMessage",
+    "RB",
     "Recovered",
     "RecoveryFailed",
     "RecoveryFile",
@@ -389,6 +396,7 @@ __all__ = [
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
+    "TMR",
     "TR",
     "TaskSupervisor",
     "Tasks",
@@ -446,6 +454,7 @@ __all__ = [
 
 # Most programs protect nobody: what they do not use is not imported.
 _LAZY = {
+    "AD": "holdfast.ftm.mechanisms.ad",
     "CertificationAuthority": "holdfast.ftm.sec.authority",
     "Detection": "holdfast.ftm.detector",
     "Diverged": "holdfast.ftm.alarms",
@@ -460,12 +469,15 @@ _LAZY = {
     "MechanismChanged": "holdfast.ftm.events",
     "AdaptationUndone": "holdfast.system.protection",
     "MechanismRefused": "holdfast.ftm.mechanism",
+    "NVP": "holdfast.ftm.mechanisms.nvp",
     "NoMajority": "holdfast.ftm.voters",
     "PBR": "holdfast.ftm.mechanisms.pbr",
     "ProtectionLost": "holdfast.ftm.alarms",
+    "RB": "holdfast.ftm.mechanisms.rb",
     "ReplicaJoined": "holdfast.ftm.events",
     "ReplicaLost": "holdfast.ftm.events",
     "SEC": "holdfast.ftm.mechanisms.sec",
+    "TMR": "holdfast.ftm.mechanisms.tmr",
     "TR": "holdfast.ftm.mechanisms.tr",
     "WrongSuspicion": "holdfast.ftm.events",
     "compose": "holdfast.ftm.mechanism",

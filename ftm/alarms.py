@@ -33,7 +33,7 @@ class Masked(Event, frozen=True, eq=False):
 
 
 class Objected(Event, frozen=True, eq=False):
-    """An assertion or acceptance test did not hold here; `by` says who has computed the request instead, "" if nobody."""
+    """An assertion or acceptance test did not hold here; `by` has computed the request instead, "" if nobody has."""
 
     replica: str
     why: str

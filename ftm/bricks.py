@@ -20,13 +20,14 @@ from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
 from .letters import LETTER_BYTES, SEALED, Letter, Letters, Sheet
-from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
+from .messages import ConfigMismatch, Done, Ended, Inward, NotFollowing, Outward, StaleEpoch, Taken, Work
 from .sealed import Part, Refused
 from .sealing import sealed
 from .standing import PeerLost
 
 if TYPE_CHECKING:
     from .mechanism import Mechanism
+    from .sealed import SecuredLink
     from .standing import Standing
 
 R = TypeVar("R")
@@ -111,11 +112,7 @@ class Brick(Letters):
         if standing.link is not None:
             if peer is None:
                 raise PeerLost("there is none")
-            back = await self._ask_sealed(
-                standing.link, peer, self.slot, Part(message_name(type(message)), body),
-                lambda: self._find_peer(peer), lambda error: standing.lost(self.slot), lambda: standing.peer == peer,
-            )  # fmt: skip
-            return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
+            return codec.decode_reply(type(message), await self._ask_peer_sealed(standing.link, peer, message, body))  # type: ignore[no-any-return]
         while True:
             if peer is None or standing.peer != peer:
                 raise PeerLost("there is none")
@@ -136,6 +133,18 @@ class Brick(Letters):
                 await standing.changes(AGAIN)
                 continue
             return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
+
+    async def _ask_peer_sealed(self, link: SecuredLink, peer: str, message: Message[Any], body: bytes) -> bytes:
+        standing, part = self._standing, Part(message_name(type(message)), body)
+        while True:
+            try:
+                return await self._ask_sealed(
+                    link, peer, self.slot, part,
+                    lambda: self._find_peer(peer), lambda error: standing.lost(self.slot),
+                    lambda: standing.peer == peer,
+                )  # fmt: skip
+            except NotFollowing:  # It is told soon that it follows.
+                await standing.changes(AGAIN)
 
     async def ask_at(self, path: str, slot: str, message: Message[R]) -> R:
         """Ask a brick of a certain replica, once.
@@ -212,6 +221,8 @@ class Brick(Letters):
         if letter.name == SEALED:
             raise Refused(path=standing.path, reason="closed")
         standing.check(letter.epoch, letter.config)
+        if letter.epoch > standing.epoch:
+            raise NotFollowing(standing.path, standing.epoch, letter.epoch)
         kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
         if kind is None:
             raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")

@@ -133,6 +133,10 @@ class FailoverManager(Actor):
     async def _tidied(self) -> bool:
         """Backups that have ended, or are suspected, do not count, and nobody waits for them. Whether one was."""
         group, found = self._group, False
+        for name, life in list(group.joining.items()):
+            if group.life_of(name) != life:  # Its next life has to be told first that it follows.
+                del group.joining[name]
+                group.dropped.add(name)
         for name in group.names:
             life = group.members.get(name, 0) or group.up.get(name, 0)
             if name == group.primary or not life:

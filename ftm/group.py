@@ -76,6 +76,7 @@ class Group(Securing):
         self.condemned: dict[str, int] = {}  # name to life, of those that must be dead before the next one leads
         self.dropped: set[str] = set()  # backups that the primary still has to forget
         self.up: dict[str, int] = {}  # name to life, of those heard of
+        self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}
         self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions

@@ -39,7 +39,7 @@ class Compute(Message[Computed]):
     heard: list[Outcome]
     keep: bool
     live: bool = True
-    log: list[Logged] = []
+    log: list[Logged] = msgspec.field(default_factory=list)
 
 
 class Settled(Message[None]):

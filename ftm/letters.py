@@ -11,7 +11,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef
 from ..checkpoint.records import pieces
-from .messages import StaleEpoch
+from .messages import NotFollowing, StaleEpoch
 from .sealed import Back, Call, LinkLost, Part, Refused, Sealed
 from .standing import PeerLost
 
@@ -130,6 +130,8 @@ class Letters(Actor):
         standing, codec = self._standing, self._standing.node.codec
         try:
             standing.check(call.epoch, call.config)
+            if call.epoch > standing.epoch:
+                raise NotFollowing(standing.path, standing.epoch, call.epoch)
             kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
             if kind is None or call.stream != self.slot:
                 raise Refused(path=self.ctx.path, reason="malformed")

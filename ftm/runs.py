@@ -20,13 +20,24 @@ from ..actors.cell import Cell
 from ..actors.errors import HoldfastError
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.values import decode_value, state_digest
-from ..checkpoint.records import CRASH, DROPPED, FAILED, Answer, Closed, Ignored, Outcome, PipeDone, Snapshot, TurnEnd
-from ..checkpoint.records import Unsaved
+from ..checkpoint.records import (
+    CRASH,
+    DROPPED,
+    FAILED,
+    Answer,
+    Closed,
+    Ignored,
+    Outcome,
+    PipeDone,
+    Snapshot,
+    TurnEnd,
+    Unsaved,
+)
 from ..supervision.spec import child
 from .bricks import After, Before
 from .canonical import canonical, end_form
-from .messages import Done, Request, State, Work
 from .life import ServerLife
+from .messages import Done, Request, State, Work
 from .server import Server
 from .voters import Agreed, AnyVoter, Undecided, _decide
 

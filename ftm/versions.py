@@ -1,4 +1,4 @@
-"""Versions: other classes, or other handlers, that do what the protected actor does, with the same messages and state."""
+"""Versions: other classes or handlers that do what the protected actor does, with the same messages and state."""
 
 from __future__ import annotations
 

@@ -182,6 +182,7 @@ class Comparing(After):
     """After of the follower: what the leader's turns have come to must be what came out here (T8)."""
 
     peer_messages = (Notify,)
+    answers_later = True  # What has to wait for the leader's state must not hold up our own outcomes.
 
     def __init__(self, *args: Any) -> None:
         super().__init__(*args)

@@ -22,13 +22,15 @@ from ...actors.actor import Actor
 from ...actors.errors import HoldfastError
 from ..alarms import Masked
 from ..assertions import names_of
+from ..declaration import Cost
 from ..mechanism import Mechanism, Role
 from ..messages import Request, State
-from ..model import Cost
 from ..runs import Deciding, Remembering, Run, Shadow, turns_of, vote
 from ..versions import version
 from ..voters import AnyVoter, Majority, Median, NoMajority, Undecided
 from .rb import protected_class
+
+MAJORITY = Majority()
 
 
 class Versions(Deciding):
@@ -90,7 +92,7 @@ class NVP(Mechanism):
     roles: ClassVar[dict[str, Role]] = {"single": Role(before=Remembering, after=Versions)}
 
     versions: Any = ()
-    voter: Any = Majority()
+    voter: Any = MAJORITY
     compare_state: bool = True
     within: float = 5.0
 

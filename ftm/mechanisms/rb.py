@@ -1,7 +1,7 @@
 """Recovery blocks (RB): what the acceptance test refuses is rolled back, and an alternate computes it.
 
 Fault model  development faults of a version, and value faults, that the acceptance test sees; crashes of a version.
-Guarantee    no outcome leaves for which the test does not hold. Alternates are tried in their order, each from the state
+Guarantee    no outcome leaves for which the test does not hold. Alternates are tried in order, each from the state
              before the turn; if none is accepted, the ask fails with `NotAccepted`, and nothing is changed.
 Not covered  wrong values that the test does not see; faults that all versions have; a version that never returns
              without awaiting anything; `on_start`; crashes of the process (compose it with PBR).

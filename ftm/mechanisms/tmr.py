@@ -1,7 +1,7 @@
 """Triple modular redundancy (TMR): three replicas compute each request, and the one that leads votes.
 
 Fault model  one replica at a time: crashed, silent, or wrong, for once or for good, in answers, outputs or state.
-Guarantee    an outcome leaves when two replicas agree on it, state included, and each other one that is up has answered.
+Guarantee    an outcome leaves when two replicas agree on it, state included, and any other that is up has answered.
              A replica that was outvoted ends, is started again and joins with the right state; if it was the one that
              leads, another one leads. Without a majority the ask fails with `NoMajority`, and nothing is changed.
 Not covered  two faulty replicas at the same time; with one of three gone, a wrong value is seen and not masked (the ask
@@ -21,15 +21,16 @@ import msgspec
 
 from ...actors.errors import HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
+from ..declaration import Cost
 from ..helping import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..mechanism import Mechanism, Role
 from ..messages import Done, Request, StaleEpoch, State
-from ..model import Cost
 from ..runs import Deciding, Run, digest_of_state, turns_of, vote
 from ..standing import PeerLost
 from ..voters import Majority, NoMajority, Undecided
 from .nvp import voter_of
 
+MAJORITY = Majority()
 NAMES = ("r1", "r2", "r3")
 
 
@@ -152,7 +153,7 @@ class TMR(Mechanism):
         "follower": Role(before=Computing, computes=False),
     }
 
-    voter: Any = Majority()
+    voter: Any = MAJORITY
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "voter", voter_of(self.voter))

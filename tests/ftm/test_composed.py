@@ -30,9 +30,7 @@ REPEATED: Any = [
 
 @pytest.mark.parametrize("outer", [PBR(), LFR()])
 @pytest.mark.parametrize("inner", REPEATED, ids=lambda one: one.name)
-async def test_a_transient_fault_and_crashes_are_both_masked(
-    system: hf.ActorSystem, outer: Any, inner: Any
-) -> None:
+async def test_a_transient_fault_and_crashes_are_both_masked(system: hf.ActorSystem, outer: Any, inner: Any) -> None:
     """A65: with a fault in r1's 12th turn, and kills of the one that leads and of the other."""
     layers = outer, inner, FAULTY(what="state", skip=11)
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=layers))

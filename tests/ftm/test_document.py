@@ -88,6 +88,18 @@ async def test_the_graph_as_it_is_shown(system: hf.ActorSystem) -> None:
     shown = [path for path in system.tree() if path.startswith("/app/bank/alice")]
     second = {path.replace("/r1", "/r2") for path in said if "/r1/" in path}
     assert sorted(shown) == sorted(said | second)
+    ftm = "/app/bank/alice/ftm"
+    for owner, port, target in (
+        ("proxy", "protocol", "r1/protocol"),
+        ("r1/protocol", "before", "r1/before"),
+        ("r1/before", "next", "r1/proceed"),
+        ("r1/proceed", "next", "r1/after"),
+        ("r1/proceed", "server", "r1/server"),
+        ("r1/after", "next", "r1/protocol"),
+        ("r1/protocol", "next", "proxy"),
+    ):
+        status = await system.get_status(system.ref(f"{ftm}/{owner}", hf.Actor))
+        assert status.bindings[port] == f"{ftm}/{target}"
 
 
 async def test_the_steps_of_a_failover(system: hf.ActorSystem) -> None:

@@ -75,7 +75,7 @@ def test_what_cannot_work_is_refused_with_the_reason() -> None:
     RB(**good).check(Total)
     with pytest.raises(MechanismRefused, match="state_access = False"):
         RB(**good).check(Closed)
-    with pytest.raises(MechanismRefused, match="no handler for .*Add"):
+    with pytest.raises(MechanismRefused, match=r"no handler for .*Add"):
         RB(**{**good, "alternates": versions.Deaf}).check(Total)
     with pytest.raises(MechanismRefused, match="cannot be imported"):
         RB(**{**good, "alternates": "tests.ftm.versions:Nobody"}).check(Total)
