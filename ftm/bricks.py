@@ -19,7 +19,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
-from .messages import ConfigMismatch, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
+from .messages import ConfigMismatch, Done, Ended, Inward, NotFollowing, Outward, StaleEpoch, Taken, Work
 from .sealing import sealed
 from .standing import PeerLost
 
@@ -91,6 +91,7 @@ class Brick(Actor):
         self._standing, self.mechanism, self.slot = standing, mechanism, slot
         self._sheets: dict[int, list[bytes]] = {}
         self._numbers = itertools.count(1)
+        self._sending = asyncio.Lock()
         self._handle: ReplyHandle[Any] | None = None
 
     @property
@@ -133,8 +134,11 @@ class Brick(Actor):
             if peer is None or standing.peer != peer:
                 raise PeerLost("there is none")
             try:
-                ref = await self._find_peer(peer)
-                asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
+                async with self._sending:  # In order: finding the peer takes the first one longer than the others.
+                    if standing.peer != peer:
+                        continue
+                    ref = await self._find_peer(peer)
+                    asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
                 reply = await standing.wait_for(asked)
             except (PeerLost, ConfigMismatch):
                 raise
@@ -177,6 +181,8 @@ class Brick(Actor):
         sheets = self._sheets.pop(letter.sheets, []) if letter.sheets else []
         standing = self._standing
         standing.check(letter.epoch, letter.config)
+        if letter.epoch > standing.epoch:
+            raise NotFollowing(standing.path, standing.epoch, letter.epoch)
         kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
         if kind is None:
             raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")

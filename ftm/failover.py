@@ -90,6 +90,8 @@ class FailoverManager(Actor):
                 group.lost(leading, group.why)
                 group.leading = None
             left = group.backups()
+            if left and group.work_is_lost():  # From the journal it is begun again.
+                group.why, left = f"{group.why}, with background work (pipe_to_self) out", []
             if not left:
                 group.is_over = True
                 group.on_over(group.why)
@@ -133,6 +135,10 @@ class FailoverManager(Actor):
     async def _tidied(self) -> bool:
         """Backups that have ended, or are suspected, do not count, and nobody waits for them. Whether one was."""
         group, found = self._group, False
+        for name, life in list(group.joining.items()):
+            if group.life_of(name) != life:  # Its next life has to be told first that it follows.
+                del group.joining[name]
+                group.dropped.add(name)
         for name in group.names:
             life = group.members.get(name, 0) or group.up.get(name, 0)
             if name == group.primary or not life:

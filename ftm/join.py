@@ -68,6 +68,7 @@ class Joiner(Actor):
             else:
                 self._delay = FIRST_RETRY
             finally:
+                group.joining.pop(name, None)
                 group.is_joining = False
                 group.stir()
 
@@ -75,6 +76,8 @@ class Joiner(Actor):
         group, epoch, begin = self._group, self._group.epoch, time.monotonic()
         await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
         group.on_joining(name)
+        group.joining[name] = life
+        group.watch(name)
         turn = await group.protocol(primary).ask(Join(epoch, group.place(name)), JOINED_WITHIN)
         if group.epoch != epoch or group.primary != primary or group.life_of(name) != life or group.is_over:
             if group.epoch == epoch and group.primary == primary and group.life_of(name) != life:

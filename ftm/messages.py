@@ -37,6 +37,14 @@ class ConfigMismatch(Refusal):
     there: int
 
 
+class NotFollowing(Refusal):
+    """This life has not been told that it follows in this epoch: what was meant for the one before is not for it."""
+
+    path: str
+    seen: int
+    got: int
+
+
 class CannotJoin(Refusal):
     """This replica cannot be brought to the state of the one that leads."""
 

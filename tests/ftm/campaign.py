@@ -24,7 +24,7 @@ from holdfast.ftm import host
 from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
 from holdfast.ftm.detector import Detection
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
-from holdfast.ftm.group import Group
+from holdfast.ftm.group import Group, Look
 from holdfast.ftm.mechanism import Mechanism
 from tests.ftm import accounts, linearizable, store
 from tests.ftm.injection import Fault, Page, recipe, unwrap, wrap_root
@@ -112,9 +112,9 @@ KINDS: dict[str, Callable[[Sequence[Mechanism]], list[Fault]]] = {
     "message doubled": lambda layers: between("double", layers),
     "message reordered": lambda layers: between("reorder", layers),
     "message lost": lambda layers: between("lose", layers),
-    "answer, transient": lambda layers: [Fault("answer", "server", REQUEST, "after")],
-    "state, transient": lambda layers: [Fault("state", "server", REQUEST, "after")],
-    "message, transient": lambda layers: [Fault("message", "proceed", "Work", leads=True)],
+    "answer, transient": lambda layers: [Fault("answer", "server", REQUEST, "after")] * 6,
+    "state, transient": lambda layers: [Fault("state", "server", REQUEST, "after")] * 6,
+    "message, transient": lambda layers: [Fault("message", "proceed", "Work", leads=True)] * 6,
     "answer, permanent": lambda layers: [Fault("answer", "server", REQUEST, "after", permanent=True)],
 }
 CRASHES = frozenset(kind for kind in KINDS if kind.startswith(("crash", "hang", "SIGSTOP")))
@@ -489,8 +489,6 @@ class Campaign:
 
 
 def group_look() -> Any:
-    from holdfast.ftm.group import Look
-
     return Look()
 
 
