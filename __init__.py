@@ -190,6 +190,7 @@ if TYPE_CHECKING:
     from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
     from holdfast.ftm.detector import Detection
     from holdfast.ftm.events import (
+        BackgroundWorkLost,
         FailedOver,
         MechanismAttached,
         MechanismChanged,
@@ -230,6 +231,7 @@ __all__ = [
     "AskFailed",
     "AskTimeout",
     "AutoShutdown",
+    "BackgroundWorkLost",
     "Backoff",
     "BadMessage",
     "Binding",
@@ -456,6 +458,7 @@ __all__ = [
 _LAZY = {
     "AD": "holdfast.ftm.mechanisms.ad",
     "CertificationAuthority": "holdfast.ftm.sec.authority",
+    "BackgroundWorkLost": "holdfast.ftm.events",
     "Detection": "holdfast.ftm.detector",
     "Diverged": "holdfast.ftm.alarms",
     "FailedOver": "holdfast.ftm.events",

@@ -90,6 +90,8 @@ class FailoverManager(Actor):
                 group.lost(leading, group.why)
                 group.leading = None
             left = group.backups()
+            if left and group.work_is_lost():  # From the journal it is begun again.
+                group.why, left = f"{group.why}, with background work (pipe_to_self) out", []
             if not left:
                 group.is_over = True
                 group.on_over(group.why)

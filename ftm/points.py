@@ -91,6 +91,7 @@ class Points(lives.LocalHost):
         self._pending: deque[Request] = deque()
         self._resting: asyncio.Future[str] | None = None
         self._chunk = 8
+        self._work_waited_for: list[asyncio.Future[None]] = []
         self._singles = 0  # requests that are run one at a time: one of them has left what cannot be saved
         self.can_save = True  # as far as is known, where nobody looks at the state after each part
         self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
@@ -152,6 +153,8 @@ class Points(lives.LocalHost):
         turn = self._start_turn if point is None else point.turn
         life.begin(start, turn, [] if point is None else point.stash_ids)
         self.life = life
+        if point is not None:
+            cell.extra().trap_exits = point.traps
         actor: Any = cell.actor
         if point is not None:
             for delta in point.deltas:
@@ -187,12 +190,27 @@ class Points(lives.LocalHost):
         """End the life without a word: its state is kept as bytes."""
         cell = self.cell
         life, self.life = self.life, None
+        self.work_back()
         if life is None or cell is None or cell.state is DOWN:
             return
         life.port = NOWHERE
         gone = cell.ended()
         self.kill(cell)
         await gone
+
+    async def until_work_is_back(self) -> None:
+        """Wait until no background work is out: it is part of no state."""
+        while self.life is not None and self.life.pipes:
+            back: asyncio.Future[None] = self.life.cell.node.loop.create_future()
+            self._work_waited_for.append(back)
+            await back
+
+    def work_back(self) -> None:
+        """No background work is out any more, or its life is over."""
+        waiting, self._work_waited_for = self._work_waited_for, []
+        for one in waiting:
+            if not one.done():
+                one.set_result(None)
 
     # -- coming to rest -----------------------------------------------------------------------------------------------
 
@@ -303,6 +321,7 @@ class Points(lives.LocalHost):
             self.marks = []
             self.point = State(life.turn, data, [], stash, returned, life.is_live)
         ids = () if life.is_live else sorted(life._stashed_ids)
+        self.point.traps = life.cell.extra().trap_exits
         self.point.stash_ids = [key for key in ids if all(fed.feed.id != key for fed in life.stash)]
         self._point_names = None
         if getattr(actor, "get_state", None) is None and key_names(actor) is None:
@@ -313,13 +332,15 @@ class Points(lives.LocalHost):
     def since(self, turn: int) -> State:
         """The present point, as what has changed since an earlier one if that is known; else all of it."""
         point = self.capture()
+        ids, traps = point.stash_ids, point.traps
         if turn == point.turn:
             at = len(point.deltas)
         elif turn in self.marks:
             at = self.marks.index(turn)
         else:
             return point
-        return State(point.turn, b"", point.deltas[at:], point.stash, point.returned, point.live, turn, point.stash_ids)
+        deltas = point.deltas[at:]
+        return State(point.turn, b"", deltas, point.stash, point.returned, point.live, turn, ids, traps)
 
     def apply(self, state: State) -> None:
         """Take a state from another replica, whole or not at all.
@@ -361,6 +382,7 @@ class Points(lives.LocalHost):
             for name in set(variables(actor)) - set(self._names_of(point)):
                 delattr(actor._state_root(), name)
         senders = life.cell.node
+        life.cell.extra().trap_exits = point.traps
         life.turn = point.turn
         life.stash = [
             Fed(life, feed, None, None if feed.sender is None else senders.cell_at(feed.sender)) for feed in point.stash

@@ -265,7 +265,7 @@ class RequestProtocol(Gate):
             data, self._pieces = b"".join(self._pieces), []
             server = self._standing.server
             await server.drop_life()
-            server.install(State(message.turn, data, [], [], [], False, -2, message.stash))
+            server.install(State(message.turn, data, [], [], [], False, -2, message.stash, message.traps))
             self._standing.log.replace(message.log)
 
     @on(Lead)
@@ -438,6 +438,8 @@ class RequestProtocol(Gate):
             await self._quiet()
             server = self._standing.server
             await server.ensure()
+            await server.until_work_is_back()
+            await self.proceed.ask(Flush(), timeout=FOREVER)  # What has come of it goes home first.
             life = server.life
             assert life is not None
             assert life.cell.actor is not None

@@ -24,7 +24,7 @@ from holdfast.ftm import host
 from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
 from holdfast.ftm.detector import Detection
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
-from holdfast.ftm.group import Group
+from holdfast.ftm.group import Group, Look
 from holdfast.ftm.mechanism import Mechanism
 from tests.ftm import accounts, linearizable, store
 from tests.ftm.injection import Fault, Page, recipe, unwrap, wrap_root
@@ -489,8 +489,6 @@ class Campaign:
 
 
 def group_look() -> Any:
-    from holdfast.ftm.group import Look
-
     return Look()
 
 
