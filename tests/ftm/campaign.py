@@ -342,13 +342,25 @@ def injecting(detection: Detection = QUICK) -> Iterator[Page]:
     """Replicas that start in this block are struck by what is armed in the page."""
     with tempfile.TemporaryDirectory() as folder:
         page = Page.new(Path(folder) / "page")
-        saved, before = wrap_root(page), (host.replica, host.Detection)
-        host.replica, host.Detection = recipe(page), lambda: detection  # type: ignore[assignment, misc]
+        saved, before = wrap_root(page), host.replica
+        host.replica = recipe(page)
         try:
-            yield page
+            with detecting(detection):
+                yield page
         finally:
-            host.replica, host.Detection = before  # type: ignore[misc]
+            host.replica = before
             unwrap(saved)
+
+
+@contextlib.contextmanager
+def detecting(detection: Detection) -> Iterator[None]:
+    """Groups that start in this block watch their replicas so."""
+    known: Any = host
+    before, known.Detection = known.Detection, lambda: detection
+    try:
+        yield
+    finally:
+        known.Detection = before
 
 
 @contextlib.asynccontextmanager

@@ -23,7 +23,7 @@ import msgspec
 import holdfast as hf
 from holdfast.actors.actor import Start
 from holdfast.actors.mail import Envelope
-from holdfast.ftm.bricks import Brick, Letter
+from holdfast.ftm.bricks import Brick
 from holdfast.ftm.detector import Detector
 from holdfast.ftm.failover import FailoverManager
 from holdfast.ftm.join import Joiner
@@ -148,7 +148,8 @@ def wrap(page: Page, kind: type[hf.Actor]) -> None:
     """Have things go wrong in the bricks of this process, and in the protected actor."""
     for name in BUILT_IN:
         find(name)
-    for one in {*subclasses(Brick), StateManager, Heart}:
+    bricks: set[Any] = {*subclasses(Brick), StateManager, Heart}
+    for one in bricks:
         wrap_table(page, one, SLOTS.get(one, ""))
     wrap_table(page, kind, "server")
 
@@ -298,6 +299,3 @@ def other(item: Any) -> Any:
     body[-1] ^= 2
     feed = msgspec.structs.replace(first.feed, body=bytes(body))
     return msgspec.structs.replace(item, requests=[msgspec.structs.replace(first, feed=feed), *item.requests[1:]])
-
-
-LETTER = Letter.__name__

@@ -79,7 +79,8 @@ class Changes:
         else:
             choices["compose"] = lambda change: change.compose(ref, TR())
         if "pbr" in names:
-            choices["update"] = lambda change: change.update(ref, "after", Renewed, mechanism="pbr", role="primary")
+            new = {"mechanism": "pbr", "role": "primary"}
+            choices["update"] = lambda change: change.update(ref, "after", Renewed, **new)
         return choices
 
     async def one(self) -> None:
