@@ -189,6 +189,7 @@ if TYPE_CHECKING:
     from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
     from holdfast.ftm.detector import Detection
     from holdfast.ftm.events import (
+        BackgroundWorkLost,
         FailedOver,
         MechanismAttached,
         MechanismDetached,
@@ -218,6 +219,7 @@ __all__ = [
     "AskFailed",
     "AskTimeout",
     "AutoShutdown",
+    "BackgroundWorkLost",
     "Backoff",
     "BadMessage",
     "Binding",
@@ -434,6 +436,7 @@ __all__ = [
 
 # Most programs protect nobody: what they do not use is not imported.
 _LAZY = {
+    "BackgroundWorkLost": "holdfast.ftm.events",
     "Detection": "holdfast.ftm.detector",
     "Diverged": "holdfast.ftm.alarms",
     "FailedOver": "holdfast.ftm.events",

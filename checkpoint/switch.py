@@ -475,6 +475,8 @@ class Switch:
         """A turn was handled again: it must have sent just what it sent before."""
         self._take(end.turn, end.id, end.outs, Batch())
         past = self.turns.get(end.turn)
+        if end.status == FAILED and past is not None and past.input.kind == START and past.status != FAILED:
+            return  # It has not become anything else: its start failed, and will be tried again.
         seen = self._replay_k if self._replay_turn == end.turn else 0
         if past is None or seen != len(past.digests) or end.status != past.status:
             raise ReplayDiverged(self.path, end.turn, seen + 1)

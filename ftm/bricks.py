@@ -20,6 +20,7 @@ from ..actors.message import Message, Refusal, message_name
 from ..actors.ref import ActorRef, current
 from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
 from .messages import ConfigMismatch, Done, Ended, Inward, NotFollowing, Outward, StaleEpoch, Taken, Work
+from .sealing import sealed
 from .standing import PeerLost
 
 if TYPE_CHECKING:
@@ -371,7 +372,9 @@ class Proceed(Brick):
             if is_last and work.go is not None:
                 is_live = server.life is not None and server.life.is_live
                 live = Live(0.0) if is_live else await server.go(work.go)
-            server.seal(ends)
+            ends = await sealed(server, ends, pending)
+            if pending and not server.is_over:  # Some of it has to be run again.
+                is_last, live = False, None
             waits = not is_last and self.leads and server.runs_alone(pending[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
             if is_last:

@@ -59,3 +59,10 @@ class WrongSuspicion(Event, frozen=True, eq=False):
 
     replica: str
     wrong: int
+
+
+class BackgroundWorkLost(Event, frozen=True, eq=False):
+    """Whoever led has died with background work (`pipe_to_self`) out, and no journal leads to its being begun again."""
+
+    epoch: int
+    count: int

@@ -90,6 +90,8 @@ class FailoverManager(Actor):
                 group.lost(leading, group.why)
                 group.leading = None
             left = group.backups()
+            if left and group.work_is_lost():  # From the journal it is begun again.
+                group.why, left = f"{group.why}, with background work (pipe_to_self) out", []
             if not left:
                 group.is_over = True
                 group.on_over(group.why)
@@ -121,6 +123,7 @@ class FailoverManager(Actor):
         """From here on it is the one."""
         group = self._group
         group.primary, group.leading = name, None
+        group.bind_proxy()
         for other in [one for one in group.members if one != name]:
             group.lost(other, "it has to catch up with the new primary")
         group.failovers += 1

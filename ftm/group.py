@@ -26,7 +26,9 @@ from ..checkpoint.records import (
     Feed,
     Go,
     Live,
+    Out,
     Outcome,
+    PipeDone,
     Released,
     SnapshotNow,
     ToLife,
@@ -34,7 +36,7 @@ from ..checkpoint.records import (
 )  # fmt: skip
 from ..checkpoint.saved import meta_now, put
 from .detector import Detection
-from .events import ReplicaLost, WrongSuspicion
+from .events import BackgroundWorkLost, ReplicaLost, WrongSuspicion
 from .messages import Done, Ended, Inward, Outward, Request, Work
 
 if TYPE_CHECKING:
@@ -101,6 +103,7 @@ class Group:
         self.is_joining = False  # a replica is catching up
         self.is_poked = False
         self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
+        self.piped: set[tuple[int, int]] = set()  # background work that is out, by turn and output
         self._quiet: list[asyncio.Future[None]] = []
         self._stirred: list[asyncio.Future[None]] = []
         # Whom to tell.
@@ -120,6 +123,12 @@ class Group:
     def cell_of(self, name: str) -> Cell | None:
         """The cell of an actor of the mechanism, if there is one now."""
         return self.node.find(self.place(name))
+
+    def bind_proxy(self) -> None:
+        """Show who leads: the proxy is bound to its RequestProtocol."""
+        proxy = self.cell_of("proxy")
+        if proxy is not None and self.primary is not None:
+            self.node.bind(proxy, "protocol", self.node.cell_at(self.place(f"{self.primary}/protocol")))
 
     def life_of(self, name: str) -> int:
         """The number of the life that a replica lives now; 0 if none."""
@@ -367,6 +376,8 @@ class Group:
             if isinstance(record, Closed):
                 self.on_ended(record.reason)
             else:
+                if isinstance(record, PipeDone):
+                    self.piped.discard((record.turn, record.k))
                 self.switch.from_life(record)
         if done.live is not None and not self.is_live:
             self.is_live = True
@@ -401,7 +412,22 @@ class Group:
                 if isinstance(record, Released) and not self._is_front(record):
                     self._is_behind(record.turn)
                     return
+                if isinstance(record, Released):
+                    self._note_work(record.turn, record.outs)
                 self.switch.from_life(record)
+
+    def _note_work(self, turn: int, outs: list[Out]) -> None:
+        """Background work runs in the process of the replica that leads, and is part of no state."""
+        done = self.switch.pipes_done.get(turn, ())
+        self.piped.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
+
+    def work_is_lost(self) -> bool:
+        """Whoever led has died: is its background work only begun again if all is replayed? Tells of what is not."""
+        out, self.piped = self.piped, set()
+        if not out or self.switch.method.replays:
+            return bool(out)
+        self.node.emit(BackgroundWorkLost(self.path, self.epoch, len(out)))
+        return False
 
     def _is_front(self, record: Released) -> bool:
         """Whether it is of the turn that comes next, or of one that is known."""
@@ -447,6 +473,8 @@ class Group:
         if source is not None and source.kind == START and end.status == FAILED:
             self.on_start_failed(end)
             return
+        if end.outs:
+            self._note_work(end.turn, end.outs)
         switch.from_life(end)
         if end.status != STASHED:
             self.ledger.pop(end.id, None)

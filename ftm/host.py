@@ -267,6 +267,7 @@ class GroupHost(HomeHost):
             raise StartFailed(group.path, f"{first} cannot lead: {error}") from error
         group.members[first] = life
         group.primary, group.is_begun = first, True
+        group.bind_proxy()
         group.watch(first)
         group.wake()
 

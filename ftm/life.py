@@ -72,6 +72,11 @@ class ServerLife(Life):
     def want_snapshot(self) -> None:
         self.server.want_snapshot()
 
+    def pipe_back(self) -> None:
+        super().pipe_back()
+        if not self.pipes:
+            self.server.work_back()
+
     def replaced(self) -> None:
         self.server.forget_point()
         super().replaced()

@@ -87,6 +87,9 @@ class Points(lives.LocalHost):
         self._pending: deque[Request] = deque()
         self._resting: asyncio.Future[str] | None = None
         self._chunk = 8
+        self._work_waited_for: list[asyncio.Future[None]] = []
+        self._singles = 0  # requests that are run one at a time: one of them has left what cannot be saved
+        self.can_save = True  # as far as is known, where nobody looks at the state after each part
         self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None
@@ -181,12 +184,27 @@ class Points(lives.LocalHost):
         """End the life without a word: its state is kept as bytes."""
         cell = self.cell
         life, self.life = self.life, None
+        self.work_back()
         if life is None or cell is None or cell.state is DOWN:
             return
         life.port = NOWHERE
         gone = cell.ended()
         self.kill(cell)
         await gone
+
+    async def until_work_is_back(self) -> None:
+        """Wait until no background work is out: it is part of no state."""
+        while self.life is not None and self.life.pipes:
+            back: asyncio.Future[None] = self.life.cell.node.loop.create_future()
+            self._work_waited_for.append(back)
+            await back
+
+    def work_back(self) -> None:
+        """No background work is out any more, or its life is over."""
+        waiting, self._work_waited_for = self._work_waited_for, []
+        for one in waiting:
+            if not one.done():
+                one.set_result(None)
 
     # -- coming to rest -----------------------------------------------------------------------------------------------
 

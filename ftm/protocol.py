@@ -424,6 +424,8 @@ class RequestProtocol(Brick):
             await self._quiet()
             server = self._standing.server
             await server.ensure()
+            await server.until_work_is_back()
+            await self.proceed.ask(Flush(), timeout=FOREVER)  # What has come of it goes home first.
             life = server.life
             assert life is not None
             assert life.cell.actor is not None

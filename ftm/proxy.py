@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..actors.actor import Actor, on
+from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.message import Message
 from .group import Flush
@@ -22,6 +23,9 @@ class Proxy(Actor):
     """Between the home of a protected actor and the replica that leads. All it knows is in the group."""
 
     deterministic = False
+
+    protocol: Binding[Actor]
+    """Of the replica that leads."""
 
     def __init__(self, group: Group) -> None:
         self._group = group

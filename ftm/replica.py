@@ -14,6 +14,7 @@ from ..actors.actor import Actor, Start, on, start
 from ..actors.bindings import Binding
 from ..actors.cell import Cell
 from ..actors.errors import HoldfastError, type_name
+from ..actors.events import ActorStarted
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.message import Message
 from ..checkpoint.method import Method
@@ -180,6 +181,7 @@ class Replica(Supervisor):
         self._bind(STATE, "server", self._cell(SERVER))
         for port, path in setting.bindings.items():
             node.bind(self._cell(SERVER), port, node.cell_at(path))
+        node.emit(ActorStarted(self._cell(SERVER).path, 1))  # Its lives come and go with the role: the address stays.
         woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=False)
         await self._take_up(woven)
         one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat)))

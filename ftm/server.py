@@ -116,6 +116,11 @@ class Server(Points):
             is_early = self.standing.leads and self.confirmed < self.handed
             return [] if self.begun or self.ends or is_early else [pending.popleft()]
         chunk: list[Request] = []
+        if self._singles:
+            if self.begun:
+                return []
+            self._singles -= 1
+            return [pending.popleft()]
         while pending and len(chunk) < self._chunk and not (chunk and self.runs_alone(pending[0])):
             chunk.append(pending.popleft())
         return chunk
@@ -151,6 +156,13 @@ class Server(Points):
                 break
         ends, self.ends = self.ends, []
         return ends
+
+    async def part_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
+        """Nothing of the last part has happened: run it once more. `single`: one request at a time."""
+        if single:
+            self._singles = len(self.begun)
+        self._take_back(pending)
+        return await self.part(pending)
 
     def _take_back(self, pending: deque[Request]) -> None:
         """Nothing of this part has happened: the life begins again where it began."""

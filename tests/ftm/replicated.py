@@ -49,6 +49,12 @@ class Guess(hf.Message[int]): ...
 class Quit(hf.Message[int]): ...
 
 
+class Spoil(hf.Message[int]):
+    """Leave behind what nobody can save."""
+
+    n: int
+
+
 class Other(hf.Actor):
     """Somebody else; the driver answers in its place."""
 
@@ -111,6 +117,12 @@ class Total(hf.Actor):
     @hf.on(Guess)
     def guess(self, message: Guess) -> int:
         self.seen.append(int.from_bytes(os.urandom(3), "little"))
+        return sum(self.seen)
+
+    @hf.on(Spoil)
+    def spoil(self, message: Spoil) -> int:
+        self.seen.append(message.n)
+        self.spoilt = object()
         return sum(self.seen)
 
     @hf.on(Quit)

@@ -102,9 +102,47 @@ async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSy
     ref = await started(system)
     seen = {path.removeprefix(f"{ref.path}/ftm/") for path in system.tree() if path.startswith(f"{ref.path}/ftm/")}
     bricks = {
-        f"{name}/{brick}" for name in ("r1", "r2") for brick in ("protocol", "before", "proceed", "state", "beat")
+        f"{name}/{brick}"
+        for name in ("r1", "r2")
+        for brick in ("protocol", "before", "proceed", "state", "server", "beat")
     }
     assert {*PARTS, "r1", "r2"} | bricks <= seen
+    backup = other(group_of(ref))
+    os.kill(pid_of(system, ref, backup), signal.SIGKILL)
+    async with asyncio.timeout(10):
+        while is_complete(ref):
+            await asyncio.sleep(0.001)
+    await two_again(ref)
+    assert f"{ref.path}/ftm/{backup}/server" in system.tree()
+
+
+async def test_the_bindings_of_the_bricks_are_seen_from_outside(system: hf.ActorSystem) -> None:
+    """A44 to A51: from the proxy to the protected actor, and back."""
+    ref = await started(system)
+    group = group_of(ref)
+    first, second = group.primary, other(group)
+
+    async def bound(brick: str) -> dict[str, str]:
+        status = await system.get_status(system.ref(f"{ref.path}/ftm/{brick}", hf.Actor))
+        return {port: path.removeprefix(f"{ref.path}/ftm/") for port, path in status.bindings.items()}
+
+    assert await ref.ask(Add(0)) == 1
+    assert await bound("proxy") == {"protocol": f"{first}/protocol"}
+    assert (await bound(f"{first}/protocol")).items() >= {"before": f"{first}/before", "next": "proxy"}.items()
+    assert (await bound(f"{first}/before"))["next"] == f"{first}/proceed"
+    found = await bound(f"{first}/proceed")
+    assert (found["next"], found["server"]) == (f"{first}/after", f"{first}/server")
+    found = await bound(f"{first}/after")
+    assert (found["next"], found["peer"], found["state"]) == (
+        f"{first}/protocol", f"{second}/after", f"{first}/state")  # fmt: skip
+    assert await bound(f"{first}/state") == {"server": f"{first}/server"}
+    status = await system.get_status(system.ref(f"{ref.path}/ftm/{first}/server", hf.Actor))
+    assert status.kind.endswith("Counter")
+    assert status.state == "running"
+    assert first is not None
+    os.kill(pid_of(system, ref, first), signal.SIGKILL)
+    assert await ref.ask(Add(1)) == 2
+    assert await bound("proxy") == {"protocol": f"{second}/protocol"}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -368,3 +406,48 @@ async def test_with_a_store_a_protected_actor_comes_back_after_a_restart_of_the_
         ref = await started(system, recovery=hf.hybrid(interval=0.05))
         assert await ref.ask(Tags()) == list(range(21))
         assert await ref.ask(Add(21)) == 22
+
+
+class Wait(hf.Message[None]):
+    path: str
+    tag: int
+
+
+class Waiter(Counter):
+    """Has something done in the background, until a file is there."""
+
+    @hf.on(Wait)
+    def wait(self, message: Wait) -> None:
+        self.ctx.pipe_to_self(until_there(Path(message.path)), lambda _: Add(message.tag))
+
+
+async def until_there(path: Path) -> None:
+    while not path.exists():
+        await asyncio.sleep(0.005)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("recovery", [hf.hybrid(interval=0.05), None])
+async def test_background_work_is_begun_again_or_said_to_be_lost(
+    system: hf.ActorSystem, recovery: Any, tmp_path: Path
+) -> None:
+    ref = await started(system, hf.start(Waiter), recovery=recovery)
+    events, there = system.events(), tmp_path / "there"
+    await ref.ask(Add(0))
+    await ref.ask(Wait(str(there), 1))
+    assert await ref.ask(Add(2)) == 2
+    primary = group_of(ref).primary
+    assert primary is not None
+    os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    assert await ref.ask(Add(3), timeout=30) == 3
+    there.touch()
+    lost = [one for one in events.take() if isinstance(one, hf.BackgroundWorkLost)]
+    if recovery is None:
+        assert [one.count for one in lost] == [1]
+        assert await ref.ask(Tags()) == [0, 2, 3]
+    else:
+        async with asyncio.timeout(10):
+            while await ref.ask(Tags(), timeout=10) != [0, 2, 3, 1]:
+                await asyncio.sleep(0.005)
+        assert lost == []
+    events.close()

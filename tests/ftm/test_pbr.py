@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.errors import UnsavableValue
 from holdfast.actors.exits import SHUTDOWN, pack_exit
 from holdfast.checkpoint.records import OK, STASHED, TurnEnd
 from holdfast.checkpoint.records import Closed as LifeClosed
@@ -18,7 +19,7 @@ from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
 from holdfast.ftm.messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
 from holdfast.ftm.orders import Export, Finish, Install, Join, Peer
 from holdfast.ftm.replylog import ReplyLog
-from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Guess, Large, Put, Quit, Read, Say, Total, pair
+from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Guess, Large, Put, Quit, Read, Say, Spoil, Total, pair
 
 
 async def test_a_backup_that_leads_goes_on_where_the_primary_was(system: hf.ActorSystem) -> None:
@@ -114,6 +115,24 @@ async def test_what_was_acknowledged_but_not_heard_of_is_not_done_twice(system: 
     await driver.fail_over("r2")
     assert [await driver.reply(key) for key in keys] == [1, 3]
     assert await driver.ask(Read()) == [1, 2]
+
+
+@pytest.mark.parametrize("together", [False, True])
+async def test_a_turn_that_leaves_an_unsavable_state_fails(system: hf.ActorSystem, together: bool) -> None:
+    """Only that turn, with the error for who has asked; neither the replica nor its successor dies of it."""
+    driver = await pair(system)
+    if together:
+        keys = driver.send(Add(1), Spoil(2), Add(3), Spoil(4), Add(5))
+    else:
+        keys = [driver.send(one)[0] for one in (Add(1), Spoil(2), Add(3), Spoil(4), Add(5))]
+    assert [await driver.reply(keys[at]) for at in (0, 2, 4)] == [1, 4, 9]
+    for at in (1, 3):
+        with pytest.raises(UnsavableValue, match="spoilt"):
+            await driver.reply(keys[at])
+    assert [driver.ends[key].turn for key in keys] == [1, 2, 3, 4, 5]
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Read()) == [1, 3, 5]
 
 
 async def test_a_turn_that_fails_leaves_nothing_but_its_number(system: hf.ActorSystem) -> None:
