@@ -36,7 +36,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import ftm_timing
 from ftm_workload import Bump, Change, Count, Parts, Whole
 
-from tests.ftm import campaign, soak
+from tests.ftm import campaign, soak, workloads
 
 STACKS: dict[str, tuple[Any, ...]] = {
     "PBR": (hf.PBR(),),
@@ -352,7 +352,7 @@ async def faults(run: Run) -> None:
     missed, injected = 0, 0
     for name, layers in STACKS.items():
         for kind in campaign.KINDS:
-            for workload in campaign.WORKLOADS:
+            for workload in workloads.WORKLOADS:
                 if not campaign.makes_sense(layers, kind):
                     continue
                 if workload != "counter" and not kind.startswith(("nothing", "crash", "SIGSTOP", "message d")):
