@@ -252,7 +252,7 @@ class GroupHost(HomeHost):
         life = group.life_of(first)
         if not life:
             raise StartFailed(group.path, f"{first} has ended")
-        protocol = group.protocol(first)
+        protocol, traps = group.protocol(first), group.cell.extra().trap_exits  # of the life that has come to rest
         try:
             pieces = switch.restore_records()
             if not pieces and switch.state_turn >= 0:
@@ -260,7 +260,7 @@ class GroupHost(HomeHost):
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 await protocol.ask(
-                    Install(group.epoch, switch.state_turn, piece.data, switch.stash, is_last, []), LED_WITHIN
+                    Install(group.epoch, switch.state_turn, piece.data, switch.stash, is_last, [], traps), LED_WITHIN
                 )
             await protocol.ask(Lead(group.epoch, group.config), LED_WITHIN)
         except HoldfastError as error:

@@ -145,6 +145,7 @@ class State(msgspec.Struct, array_like=True):
     live: bool
     base: int = -2
     stash_ids: list[int] = []
+    traps: bool = False  # `ctx.trap_exits`
 
 
 class Lead(Message[int]):

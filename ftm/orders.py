@@ -39,6 +39,7 @@ class Install(Message[None]):
     stash: list[int]
     is_last: bool
     log: list[tuple[str, int, int, TurnEnd]]
+    traps: bool = False  # `ctx.trap_exits` of the life that it comes from
 
 
 class Peer(Message[None]):

@@ -149,6 +149,8 @@ class Points(lives.LocalHost):
         turn = self._start_turn if point is None else point.turn
         life.begin(start, turn, [] if point is None else point.stash_ids)
         self.life = life
+        if point is not None:
+            cell.extra().trap_exits = point.traps
         actor: Any = cell.actor
         if point is not None:
             for delta in point.deltas:
@@ -315,6 +317,7 @@ class Points(lives.LocalHost):
             self.marks = []
             self.point = State(life.turn, data, [], stash, returned, life.is_live)
         ids = () if life.is_live else sorted(life._stashed_ids)
+        self.point.traps = life.cell.extra().trap_exits
         self.point.stash_ids = [key for key in ids if all(fed.feed.id != key for fed in life.stash)]
         self._point_names = None
         if getattr(actor, "get_state", None) is None and key_names(actor) is None:
@@ -325,13 +328,15 @@ class Points(lives.LocalHost):
     def since(self, turn: int) -> State:
         """The present point, as what has changed since an earlier one if that is known; else all of it."""
         point = self.capture()
+        ids, traps = point.stash_ids, point.traps
         if turn == point.turn:
             at = len(point.deltas)
         elif turn in self.marks:
             at = self.marks.index(turn)
         else:
             return point
-        return State(point.turn, b"", point.deltas[at:], point.stash, point.returned, point.live, turn, point.stash_ids)
+        deltas = point.deltas[at:]
+        return State(point.turn, b"", deltas, point.stash, point.returned, point.live, turn, ids, traps)
 
     def apply(self, state: State) -> None:
         """Take a state from another replica, whole or not at all.
@@ -373,6 +378,7 @@ class Points(lives.LocalHost):
             for name in set(variables(actor)) - set(self._names_of(point)):
                 delattr(actor._state_root(), name)
         senders = life.cell.node
+        life.cell.extra().trap_exits = point.traps
         life.turn = point.turn
         life.stash = [
             Fed(life, feed, None, None if feed.sender is None else senders.cell_at(feed.sender)) for feed in point.stash

@@ -254,7 +254,7 @@ class RequestProtocol(Brick):
             data, self._pieces = b"".join(self._pieces), []
             server = self._standing.server
             await server.drop_life()
-            server.install(State(message.turn, data, [], [], [], False, -2, message.stash))
+            server.install(State(message.turn, data, [], [], [], False, -2, message.stash, message.traps))
             self._standing.log.replace(message.log)
 
     @on(Lead)

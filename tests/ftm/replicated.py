@@ -49,6 +49,12 @@ class Guess(hf.Message[int]): ...
 class Quit(hf.Message[int]): ...
 
 
+class Trap(hf.Message[bool]):
+    """Trap exits from now on, or say whether it does."""
+
+    on: bool
+
+
 class Spoil(hf.Message[int]):
     """Leave behind what nobody can save."""
 
@@ -118,6 +124,12 @@ class Total(hf.Actor):
     def guess(self, message: Guess) -> int:
         self.seen.append(int.from_bytes(os.urandom(3), "little"))
         return sum(self.seen)
+
+    @hf.on(Trap)
+    def trap(self, message: Trap) -> bool:
+        if message.on:
+            self.ctx.trap_exits = True
+        return self.ctx.trap_exits
 
     @hf.on(Spoil)
     def spoil(self, message: Spoil) -> int:

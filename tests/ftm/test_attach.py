@@ -233,3 +233,45 @@ async def test_a_binding_is_that_of_every_replica_from_now_on(system: hf.ActorSy
         os.kill(pid_of(system, ref, primary), signal.SIGKILL)
         assert await ref.ask(Pay(1), timeout=30) == total
         await two_again(ref)
+
+
+class Hold(hf.Message[bool]):
+    seconds: float
+
+
+class Busy(Counter):
+    """Takes its time, and traps exits once it has been told to."""
+
+    @hf.on(Hold)
+    async def hold(self, message: Hold) -> bool:
+        await asyncio.sleep(message.seconds)
+        had, self.ctx.trap_exits = self.ctx.trap_exits, True
+        return had
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("method", ["without recovery", "hybrid"])
+async def test_whether_it_traps_exits_comes_along(system: hf.ActorSystem, method: str) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Busy), recovery=METHODS[method]()))
+    assert await ref.ask(Hold(0.0)) is False
+    await attach(system, ref)
+    assert await ref.ask(Hold(0.0)) is True
+    primary = group_of(ref).primary
+    assert primary is not None
+    os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    assert await ref.ask(Hold(0.0), timeout=30) is True
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("method", ["without recovery", "hybrid"])
+async def test_those_that_wait_for_room_come_along(system: hf.ActorSystem, method: str) -> None:
+    spec = hf.child("alice", hf.start(Busy), mailbox=hf.bounded(2), recovery=METHODS[method]())
+    ref = await system.start(spec)
+    held = asyncio.ensure_future(ref.ask(Hold(0.3)))
+    asks = [asyncio.ensure_future(ref.ask(Add(tag), timeout=30)) for tag in range(8)]
+    await asyncio.sleep(0.05)
+    await attach(system, ref)
+    assert isinstance(ref._cell.host, GroupHost)
+    await held
+    assert sorted(await asyncio.gather(*asks)) == list(range(1, 9))
+    assert sorted(await ref.ask(Tags())) == list(range(8))

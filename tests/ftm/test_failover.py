@@ -451,3 +451,40 @@ async def test_background_work_is_begun_again_or_said_to_be_lost(
                 await asyncio.sleep(0.005)
         assert lost == []
     events.close()
+
+
+class Ring(hf.Message[str]): ...
+
+
+class Caller(Counter):
+    """Asks somebody who asks it in turn."""
+
+    friend: hf.Binding[Friend]
+
+    @hf.on(Ring)
+    async def ring(self, message: Ring) -> str:
+        return await self.friend.ask(Ring())
+
+
+class Friend(hf.Actor):
+    """Asks back."""
+
+    @hf.on(Ring)
+    async def ring(self, message: Ring) -> str:
+        try:
+            await self.ctx.find("/app/alice", Counter).ask(Total())
+        except hf.AskDeadlock:
+            return "deadlock"
+        return "answered"
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("recovery", [hf.hybrid(), None])
+@pytest.mark.parametrize("recorded", [False, True])
+async def test_an_ask_that_comes_back_inside_a_turn_fails_at_once(
+    system: hf.ActorSystem, recovery: Any, recorded: bool
+) -> None:
+    friend = await system.start(hf.child("friend", hf.start(Friend), recovery=hf.hybrid() if recorded else None))
+    ref = await started(system, hf.start(Caller), recovery=recovery, bindings={"friend": friend.path})
+    assert await ref.ask(Ring(), timeout=3.0) == "deadlock"
+    assert await ref.ask(Add(0)) == 1

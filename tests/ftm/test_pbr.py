@@ -19,7 +19,23 @@ from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
 from holdfast.ftm.messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
 from holdfast.ftm.orders import Export, Finish, Install, Join, Peer
 from holdfast.ftm.replylog import ReplyLog
-from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Guess, Large, Put, Quit, Read, Say, Spoil, Total, pair
+from tests.ftm.replicated import (
+    Add,
+    Back,
+    Closed,
+    Fail,
+    Fetch,
+    Guess,
+    Large,
+    Put,
+    Quit,
+    Read,
+    Say,
+    Spoil,
+    Total,
+    Trap,
+    pair,
+)
 
 
 async def test_a_backup_that_leads_goes_on_where_the_primary_was(system: hf.ActorSystem) -> None:
@@ -115,6 +131,17 @@ async def test_what_was_acknowledged_but_not_heard_of_is_not_done_twice(system: 
     await driver.fail_over("r2")
     assert [await driver.reply(key) for key in keys] == [1, 3]
     assert await driver.ask(Read()) == [1, 2]
+
+
+async def test_whether_it_traps_exits_is_part_of_its_state(system: hf.ActorSystem) -> None:
+    driver = await pair(system)
+    assert await driver.ask(Trap(on=True))
+    with pytest.raises(hf.RemoteCrash):
+        await driver.ask(Fail(1))
+    assert await driver.ask(Trap(on=False))
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Trap(on=False))
 
 
 @pytest.mark.parametrize("together", [False, True])
