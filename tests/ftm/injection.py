@@ -139,7 +139,8 @@ def recipe(page: Page) -> Any:
 
 
 def subclasses(kind: type) -> Iterable[type]:
-    for one in kind.__subclasses__():
+    found: list[type] = kind.__subclasses__()
+    for one in found:
         yield one
         yield from subclasses(one)
 
