@@ -17,16 +17,17 @@ from holdfast.ftm.proxy import Proxy
 from holdfast.ftm.replica import Replica
 from holdfast.ftm.state import StateManager
 
-KEPT = 40  # marks of the last requests, of each process
+KEPT = 400  # marks between two writes
 
 Mark = tuple[float, str]
 
 
 class Marks:
-    """The last moments at which bricks of this process were handed something."""
+    """The moments at which bricks of this process were handed something; now and then they go to a file."""
 
-    def __init__(self) -> None:
+    def __init__(self, file: Path | None = None) -> None:
         self.seen: list[Mark] = []
+        self.file = file
 
     def wrap(self, kind: type[Actor], name: str) -> None:
         """Note each message that actors of this class handle."""
@@ -41,27 +42,30 @@ class Marks:
 
         def marked(actor: Any, item: Any) -> Any:
             seen.append((clock(), f"{name or actor.slot}:{message}"))
+            if len(seen) >= KEPT and self.file is not None:
+                with self.file.open("a") as file:
+                    file.write(json.dumps(seen) + "\n")
+                seen.clear()
             return handler(actor, item)
 
         marked.__marked__ = True  # type: ignore[attr-defined]
         return marked
 
 
+ROOT = Marks()
+
+
 class TimedReplica(Replica):
-    """A replica whose bricks note when they are handed something; when it ends, it says so in a file."""
+    """A replica whose bricks note when they are handed something."""
 
     def __init__(self, setting: Any, start: Start[Any], layers: Any, folder: str) -> None:
         super().__init__(setting, start, layers)
-        self._folder, self._marks = Path(folder), Marks()
+        marks = Marks(Path(folder) / f"{setting.name}.{os.getpid()}")
         for name in BUILT_IN:
             find(name)
         for kind in {*_derived(Brick), StateManager}:
-            self._marks.wrap(kind, "state" if kind is StateManager else "")
-        self._marks.wrap(start.kind, "server")
-
-    def on_stop(self, reason: Any) -> Any:
-        (self._folder / f"{self._setting.name}.{os.getpid()}.json").write_text(json.dumps(self._marks.seen))
-        return super().on_stop(reason)
+            marks.wrap(kind, "state" if kind is StateManager else "")
+        marks.wrap(start.kind, "server")
 
 
 def _derived(kind: type) -> list[type]:
@@ -79,9 +83,9 @@ def recipe(folder: Path) -> Any:
 
 def root_marks() -> Marks:
     """Of the proxy, in this process."""
-    marks = Marks()
-    marks.wrap(Proxy, "proxy")
-    return marks
+    ROOT.seen.clear()
+    ROOT.wrap(Proxy, "proxy")
+    return ROOT
 
 
 def by_brick(asks: list[tuple[float, float]], marks: list[Mark]) -> list[tuple[str, float]]:

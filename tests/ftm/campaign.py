@@ -14,7 +14,6 @@ import os
 import random
 import signal
 import tempfile
-from collections import Counter as Tally
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,12 +25,11 @@ from holdfast.ftm.detector import Detection
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group import Group, Look
 from holdfast.ftm.mechanism import Mechanism
-from tests.ftm import accounts, linearizable, store
 from tests.ftm.injection import Fault, Page, recipe, unwrap, wrap_root
+from tests.ftm.workloads import CLIENTS, WORKLOADS, Bad
 
 REQUEST = "REQUEST"
 """In place of the message that the workload's clients send most."""
-CLIENTS = 4
 GIVE_UP = 3.0
 """Seconds in which an armed fault is reached, or is not on the way of this mechanism."""
 ALARMS = (FailedOver, WrongSuspicion, Diverged, Masked, ProtectionLost, ReplicaLost)
@@ -138,152 +136,6 @@ def makes_sense(layers: Sequence[Mechanism], kind: str) -> bool:
     return kind not in CRASHES or max(one.replicas for one in layers) > 1
 
 
-# -- what clients do --------------------------------------------------------------------------------------------------
-
-
-@dataclasses.dataclass
-class Bad:
-    """Numbers of requests that went wrong, by how."""
-
-    lost: list[int] = dataclasses.field(default_factory=list)
-    wrong: list[int] = dataclasses.field(default_factory=list)
-    doubled: list[int] = dataclasses.field(default_factory=list)
-
-    def all(self) -> set[int]:
-        return {*self.lost, *self.wrong, *self.doubled}
-
-
-class Workload:
-    """Clients that ask one after the other; each ask has a number of its own."""
-
-    main = ""
-
-    def __init__(self, timeout: float, rng: random.Random) -> None:
-        self.timeout, self.rng = timeout, rng
-        self.sent = 0
-        self.answered: dict[int, Any] = {}
-        self.failed: dict[int, BaseException] = {}
-        self._stopping = False
-        self._tasks: list[asyncio.Task[None]] = []
-
-    async def start(self, system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
-        raise NotImplementedError
-
-    async def one(self, client: int, number: int) -> Any:
-        raise NotImplementedError
-
-    async def bad(self) -> Bad:
-        raise NotImplementedError
-
-    def begin(self) -> None:
-        self._tasks = [asyncio.create_task(self._client(client)) for client in range(CLIENTS)]
-
-    async def _client(self, client: int) -> None:
-        while not self._stopping:
-            number = self.sent
-            self.sent += 1
-            try:
-                self.answered[number] = await self.one(client, number)
-            except hf.HoldfastError as error:
-                self.failed[number] = error
-                await asyncio.sleep(0.01)
-
-    @property
-    def done(self) -> int:
-        return len(self.answered) + len(self.failed)
-
-    async def reached(self, more: int) -> None:
-        goal = self.done + more
-        async with asyncio.timeout(120):
-            while self.done < goal:
-                await asyncio.sleep(0.001)
-
-    async def stop(self) -> None:
-        self._stopping = True
-        await asyncio.gather(*self._tasks)
-
-
-def judged(answered: dict[int, Any], failed: dict[int, BaseException], tags: list[int]) -> Bad:
-    """Of an actor that notes the numbers it handles, and answers how many (or their sum)."""
-    bad = Bad()
-    seen = Tally(tags)
-    bad.doubled = [tag for tag, times in seen.items() if times > 1]
-    bad.lost = [tag for tag in answered if tag not in seen]
-    bad.wrong = [tag for tag in seen if tag not in answered and tag not in failed]
-    offset = 0
-    for place, tag in enumerate(tags, 1):
-        reply = answered.get(tag)
-        if reply is not None and reply != place + offset:
-            bad.wrong.append(tag)
-            offset = reply - place
-    return bad
-
-
-class Counting(Workload):
-    main = "Add"
-
-    async def start(self, system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
-        self.ref = await system.start(hf.child("c", hf.start(accounts.Counter), mechanism=mechanism))
-        return self.ref
-
-    async def one(self, client: int, number: int) -> Any:
-        return await self.ref.ask(accounts.Add(number, 1), timeout=self.timeout)
-
-    async def bad(self) -> Bad:
-        return judged(self.answered, self.failed, await self.ref.ask(accounts.Tags(), timeout=30))
-
-
-class Banking(Workload):
-    main = "Transfer"
-
-    async def start(self, system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
-        self.accounts = [
-            await system.start(hf.child(name, hf.start(accounts.Account, 1000))) for name in ("one", "two")
-        ]
-        bindings = {"one": self.accounts[0].path, "other": self.accounts[1].path}
-        spec = hf.child("bank", hf.start(accounts.Bank), mechanism=mechanism, bindings=bindings)
-        self.ref = await system.start(spec)
-        return self.ref
-
-    async def one(self, client: int, number: int) -> Any:
-        return await self.ref.ask(accounts.Transfer(number, 1), timeout=self.timeout)
-
-    async def bad(self) -> Bad:
-        tags = await self.ref.ask(accounts.Tags(), timeout=30)
-        bad = judged(self.answered, self.failed, tags)
-        moved = [1000 - await self.accounts[0].ask(accounts.Put(0)), await self.accounts[1].ask(accounts.Put(0)) - 1000]
-        if not self.failed and moved != [len(tags)] * 2:
-            bad.wrong.append(self.sent - 1)
-        return bad
-
-
-class Storing(Workload):
-    main = "Write"
-
-    async def start(self, system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
-        self.history = linearizable.History()
-        self.ref = await system.start(hf.child("kv", hf.start(store.Store), mechanism=mechanism))
-        return self.ref
-
-    async def one(self, client: int, number: int) -> Any:
-        key, rng = f"k{self.rng.randrange(8)}", self.rng
-        kind = rng.choice(("write", "read", "cas"))
-        old, new = rng.choice((None, number - 1, number - 3)), number
-        args: tuple[Any, ...] = {"write": (new,), "read": (), "cas": (old, new)}[kind]
-        message: Any = {"write": store.Write(key, new), "read": store.Look(key), "cas": store.Cas(key, old, new)}[kind]
-        at = self.history.begin(f"c{client}.{number}", kind, *args, key=key)
-        reply = await self.ref.ask(message, timeout=self.timeout)
-        self.history.end(at, reply)
-        return reply
-
-    async def bad(self) -> Bad:
-        found = await asyncio.to_thread(linearizable.check, self.history, linearizable.key_value())
-        return Bad() if isinstance(found, linearizable.Linearizable) else Bad(wrong=[self.sent - 1])
-
-
-WORKLOADS: dict[str, type[Workload]] = {"counter": Counting, "bank": Banking, "store": Storing}
-
-
 # -- the campaign -----------------------------------------------------------------------------------------------------
 
 
@@ -342,13 +194,25 @@ def injecting(detection: Detection = QUICK) -> Iterator[Page]:
     """Replicas that start in this block are struck by what is armed in the page."""
     with tempfile.TemporaryDirectory() as folder:
         page = Page.new(Path(folder) / "page")
-        saved, before = wrap_root(page), (host.replica, host.Detection)
-        host.replica, host.Detection = recipe(page), lambda: detection  # type: ignore[assignment, misc]
+        saved, before = wrap_root(page), host.replica
+        host.replica = recipe(page)
         try:
-            yield page
+            with detecting(detection):
+                yield page
         finally:
-            host.replica, host.Detection = before  # type: ignore[misc]
+            host.replica = before
             unwrap(saved)
+
+
+@contextlib.contextmanager
+def detecting(detection: Detection) -> Iterator[None]:
+    """Groups that start in this block watch their replicas so."""
+    known: Any = host
+    before, known.Detection = known.Detection, lambda: detection
+    try:
+        yield
+    finally:
+        known.Detection = before
 
 
 @contextlib.asynccontextmanager

@@ -27,7 +27,6 @@ from holdfast.ftm.bricks import Brick
 from holdfast.ftm.detector import Detector
 from holdfast.ftm.failover import FailoverManager
 from holdfast.ftm.join import Joiner
-from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanism import BUILT_IN, find
 from holdfast.ftm.messages import Work
 from holdfast.ftm.proxy import Proxy
@@ -140,7 +139,8 @@ def recipe(page: Page) -> Any:
 
 
 def subclasses(kind: type) -> Iterable[type]:
-    for one in kind.__subclasses__():
+    found: list[type] = kind.__subclasses__()
+    for one in found:
         yield one
         yield from subclasses(one)
 
@@ -149,7 +149,8 @@ def wrap(page: Page, kind: type[hf.Actor]) -> None:
     """Have things go wrong in the bricks of this process, and in the protected actor."""
     for name in BUILT_IN:
         find(name)
-    for one in {*subclasses(Brick), StateManager, Heart}:
+    bricks: set[Any] = {*subclasses(Brick), StateManager, Heart}
+    for one in bricks:
         wrap_table(page, one, SLOTS.get(one, ""))
     wrap_table(page, kind, "server")
 
@@ -299,6 +300,3 @@ def other(item: Any) -> Any:
     body[-1] ^= 2
     feed = msgspec.structs.replace(first.feed, body=bytes(body))
     return msgspec.structs.replace(item, requests=[msgspec.structs.replace(first, feed=feed), *item.requests[1:]])
-
-
-LETTER = Letter.__name__

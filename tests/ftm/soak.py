@@ -16,7 +16,8 @@ from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.messages import Done
 from tests.ftm.accounts import Counter
-from tests.ftm.campaign import Bad, Counting, group_of, running, whole
+from tests.ftm.campaign import group_of, running, whole
+from tests.ftm.workloads import Bad, Counting
 
 PAUSE = 0.2
 
@@ -42,7 +43,8 @@ class Found:
     def __str__(self) -> str:
         return (
             f"{self.requests} requests, {self.kills} kills, {self.done.total()} changes {dict(self.done)}, "
-            f"{self.refused.total()} rolled back {dict(self.refused)}; failed {self.failed}, lost {len(self.bad.lost)}, "
+            f"{self.refused.total()} rolled back {dict(self.refused)}; failed {self.failed}, "
+            f"lost {len(self.bad.lost)}, "
             f"wrong {len(self.bad.wrong)}, twice {len(self.bad.doubled)}"
         )
 
@@ -79,7 +81,8 @@ class Changes:
         else:
             choices["compose"] = lambda change: change.compose(ref, TR())
         if "pbr" in names:
-            choices["update"] = lambda change: change.update(ref, "after", Renewed, mechanism="pbr", role="primary")
+            new = {"mechanism": "pbr", "role": "primary"}
+            choices["update"] = lambda change: change.update(ref, "after", Renewed, **new)
         return choices
 
     async def one(self) -> None:
