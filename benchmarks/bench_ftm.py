@@ -19,7 +19,7 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncGenerator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1]))
 import ftm_timing
 from ftm_workload import Bump, Change, Count, Parts, Whole
 
-from tests.ftm import campaign, soak, workloads
+from tests.ftm import campaign, soak, workloads  # pyright: ignore[reportMissingImports]  # found by the line above
 
 STACKS: dict[str, tuple[Any, ...]] = {
     "PBR": (hf.PBR(),),
@@ -54,7 +54,7 @@ WINDOW = 0.25  # seconds around a change, and of the quiet time beside it
 
 
 @contextlib.asynccontextmanager
-async def _system() -> AsyncIterator[hf.ActorSystem]:
+async def _system() -> AsyncGenerator[hf.ActorSystem, None]:
     async with hf.ActorSystem("bench", log=False, intensity=100_000) as system:
         yield system
 

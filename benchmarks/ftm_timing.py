@@ -68,8 +68,9 @@ class TimedReplica(Replica):
         marks.wrap(start.kind, "server")
 
 
-def _derived(kind: type) -> list[type]:
-    return [one for each in kind.__subclasses__() for one in (each, *_derived(each))]
+def _derived(kind: type[Any]) -> list[type[Any]]:
+    direct: list[type[Any]] = kind.__subclasses__()
+    return [one for each in direct for one in (each, *_derived(each))]
 
 
 def recipe(folder: Path) -> Any:

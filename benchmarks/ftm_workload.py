@@ -52,10 +52,10 @@ class Parts(Whole):
 
     @hf.on(Change)
     def change(self, message: Change) -> int:
-        count = super().change(message)
+        super().change(message)
         at = message.key % len(self.entries)
         self._changed[at] = self.entries[at]
-        return count
+        return self.count
 
     def get_state(self) -> tuple[list[bytes], int]:
         return self.entries, self.count

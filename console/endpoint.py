@@ -48,10 +48,9 @@ LINGER = 1.0
 """Seconds that a client gets to take the reason why its connection ends."""
 LONGEST = 3600.0
 """Seconds that one request may take."""
-OPERATIONS = frozenset({"add", "remove", "move", "reorder", "strategy", "intensity", "isolation"}) | frozenset(
-    {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code", "stop", "start"}
-)
-OPERATIONS |= {"attach", "detach", "compose", "transition", "update"}
+_TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
+_LIVING = {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
+OPERATIONS = frozenset(_TREE | _LIVING | {"attach", "detach", "compose", "transition", "update"})
 NAMED = {"compose": ("outside",), "update": ("mechanism", "role")}
 """What comes last is named."""
 

@@ -163,6 +163,7 @@ class Shadow(Server):
         """Run requests from a state."""
         self._why, self.objections, self.released = "", {}, {}
         self.heard = {(one.turn, one.k): one for one in heard}
+        ends, state = list[TurnEnd](), None
         try:
             async with asyncio.timeout(self._within):
                 ends, state = await self._run(before, requests)

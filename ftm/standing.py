@@ -40,7 +40,10 @@ class Standing:
         self.peer: str | None = None  # the path of the other replica
         self.peer_state: PeerState = "none"
         self.peer_turn = -2  # the last turn whose state it has acknowledged, -2 if that is not known
-        self.kept = (-1, -1)  # epoch and turn of the state that was last computed here for the one that leads
+        self.kept: tuple[int, int] = (
+            -1,
+            -1,
+        )  # epoch and turn of what was last computed here for the leader
         self.leading = -1  # the epoch in which it has begun to lead
         self.computes = False  # whether the protected actor lives here
         self.is_ready = False  # whether it has the state of the one that leads

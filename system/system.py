@@ -51,7 +51,7 @@ A = TypeVar("A", bound=Actor)
 ENTRY = f"{__package__}.guest_main:main"
 BASE = (f"{__package__}.guest_main",)
 
-REPLICA = f"{__package__.rpartition('.')[0]}.ftm.replica"
+REPLICA = f"{__name__.rpartition('.')[0].rpartition('.')[0]}.ftm.replica"
 """What the processes of replicas import beforehand."""
 ADMIN_TIMEOUT = 60.0
 """Seconds an admin call of the system may take: starting a child can mean restoring a large state."""

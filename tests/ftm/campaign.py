@@ -14,7 +14,7 @@ import os
 import random
 import signal
 import tempfile
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncGenerator, Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -190,7 +190,7 @@ class Trial:
 
 
 @contextlib.contextmanager
-def injecting(detection: Detection = QUICK) -> Iterator[Page]:
+def injecting(detection: Detection = QUICK) -> Generator[Page, None, None]:
     """Replicas that start in this block are struck by what is armed in the page."""
     with tempfile.TemporaryDirectory() as folder:
         page = Page.new(Path(folder) / "page")
@@ -205,7 +205,7 @@ def injecting(detection: Detection = QUICK) -> Iterator[Page]:
 
 
 @contextlib.contextmanager
-def detecting(detection: Detection) -> Iterator[None]:
+def detecting(detection: Detection) -> Generator[None, None, None]:
     """Groups that start in this block watch their replicas so."""
     known: Any = host
     before, known.Detection = known.Detection, lambda: detection
@@ -216,7 +216,7 @@ def detecting(detection: Detection) -> Iterator[None]:
 
 
 @contextlib.asynccontextmanager
-async def running() -> AsyncIterator[hf.ActorSystem]:
+async def running() -> AsyncGenerator[hf.ActorSystem, None]:
     async with hf.ActorSystem("app", log=False, intensity=100_000) as system:
         yield system
 

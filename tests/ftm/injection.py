@@ -34,8 +34,14 @@ from holdfast.ftm.replica import Heart, Replica
 from holdfast.ftm.state import StateManager
 
 ARMED, FIRED, PID, LENGTH, BODY, SIZE = 0, 1, 4, 8, 16, 4096
-SLOTS = {StateManager: "state", Heart: "beat", Proxy: "proxy", Detector: "detector", FailoverManager: "failover"}
-SLOTS[Joiner] = "join"
+SLOTS: dict[type[Any], str] = {
+    StateManager: "state",
+    Heart: "beat",
+    Proxy: "proxy",
+    Detector: "detector",
+    FailoverManager: "failover",
+    Joiner: "join",
+}
 DELAY = 0.03  # seconds of a message that is late
 
 

@@ -55,7 +55,7 @@ class Slow(Counter):
         self.file = file
 
     @hf.on(Total)
-    async def read(self, message: Total) -> int:
+    async def read(self, message: Total) -> int:  # type: ignore[override]  # pyright: ignore[reportIncompatibleMethodOverride]
         while os.path.exists(self.file):
             await asyncio.sleep(0.005)
         return self.total

@@ -120,7 +120,8 @@ async def test_a_duplicate_is_answered_from_the_log_also_by_the_next_primary(sys
 async def test_what_was_acknowledged_but_not_heard_of_is_not_done_twice(system: hf.ActorSystem) -> None:
     """The primary dies between the acknowledgement of the backup and its reply (A52, A53)."""
     driver = await pair(system)
-    real, heard = driver.take, []
+    heard: list[Any] = []
+    real = driver.take
     driver.take = heard.append  # type: ignore[method-assign,assignment]  # the replies are lost on their way
     keys = driver.send(Add(1), Add(2))
     async with asyncio.timeout(5):

@@ -76,14 +76,14 @@ def test_what_cannot_work_is_refused_with_the_reason() -> None:
     with pytest.raises(MechanismRefused, match="state_access = False"):
         RB(**good).check(Closed)
     with pytest.raises(MechanismRefused, match=r"no handler for .*Add"):
-        RB(**{**good, "alternates": versions.Deaf}).check(Total)
+        RB(**dict(good, alternates=versions.Deaf)).check(Total)
     with pytest.raises(MechanismRefused, match="cannot be imported"):
-        RB(**{**good, "alternates": "tests.ftm.versions:Nobody"}).check(Total)
+        RB(**dict(good, alternates="tests.ftm.versions:Nobody")).check(Total)
     with pytest.raises(MechanismRefused, match="it may take reply, message and state"):
-        RB(**{**good, "test": versions.odd_name}).check(Total)
+        RB(**dict(good, test=versions.odd_name)).check(Total)
     with pytest.raises(ValueError, match="at least one"):
         RB(alternates=(versions.Second,))
     with pytest.raises(ValueError, match="define it in a module"):
-        RB(**{**good, "test": lambda reply: True})
+        RB(**dict(good, test=lambda reply: True))
     assert revive(RB(**good).describe()) == RB(**good)
     assert find("rb") is RB

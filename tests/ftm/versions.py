@@ -101,7 +101,7 @@ class Curious(Total):
     """Asks what the others do not ask."""
 
     @hf.on(Add)
-    async def add(self, message: Add) -> int:
+    async def add(self, message: Add) -> int:  # type: ignore[override]  # pyright: ignore[reportIncompatibleMethodOverride]
         self.seen.append(message.n)
         if message.n == 13:
             await self.other.ask(Add(1))
