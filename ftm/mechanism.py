@@ -125,6 +125,11 @@ class Mechanism:
         names = list(self.roles) or ["single"]
         return names[0] if leads else names[-1]
 
+    @property
+    def secures(self) -> bool:
+        """Whether it secures the links, and so stands around the protocol instead of behind it."""
+        return type(self).open_link is not Mechanism.open_link
+
     def open_link(
         self,
         node: Node,

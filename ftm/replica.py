@@ -122,7 +122,7 @@ def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
             raise MechanismRefused(one.name, "it stands in the composition twice")
         if index:
             places[f"{one.name}.protocol"] = Place(InnerProtocol, None, f"{prefix}protocol")
-            if one.layer == "link":
+            if one.secures:
                 raise MechanismRefused(one.name, "it secures the links: it stands outermost, and once")
         for part, kind in PARTS.items():
             check_brick(one, part, getattr(role, part) or kind)
@@ -372,7 +372,7 @@ class Replica(Supervisor):
         state, server = self._cell(STATE), self._cell(SERVER)
         cell = {slot: self._cell(name) for slot, name in names.items()}
         # A mechanism that secures the links stands around the protocol, all others stand behind it.
-        is_secured = bool(layers) and layers[0].layer == "link"
+        is_secured = bool(layers) and layers[0].secures
         gate = cell[f"{layers[0].name}.before"]
         outlet = cell[f"{layers[0].name}.after"] if is_secured else proxy
         entries = [cell[PROTOCOL if index == 0 else f"{one.name}.protocol"] for index, one in enumerate(layers)]

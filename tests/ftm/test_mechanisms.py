@@ -15,10 +15,19 @@ from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.replica import Abort, Commit, Prepare, weave
+from tests.ftm import versions
 from tests.ftm.driver import Driver
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Total, pair
 
 FILE = Path(__file__).parent / "masked_sum.py"
+
+
+SETTINGS: dict[str, dict[str, Any]] = {  # of those that do not go without
+    "ad": {"assertions": (versions.is_positive,)},
+    "rb": {"alternates": (versions.Second,), "test": (versions.is_positive,)},
+    "nvp": {"versions": (versions.Second, versions.Third)},
+    "sec": {"authority": "/app/authority"},
+}
 
 
 def own_copy(folder: Path, text: str | None = None) -> Path:
@@ -33,7 +42,7 @@ def test_built_in_ones_are_found_by_name_and_travel(name: str) -> None:
     kind = find(name)
     assert kind.name == name
     assert kind.__doc__
-    made = kind()
+    made = kind(**SETTINGS.get(name, {}))
     assert revive(made.describe()) == made
 
 
