@@ -220,9 +220,7 @@ class Brick(Letters):
             return await self._take_sealed(standing.link, b"".join(sheets) if sheets else letter.body)
         if letter.name == SEALED:
             raise Refused(path=standing.path, reason="closed")
-        standing.check(letter.epoch, letter.config)
-        if letter.epoch > standing.epoch:
-            raise NotFollowing(standing.path, standing.epoch, letter.epoch)
+        self._check_sender(letter.epoch, letter.config)
         kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
         if kind is None:
             raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")

@@ -30,6 +30,7 @@ class Compute(Message[Computed]):
     """Compute these requests, from `state`, or from the one that is here if `base` is its digest.
 
     `keep`: the state that they lead to is the one to begin from next time, and to lead with; else it is sent back.
+    `log`: the reply log that goes with `state`, if that is kept.
     """
 
     turn: int
@@ -86,13 +87,14 @@ class Helping(Remembering):
             before = msgspec.structs.replace(before, live=order.live)
         if self._shadow is None:
             self._shadow = Shadow(self._standing, None)
+        epoch = self._standing.epoch
         run = await self._shadow.run(before, order.requests, order.heard)
         if isinstance(run, Missing) or run.state is None:
             return Computed([], [], None, b"", [], run.why if isinstance(run, Missing) else "no state")
         digest = b""
         if order.keep:
             digest = digest_of_state(run.state)
-            self._keep(order, run, digest)
+            self._keep(order, run, digest, epoch)
         return Computed(run.ends, run.released, None if order.keep else run.state, digest, run.objections)
 
     def _base(self, order: Compute) -> State | None:
@@ -105,7 +107,7 @@ class Helping(Remembering):
             self._digest, self._kept = digest_of_state(point), point
         return point if self._digest == order.base else None
 
-    def _keep(self, order: Compute, run: Run, digest: bytes) -> None:
+    def _keep(self, order: Compute, run: Run, digest: bytes, epoch: int) -> None:
         standing = self._standing
         if standing.leads or standing.server.life is not None:
             return
@@ -114,5 +116,7 @@ class Helping(Remembering):
         self._digest, self._kept = digest, run.state
         clients = {one.feed.id: (one.client, one.incarnation) for one in order.requests}
         entries: list[Logged] = [(*clients.get(end.id, ("", 0)), end.id, end) for end in run.ends]
-        standing.log.add([*order.log, *entries])
-        standing.kept = standing.epoch, run.state.turn
+        if order.state is not None:  # What is here may not be what has led to that.
+            standing.log.replace(order.log)
+        standing.log.add(entries)
+        standing.kept = epoch, run.state.turn  # It may have been told meanwhile that another one leads.

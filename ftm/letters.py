@@ -50,6 +50,8 @@ class Letters(Actor):
     """What `from_peer` understands."""
     answers_later: ClassVar[bool] = False
     """Whether other messages are handled while `from_peer` waits for something."""
+    follows_at_once: ClassVar[bool] = False
+    """Whether a follower takes what the next leader says before it is told of it: it says itself what it builds on."""
 
     slot: str
     _standing: Standing
@@ -58,6 +60,20 @@ class Letters(Actor):
     async def from_peer(self, message: Message[Any]) -> Any:
         """Take what the same brick of the other replica says."""
         raise NotImplementedError
+
+    def _check_sender(self, epoch: int, config: int) -> None:
+        """Refuse what an earlier leader says, and, as a rule, what one says of whom we were not told.
+
+        Raises:
+            StaleEpoch, ConfigMismatch, NotFollowing.
+        """
+        standing = self._standing
+        standing.check(epoch, config)
+        if epoch > standing.epoch:
+            follows = standing.epoch >= 0 and not standing.leads and not standing.is_fenced
+            if not (follows and self.follows_at_once):
+                raise NotFollowing(standing.path, standing.epoch, epoch)
+            standing.epoch = epoch
 
     async def _ask_sealed(
         self,
@@ -127,11 +143,9 @@ class Letters(Actor):
 
     async def _read(self, call: Call) -> Back:
         """What was in a sealed letter."""
-        standing, codec = self._standing, self._standing.node.codec
+        codec = self._standing.node.codec
         try:
-            standing.check(call.epoch, call.config)
-            if call.epoch > standing.epoch:
-                raise NotFollowing(standing.path, standing.epoch, call.epoch)
+            self._check_sender(call.epoch, call.config)
             kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
             if kind is None or call.stream != self.slot:
                 raise Refused(path=self.ctx.path, reason="malformed")

@@ -41,6 +41,8 @@ class OutvotedHere(HoldfastError):
 class Computing(Helping):
     """Before of all three: computes for the one that leads."""
 
+    follows_at_once = True  # An order says which state it begins from: nobody is left out until it is told to follow.
+
     def settled(self, message: Settled) -> None:
         """Outvoted: end, begin again, and join."""
         if not message.right and not self.leads:
@@ -95,7 +97,8 @@ class Voting(Deciding):
         """The others begin with the state after `on_start`."""
         standing = self._standing
         point = standing.server.capture()
-        order = Compute(point.turn, b"", point, [], [], True, point.live, standing.entries(done.ends))
+        log = [*standing.log.entries(), *standing.entries(done.ends)]
+        order = Compute(point.turn, b"", point, [], [], True, point.live, log)
         await asyncio.gather(*(self._at(path, point, order) for path in self._others()))
 
     def _digest_of(self, state: State) -> bytes:
@@ -113,7 +116,7 @@ class Voting(Deciding):
             try:
                 done = await self.ask_at(path, "tmr.before", order)
                 if done.problem == NEEDS_STATE:
-                    whole = msgspec.structs.replace(order, state=before)
+                    whole = msgspec.structs.replace(order, state=before, log=self._standing.log.entries())
                     done = await self.ask_at(path, "tmr.before", whole)
             except StaleEpoch:
                 raise
