@@ -57,6 +57,7 @@ class Node(RunLoop):
         self.root: Cell | None = None
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
         self.here: Host = LOCAL  # lives in this very process
+        self.awaited: dict[str, list[Callable[[], None]]] = {}  # what is done when somebody comes to live at a path
         self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
         self.keeper: Keeper = NothingKept()
         self.complete: Callable[[Any, str], Any] = lambda spec, path: spec  # what else is known of a child spec
@@ -126,6 +127,9 @@ class Node(RunLoop):
             elif name in parent.children:
                 raise NameTaken(f"{parent.path}/{name}")
             parent.children[name] = cell
+        if self.awaited:
+            for come in self.awaited.pop(cell.path, ()):
+                self.loop.call_soon(come)  # It is not started yet.
         return cell
 
     def spawn(

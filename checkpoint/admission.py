@@ -104,10 +104,14 @@ def taken_up(home: Switch, item: Item) -> tuple[str, str, bytes] | None:
     """
     if isinstance(item, links.Exit):
         data: dict[str, Any] = {"source": item.source.path, "reason": pack_exit(item.reason)}
+        home.ties.over("link", item.source.path)
         return EXIT, "", msgspec.msgpack.encode(data)
     if not isinstance(item, links.Down):
         raise HoldfastError(f"{type(item).__name__} cannot be journaled for {home.path}")
     if not item.watch.active:
         return None
-    data = {"source": item.watch.target.path, "reason": pack_exit(item.reason), "recovering": item.recovering}
+    verb, target = "watch" if item.watch.for_good else "monitor", item.watch.target.path
+    data = {"source": target, "reason": pack_exit(item.reason), "recovering": item.recovering, "verb": verb}
+    if not item.recovering:
+        home.ties.over(verb, target)
     return DOWN, "", msgspec.msgpack.encode(data)

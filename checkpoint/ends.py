@@ -104,6 +104,7 @@ class Ends:
         home.calls.abandon()
         self.drop_all(why)
         home.timers.replace({})
+        home.ties.replace([])
         home.images.close()
         home.cell = None
 

@@ -183,6 +183,7 @@ def _image(home: Switch) -> Image:
         blocks=[],
         earlier=[],
         owed=owed(home),
+        ties=home.ties.saved(),
     )
     inputs = {turn.input.id: turn.input for turn in home.turns.values()} | home.open
     entries: list[Entry] = [_in(inputs[key]) for key in sorted(inputs)]

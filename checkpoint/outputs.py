@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
-from ..actors import links
 from ..actors.cell import GONE, Cell
 from ..actors.codec import Parcel
 from ..actors.errors import AskDeadlock, HoldfastError, MailboxFull
@@ -14,6 +13,7 @@ from .asks import SwitchAsk, answer_ask, origin_of
 from .inputs import Batch
 from .records import MESSAGE, Answer, Out
 from .recovery.held import Inlet, inlet
+from .ties import connect
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -64,7 +64,10 @@ class Outputs:
                 self._keep(turn, out, batch)
                 batch.after.append(lambda: self._subscribe(out))
             case "monitor" | "watch" | "demonitor" | "unwatch" | "link" | "unlink":
-                batch.after.append(lambda: self._connect(out))
+                home.ties.turn(out.verb, out.to)
+                if home.journal.durable:
+                    batch.add(home.path, ("tie", turn, out.verb, out.to), home.positions_of(turn))
+                batch.after.append(lambda: connect(cell, node.cell_at(out.to), out.verb))
             case "pipe":
                 pass
             case verb:
@@ -218,20 +221,6 @@ class Outputs:
                 ask.fail(error)
 
         batch.after.append(send)
-
-    def _connect(self, out: Out) -> None:
-        home = self._home
-        cell, target = home.cell, home.node.cell_at(out.to)
-        assert cell is not None
-        match out.verb:
-            case "monitor" | "watch":
-                links.monitor(cell, target, for_good=out.verb == "watch")
-            case "demonitor" | "unwatch":
-                links.demonitor(cell, target, for_good=out.verb == "unwatch")
-            case "link":
-                links.link(cell, target)
-            case _:
-                links.unlink(cell, target)
 
     def _subscribe(self, out: Out) -> None:
         """Subscriptions belong to the address and outlive its lives."""

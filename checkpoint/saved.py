@@ -13,8 +13,9 @@ from .compression import PLAIN, compressor, decompress
 from .inputs import OVERHEAD, Input, Turn
 from .journal import DamagedStore, Entry
 from .journal import Saved as Journaled
-from .records import PIPE, STASHED, TICK, Answer, Snapshot
+from .records import DOWN, EXIT, PIPE, STASHED, TICK, Answer, Snapshot
 from .segments import Place
+from .ties import Tie
 from .timers import Saved
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     length: int = 0
     time: float = 0.0
     owed: dict[int, tuple[str, str]] = {}
+    ties: list[Tie] = []
 
     @property
     def has_state(self) -> bool:
@@ -91,7 +93,20 @@ def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> M
     """A snapshot of the state after `turn`, with what the home knows at this moment."""
     timers, topics = outlasting(home)
     epoch, now = home.journal.epoch, home.node.wall()
-    return Meta(FORMAT, turn, home.next_id, stash, timers, topics, epoch, state, turn, time=now, owed=owed(home))
+    return Meta(
+        FORMAT,
+        turn,
+        home.next_id,
+        stash,
+        timers,
+        topics,
+        epoch,
+        state,
+        turn,
+        time=now,
+        owed=owed(home),
+        ties=home.ties.saved(),
+    )
 
 
 def cut(home: Switch, state: bytes, record: Snapshot) -> None:
@@ -182,12 +197,14 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
         meta = home.newest = newest
         home.turn, home.next_id, home.stash = meta.turn, meta.next_id, meta.stash
         home.topics, home.owed = dict.fromkeys(meta.topics), dict(meta.owed)
+        home.ties.replace(meta.ties)
         timers = {
             key: (name, body, left - elapsed(home, meta.time), interval)
             for key, (name, body, left, interval) in meta.timers.items()
         }
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
+    home.ties.loaded()
     for source in home.open.values():
         home.bytes += len(source.body) + OVERHEAD
     for turn in home.turns.values():
@@ -241,6 +258,10 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             home.next_id = max(home.next_id, key + 1)
             if kind == TICK and origin in timers and not timers[origin][3]:
                 del timers[origin]
+            if kind in (EXIT, DOWN):
+                told = msgspec.msgpack.decode(body)
+                if not told.get("recovering"):
+                    home.ties.over(told.get("verb", "link"), told["source"])
             if kind == PIPE:
                 turn, k = map(int, origin.split("."))
                 home.pipes_done.setdefault(turn, set()).add(k)
@@ -263,6 +284,9 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
         case ("drop", key):
             dropped = home.open.pop(key, None)
             home.dropped += ([] if dropped is None else dropped.positions, [position])
+        case ("tie", turn, verb, path):
+            home.positions_of(turn).append(position)
+            home.ties.turn(verb, path)
         case ("later", turn, key):
             home.positions_of(turn).append(position)
             source = home.turns[turn].input

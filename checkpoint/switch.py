@@ -63,6 +63,7 @@ from .recovery.held import Holding, Inlet, let_go
 from .replay import Replay
 from .saved import Meta, load
 from .skipping import Skipping
+from .ties import Ties
 from .timers import Timers
 
 if TYPE_CHECKING:
@@ -88,6 +89,7 @@ class Switch:
         self.owed: dict[int, tuple[str, str]] = {}  # as read back: asker and origin of what was to be answered later
         self.timers = Timers(self)
         self.outputs = Outputs(self)
+        self.ties = Ties(self)
         self.ends = Ends(self)
         self.limit = Limit(self)
         self.bound: HomeBound | Holding | None = None
@@ -110,17 +112,14 @@ class Switch:
         self.live_at = 0.0
         self.is_released = False
         self.kept_back = False  # it is live, but waits for the others of its group
-        self.replayed = 0
+        self.replayed = self.next_id = self.bytes = 0
         self.diverged: ReplayDiverged | None = None
         self.is_void = False  # a state that was put in place from outside could not be kept: this life does not count
         self.unsaved: list[str] = []  # why, for each of those
-        self.next_id = 0
-        self.bytes = 0
         self.arrival = Arrival(self)
         self.positions: dict[int, list[int]] = {}  # in the journal, of what belongs to a turn besides its input
         self.dropped: list[list[int]] = []  # the same of inputs that ended without a turn
-        self._replay_k = 0
-        self._replay_turn = -1
+        self._replay_k, self._replay_turn = 0, -1
         load(self, saved)
 
     def use(self, method: Method) -> None:
@@ -326,6 +325,7 @@ class Switch:
         if self.bound is not None:
             self.bound.refill()
         self.due.on_want(self)
+        self.ties.tie()
         if holding is not None:
             holding.let_in()
 

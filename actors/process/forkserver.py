@@ -39,7 +39,7 @@ class ForkServer:
         preload: names or paths of modules to import before the first fork.
         on_exit: called with (pid, wait status as from `waitpid`) when a child that `fork` has returned is dead and
             reaped, and its descendants are killed. Not called for children that end with the server.
-        on_lost: called when the server has died without `stop`; its children are being killed by the kernel.
+        on_lost: called when the server has died without `stop`; its children are being killed.
         fork_seconds: time limit of `fork`.
     """
 
@@ -70,7 +70,7 @@ class ForkServer:
         self._last_number = 0
         self._requests: dict[int, ForkRequest] = {}  # by number, unanswered
         self._unclaimed: dict[int, ForkRequest] = {}  # by pid, answered, `fork` has not resumed yet
-        self._children: set[int] = set()  # pids that `fork` has returned
+        self._children: dict[int, Forked] = {}  # by pid, what `fork` has returned
 
     @property
     def pid(self) -> int:
@@ -164,6 +164,10 @@ class ForkServer:
         self._process.poll()  # reaps exactly this process; somebody else's waitpid(-1) may have been first
         self._close_control()
         self._ended.set()
+        # The kernel kills the children, except one that was stopped before it could ask for that.
+        for child in self._children.values():
+            child.kill()
+        self._children.clear()
         was_ready = self._ready.done() and not self._ready.cancelled() and self._ready.exception() is None
         self._fail_all(f"the fork server (pid {self._process.pid}) has died ({_cause(self._process.returncode)})")
         if was_ready and not self._stopping:
@@ -181,7 +185,6 @@ class ForkServer:
         """Nothing will be answered any more. Requests close their descriptors when `fork` resumes."""
         self._outbox.clear()
         self._loading = 0
-        self._children.clear()
         waiting = [request.outcome for request in self._requests.values()]
         if self._process is not None:
             waiting.append(self._ready)  # type: ignore[arg-type]
@@ -216,8 +219,10 @@ class ForkServer:
         try:
             self._post(request)
             pid = await request.outcome
-            self._children.add(pid)
-            return request.hand_over()
+            child = self._children[pid] = request.hand_over()
+            if self._ended.is_set():
+                child.kill()
+            return child
         finally:
             self._requests.pop(request.number, None)
             self._claim(request)
@@ -345,7 +350,7 @@ class ForkServer:
 
     def _report(self, pid: int, status: int) -> None:
         if pid in self._children:
-            self._children.remove(pid)
+            del self._children[pid]
             self._on_exit(pid, status)
 
 

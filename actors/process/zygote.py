@@ -6,7 +6,8 @@ What it promises
     * A child is reported with a pidfd that was opened before it could be reaped: a pid never means somebody else.
     * The descendants of an actor process die with it, those that called `setsid` too: the server is their subreaper.
     * When the parent ends, all children and descendants are killed and reaped, then the server ends.
-    * When the server is killed, the kernel kills the children (PDEATHSIG); their descendants are then known to nobody.
+    * When the server is killed, the kernel kills the children (PDEATHSIG), and the parent one that was stopped before
+      it could ask for that; their descendants are then known to nobody.
 
 A child pays for each page it writes to until its actor runs, some 5 us apiece: what can be done before the fork is.
 """

@@ -285,10 +285,13 @@ async def test_a_daemon_without_exec_dies_too() -> None:
 
 
 async def test_death_of_the_server_kills_all_children() -> None:
+    """Also one that was stopped in its very first steps, before it could ask the kernel to end it with the server."""
     fixture = Fixture()
     await fixture.server.start()
-    children = [await fixture.server.fork() for _ in range(5)]
-    os.kill(children[0].pid, signal.SIGSTOP)
+    children = []
+    for _ in range(5):
+        children.append(await fixture.server.fork())
+        os.kill(children[-1].pid, signal.SIGSTOP)
     pidfds = [os.dup(child.pidfd) for child in children]
     os.kill(fixture.server.pid, signal.SIGKILL)
     await fixture.lost.wait()

@@ -1,0 +1,215 @@
+"""The board's TCP server: some clients at a time, each bounded in all it may send, hold and leave unread."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from typing import Protocol
+
+from .frames import (
+    Answer,
+    AskMeasurements,
+    AskSpecification,
+    BadFrame,
+    Broadcast,
+    Decoder,
+    Done,
+    Frame,
+    Measurements,
+    Refused,
+    SetDefaults,
+    Specification,
+    Switch,
+    encode,
+)
+
+MOST_CLIENTS = 8
+"""Connections at a time; further ones are told so and closed."""
+IDLE = 3600.0
+"""Seconds a client may say nothing."""
+PATIENCE = 5.0
+"""Seconds that a frame may take once it has begun, either way."""
+MOST_UNREAD = 64 * 1024
+"""Bytes that a client may leave unread before it is told no more broadcasts."""
+PIECE = 4096
+
+
+class Device(Protocol):
+    """What the server is in front of. Its channels are those that frames allow."""
+
+    def specification(self) -> Specification:
+        """What it is."""
+        ...
+
+    def measure(self) -> Measurements:
+        """What it measures now, in numbers that a frame can hold."""
+        ...
+
+    def switch(self, channel: int, on: bool) -> None:
+        """Switch a channel; to do it twice is to do it once."""
+        ...
+
+    def set_defaults(self, channels: frozenset[int]) -> None:
+        """Which channels are on after its own power-up."""
+        ...
+
+
+class BoardServer:
+    """Serves a device.
+
+    Attributes:
+        delay: seconds by which each answer comes later than it could.
+        is_mute: no answer comes, and no broadcast.
+        is_deaf: new connections are closed at once.
+    """
+
+    def __init__(self, device: Device, host: str = "127.0.0.1", port: int = 0) -> None:
+        self._device, self._host, self._port = device, host, port
+        self._server: asyncio.Server | None = None
+        self._clients: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
+        self.delay = 0.0
+        self.is_mute = self.is_deaf = False
+
+    @property
+    def url(self) -> str:
+        """Where it listens, for `Board`."""
+        return f"tcp://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}"
+
+    async def start(self) -> None:
+        """Listen. Raises OSError: the address cannot be had."""
+        self._server = await asyncio.start_server(self._serve, self._host, self._port, limit=PIECE)
+        self._port = self._server.sockets[0].getsockname()[1]
+
+    def abort(self) -> None:
+        """End at once, without waiting for anybody."""
+        if self._server is not None:
+            self._server.close()
+        self.drop()
+
+    async def close(self) -> None:
+        """End, and wait until all connections have ended."""
+        self.abort()
+        while self._clients:
+            await asyncio.wait(list(self._clients))
+        if self._server is not None:
+            await self._server.wait_closed()
+
+    def drop(self) -> None:
+        """Cut all connections as if the cable were pulled: what is under way is lost."""
+        for task, writer in self._clients.items():
+            writer.transport.abort()
+            task.cancel()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        if self.is_deaf:
+            writer.transport.abort()
+            return
+        self._clients[task] = writer
+        client = _Client(self, self._device, reader, writer)
+        try:
+            if len(self._clients) > MOST_CLIENTS:
+                await client.send(0, Refused(f"there are {MOST_CLIENTS} connections already"))
+            else:
+                await client.run()
+        except (OSError, TimeoutError):
+            pass  # It has gone, or says nothing, or does not listen: its connection ends, and that is all.
+        except asyncio.CancelledError:
+            pass  # We drop it: this task is its own, and nobody waits for its outcome.
+        finally:
+            del self._clients[task]
+            writer.close()
+
+
+class _Client:
+    """One connection."""
+
+    def __init__(
+        self, server: BoardServer, device: Device, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
+    ) -> None:
+        self._server, self._device, self._reader, self._writer = server, device, reader, writer
+        self._broadcasts: asyncio.Task[None] | None = None
+
+    async def run(self) -> None:
+        """From its first frame to its end."""
+        decoder, clock = Decoder(), asyncio.get_running_loop().time
+        ends = clock() + IDLE
+        try:
+            while True:
+                async with asyncio.timeout_at(ends):
+                    data = await self._reader.read(PIECE)
+                if not data:
+                    return
+                was_inside = decoder.is_inside
+                decoder.feed(data)
+                while (answered := await self._next(decoder)) is not None:
+                    if not answered:
+                        return
+                    was_inside = False
+                if not was_inside:  # A frame that comes byte by byte gets no more time with each.
+                    ends = clock() + (PATIENCE if decoder.is_inside else IDLE)
+        finally:
+            await self._stop_broadcasts()
+
+    async def _next(self, decoder: Decoder) -> bool | None:
+        """Answer the next frame. None: there is none yet; False: the connection must end."""
+        try:
+            taken = decoder.take()
+            if taken is None:
+                return None
+            sequence, frame = taken
+            answer = await self._answer(frame)
+        except BadFrame as error:
+            await self._reply(error.sequence, Refused(error.why))
+            return not error.is_fatal
+        await self._reply(sequence, answer)
+        return True
+
+    async def _answer(self, frame: Frame) -> Answer:
+        match frame:
+            case AskSpecification():
+                return self._device.specification()
+            case AskMeasurements():
+                return self._device.measure()
+            case Switch(channel, on):
+                self._device.switch(channel, on)
+                return Done()
+            case SetDefaults(channels):
+                self._device.set_defaults(channels)
+                return Done()
+            case Broadcast(milliseconds):
+                await self._stop_broadcasts()
+                if milliseconds:
+                    self._broadcasts = asyncio.create_task(self._broadcast(milliseconds / 1000))
+                return Done()
+            case _:
+                return Refused(f"{type(frame).__name__} is for a board to say")
+
+    async def _reply(self, sequence: int, answer: Answer) -> None:
+        if self._server.delay:
+            await asyncio.sleep(self._server.delay)
+        await self.send(sequence, answer)
+
+    async def send(self, sequence: int, frame: Frame) -> None:
+        """Send, and wait until the client takes it. Raises TimeoutError, OSError."""
+        if self._server.is_mute:
+            return
+        if self._writer.transport.is_closing():
+            raise ConnectionResetError("the client has gone")
+        self._writer.write(encode(sequence, frame))
+        async with asyncio.timeout(PATIENCE):
+            await self._writer.drain()
+
+    async def _broadcast(self, interval: float) -> None:
+        with contextlib.suppress(OSError, TimeoutError):  # The reader's side ends the connection.
+            while True:
+                if self._writer.transport.get_write_buffer_size() <= MOST_UNREAD:
+                    await self.send(0, self._device.measure())
+                await asyncio.sleep(interval)
+
+    async def _stop_broadcasts(self) -> None:
+        if self._broadcasts is not None:
+            self._broadcasts.cancel()
+            await asyncio.wait((self._broadcasts,))
+            self._broadcasts = None

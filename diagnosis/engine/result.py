@@ -1,0 +1,104 @@
+"""What a diagnosis says: messages for `/diagnosis`, and the same for ROS diagnostics."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any, TypeAlias
+
+from ...actors.message import Message
+from ..literals import Literal
+from ..observations import Contradiction
+
+Plain: TypeAlias = dict[str, Any]
+"""A message of another system, as plain data."""
+
+
+class State(enum.Enum):
+    """How the system looks."""
+
+    HEALTHY = "healthy"
+    FAULTY = "faulty"
+    CONTRADICTORY = "contradictory"
+    """The observations cannot all be true: there is no diagnosis, and no repair may start."""
+    BLIND = "blind"
+    """Nothing is observed: nothing is known, and no repair may start."""
+
+
+class Candidate(Message):
+    """One minimal diagnosis: what is faulty. Everything else works (`Diagnosis.good`)."""
+
+    bad: tuple[str, ...]
+    probability: float = 1.0
+    """Among the candidates that are listed, by the priors alone."""
+
+
+class Diagnosis(Message):
+    """All minimal diagnoses within the limits, best first; what observers and repair act on."""
+
+    state: State
+    components: tuple[str, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
+    symptoms: tuple[Literal, ...] = ()
+    """Literals that contradict "all components work"."""
+    contradictions: tuple[Contradiction, ...] = ()
+    found: int = 0
+    """Minimal diagnoses that were found; `candidates` may hold fewer."""
+    truncated: tuple[str, ...] = ()
+    """"count" and "time": what kept further ones from being listed; empty if these are all."""
+    version: int = 1
+    """Of the model."""
+    seconds: float = 0.0
+
+    @property
+    def is_complete(self) -> bool:
+        """No minimal diagnosis is missing."""
+        return not self.truncated and self.state in (State.HEALTHY, State.FAULTY)
+
+    @property
+    def suspects(self) -> tuple[str, ...]:
+        """Every component that is faulty in a candidate, those of better candidates first."""
+        return tuple(dict.fromkeys(name for candidate in self.candidates for name in candidate.bad))
+
+    @property
+    def certain(self) -> tuple[str, ...]:
+        """The components that are faulty in each candidate; nothing is certain while candidates may be missing."""
+        if not self.is_complete or not self.candidates:
+            return ()
+        shared = set.intersection(*(set(candidate.bad) for candidate in self.candidates))
+        return tuple(name for name in self.components if name in shared)
+
+    def good(self, candidate: Candidate) -> tuple[str, ...]:
+        """What works if `candidate` is right: good and bad together are all components (D32)."""
+        bad = set(candidate.bad)
+        return tuple(name for name in self.components if name not in bad)
+
+    def sets(self) -> list[Plain]:
+        """Each candidate as its set of bad and its set of good components, in plain data."""
+        return [{"bad": list(one.bad), "good": list(self.good(one))} for one in self.candidates]
+
+    def ros(self, stamp: float) -> Plain:
+        """As a `diagnostic_msgs/DiagnosticArray`: error if surely faulty, warning if perhaps, stale if unknown (D33).
+
+        Args:
+            stamp: seconds since 1970.
+        """
+        certain, suspects = set(self.certain), set(self.suspects)
+        is_known = self.state in (State.HEALTHY, State.FAULTY)
+        nanoseconds = round(stamp * 1e9)
+        return {
+            "header": {"stamp": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9}, "frame_id": ""},
+            "status": [self._status(name, is_known, name in certain, name in suspects) for name in self.components],
+        }
+
+    def _status(self, name: str, is_known: bool, is_certain: bool, is_suspect: bool) -> Plain:
+        if not is_known:
+            level, message = 3, f"unknown: the observations are {self.state.value}"
+        elif is_certain:
+            level, message = 2, "faulty"
+        elif is_suspect:
+            level, message = 1, "perhaps faulty"
+        else:
+            level, message = 0, "works"
+        chance = sum(one.probability for one in self.candidates if name in one.bad) if is_suspect else 0.0
+        values = [{"key": "probability", "value": f"{chance:.3f}"}] if is_suspect else []
+        return {"level": level, "name": name, "message": message, "hardware_id": name, "values": values}

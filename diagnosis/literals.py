@@ -1,0 +1,172 @@
+"""Literals: what can be said about a system, and which words exist to say it.
+
+A literal is `ok(/odom)` or `not ok(/odom)`, in the spelling of the paper (Zaman et al. 2013). It is a typed value, not
+a string: a negation spelled in another way would silently be another proposition. So what cannot be read, and every
+name that the model does not declare, is an error (T53).
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Iterable, Iterator
+from typing import Final
+
+import msgspec
+
+from ..actors.errors import HoldfastError
+
+ARITIES: Final = {"ok": 1, "running": 1, "on": 1, "matched": 2, "inc": 1, "dec": 1, "const": 1}
+"""The paper's predicates, with their numbers of arguments."""
+
+TRENDS: Final = ("inc", "dec", "const")
+"""Of one value at most one of these holds at a time."""
+
+SYMMETRIC: Final = frozenset({"matched"})
+"""Predicates whose arguments can be exchanged."""
+
+_FORM: Final = re.compile(r"\s*(?:(not)\s+|(¬)\s*)?([A-Za-z_]\w*)\s*\(([^()]*)\)\s*\Z")
+_ARGUMENT: Final = re.compile(r"[^\s(),]+\Z")
+_OTHER_NEGATION: Final = re.compile(r"\s*(?:!|~|-|not_|no_|NOT)\s*\(?[A-Za-z_]")
+
+
+class BadLiteral(HoldfastError):
+    """A text that is no literal, or a literal with a name that the model does not declare."""
+
+    def __init__(self, text: str, problem: str) -> None:
+        super().__init__(text, problem)
+        self.text, self.problem = text, problem
+
+    def __str__(self) -> str:
+        return f"{self.text!r}: {self.problem}"
+
+
+class Literal(msgspec.Struct, frozen=True, order=True, array_like=True, cache_hash=True):
+    """An atom, or its negation: `positive` says which.
+
+    >>> str(~ok("/odom")), ok("/odom").positive
+    ('not ok(/odom)', True)
+    """
+
+    name: str
+    args: tuple[str, ...]
+    positive: bool = True
+
+    def __str__(self) -> str:
+        return f"{'' if self.positive else 'not '}{self.name}({','.join(self.args)})"
+
+    def __invert__(self) -> Literal:
+        return Literal(self.name, self.args, not self.positive)
+
+    @property
+    def atom(self) -> Literal:
+        """The literal without its negation."""
+        return self if self.positive else Literal(self.name, self.args)
+
+
+def ok(topic: str) -> Literal:
+    """What is published on `topic`, or a named property, is as it should be."""
+    return Literal("ok", (topic,))
+
+
+def running(component: str) -> Literal:
+    """The component runs."""
+    return Literal("running", (component,))
+
+
+def on(device: str) -> Literal:
+    """The device has power."""
+    return Literal("on", (device,))
+
+
+def matched(one: str, other: str) -> Literal:
+    """The trends of two values are alike; the order of the two means nothing."""
+    return Literal("matched", (one, other))
+
+
+def inc(value: str) -> Literal:
+    """The value rises."""
+    return Literal("inc", (value,))
+
+
+def dec(value: str) -> Literal:
+    """The value falls."""
+    return Literal("dec", (value,))
+
+
+def const(value: str) -> Literal:
+    """The value stays."""
+    return Literal("const", (value,))
+
+
+def parse(text: str) -> Literal:
+    """Read one literal; names are not looked up (`Vocabulary.parse` does).
+
+    Raises:
+        BadLiteral: the text is none.
+
+    >>> parse("not matched(odom.yaw, imu.yaw)")
+    Literal(name='matched', args=('odom.yaw', 'imu.yaw'), positive=False)
+    """
+    found = _FORM.match(text)
+    if found is None or found[3] == "not":
+        raise BadLiteral(text, "a literal is spelled like `ok(/odom)` or `not ok(/odom)`")
+    args = tuple(argument.strip() for argument in found[4].split(","))
+    if not all(map(_ARGUMENT.match, args)):
+        raise BadLiteral(text, "an argument is a word without spaces, brackets and commas, and there is at least one")
+    return Literal(found[3], args, not (found[1] or found[2]))
+
+
+class Vocabulary:
+    """The atoms that exist: those the model declares, and no other (T53).
+
+    >>> words = Vocabulary([ok("/odom"), matched("odom.yaw", "imu.yaw")])
+    >>> str(words.parse("not matched(imu.yaw,odom.yaw)"))
+    'not matched(odom.yaw,imu.yaw)'
+    """
+
+    def __init__(self, atoms: Iterable[Literal]) -> None:
+        self._atoms = {atom.atom: atom.atom for atom in atoms}
+        for atom in tuple(self._atoms):
+            if atom.name in SYMMETRIC:
+                self._atoms.setdefault(Literal(atom.name, atom.args[::-1]), atom)
+
+    def __iter__(self) -> Iterator[Literal]:
+        return (atom for atom, declared in self._atoms.items() if atom == declared)
+
+    def __contains__(self, literal: Literal) -> bool:
+        return literal.atom in self._atoms
+
+    def check(self, literal: Literal) -> Literal:
+        """The literal as it was declared (the arguments of a symmetric predicate in their declared order).
+
+        Raises:
+            BadLiteral: the model has no such atom.
+        """
+        declared = self._atoms.get(literal.atom)
+        if declared is None:
+            raise BadLiteral(str(literal), self._unknown(literal))
+        return declared if literal.positive else ~declared
+
+    def parse(self, text: str) -> Literal:
+        """Read a literal and look its names up.
+
+        Raises:
+            BadLiteral: the text is no literal, or the model has no such atom.
+        """
+        return self.check(parse(text))
+
+    def _unknown(self, literal: Literal) -> str:
+        names = {atom.name: len(atom.args) for atom in self._atoms}
+        arity = names.get(literal.name, ARITIES.get(literal.name))
+        if arity is None:
+            hint = "; a negation is spelled `not `" if _OTHER_NEGATION.match(literal.name) else ""
+            return f"the model knows no predicate {literal.name!r}{_near(literal.name, names)}{hint}"
+        if arity != len(literal.args):
+            return f"{literal.name} takes {arity} argument{'s' * (arity != 1)}, not {len(literal.args)}"
+        return f"the model declares no such atom{_near(str(literal.atom), map(str, self))}"
+
+
+def _near(word: str, words: Iterable[str]) -> str:
+    near = difflib.get_close_matches(word, list(words), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
