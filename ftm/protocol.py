@@ -23,6 +23,7 @@ from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
 from .bricks import FOREVER, Abandon, Brick, Flush, Where
 from .gate import Gate
+from .images import image_from
 from .messages import (
     CannotJoin,
     ConfigMismatch,
@@ -265,7 +266,7 @@ class RequestProtocol(Gate):
             data, self._pieces = b"".join(self._pieces), []
             server = self._standing.server
             await server.drop_life()
-            server.install(State(message.turn, data, [], [], [], False, -2, message.stash, message.traps))
+            server.install(State(message.turn, image_from(data), [], [], [], False, message.stash, message.traps))
             self._standing.log.replace(message.log)
 
     @on(Lead)
