@@ -2,8 +2,8 @@
 
 Baseline: the same actor unprotected, in a process of its own; a change by stopping the child and starting it with the
 new spec; one comparison plus one encoding of the state.
-Command: python benchmarks/bench_ftm.py [--quick] [--only JOB]; HOLDFAST_CAMPAIGN=10000 requests for each row of the
-campaign, HOLDFAST_SOAK=60 seconds of soak.
+Command: python benchmarks/bench_ftm.py [--quick] [--only JOB]; HOLDFAST_REQUESTS=10000 requests for each row of the
+campaign (see ftm_campaign.py), HOLDFAST_SOAK=60 seconds of soak.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import contextlib
 import itertools
 import json
 import os
-import random
 import signal
 import statistics
 import sys
@@ -34,9 +33,10 @@ from holdfast.ftm.events import FailedOver
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 import ftm_timing
+from ftm_campaign import campaign, soaking
 from ftm_workload import Bump, Change, Count, Parts, Whole
 
-from tests.ftm import campaign, soak, workloads  # pyright: ignore[reportMissingImports]  # found by the line above
+from tests.ftm import campaign as engine  # pyright: ignore[reportMissingImports]  # found by the line above
 
 STACKS: dict[str, tuple[Any, ...]] = {
     "PBR": (hf.PBR(),),
@@ -61,13 +61,13 @@ async def _system() -> AsyncGenerator[hf.ActorSystem, None]:
 
 async def _protected(system: hf.ActorSystem, name: str, layers: Sequence[Any], start: Any = None) -> hf.ActorRef[Any]:
     ref = await system.start(hf.child(name, start or hf.start(Count), mechanism=tuple(layers)))
-    await campaign.whole(ref)
+    await engine.whole(ref)
     return ref
 
 
 def _pid(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> int:
     """The process of the replica that leads."""
-    group = campaign.group_of(ref)
+    group = engine.group_of(ref)
     assert group is not None
     return system._workers.processes()[f"{ref.path}/ftm/{group.primary}"]
 
@@ -149,7 +149,7 @@ async def failover(run: Run) -> None:
             await ask_all(ref.ask, Bump(), 300)
             waits, inner = list[float](), list[float]()
             for _ in range(run.size(50)):
-                await campaign.whole(ref)
+                await engine.whole(ref)
                 await asyncio.sleep(0.1)
                 events.take()
                 pid, began = _pid(system, ref), time.perf_counter()
@@ -165,15 +165,15 @@ async def failover(run: Run) -> None:
 
 
 async def _stopped(run: Run) -> None:
-    patched = campaign.detecting(Detection(interval=0.02, pause=0.2))
+    patched = engine.detecting(Detection(interval=0.02, pause=0.2))
     with patched:
         async with _system() as system:
             ref = await _protected(system, "c", STACKS["PBR"])
             waits = []
             for _ in range(run.size(20)):
-                await campaign.whole(ref)
+                await engine.whole(ref)
                 await asyncio.sleep(0.2)
-                group = campaign.group_of(ref)
+                group = engine.group_of(ref)
                 assert group is not None
                 os.kill(_pid(system, ref), signal.SIGSTOP)
                 await ref.ask(Bump(), timeout=30.0)
@@ -342,41 +342,5 @@ def _encoded_and_compared(size: int) -> float:
     return best
 
 
-# -- faults -----------------------------------------------------------------------------------------------------------
-
-
-async def faults(run: Run) -> None:
-    """The fault-injection campaign, as a table."""
-    requests = int(os.environ.get("HOLDFAST_CAMPAIGN", "300" if run.quick else "2000"))
-    print(f"# {campaign.HEAD}", flush=True)
-    missed, injected = 0, 0
-    for name, layers in STACKS.items():
-        for kind in campaign.KINDS:
-            for workload in workloads.WORKLOADS:
-                if not campaign.makes_sense(layers, kind):
-                    continue
-                if workload != "counter" and not kind.startswith(("nothing", "crash", "SIGSTOP", "message d")):
-                    continue
-                most = 10 if run.quick else max(20, requests // 50)
-                row = await campaign.run_row(
-                    name, layers, kind, workload, requests=requests, most=most, seed=str(run.seed)
-                )
-                injected += row.injected
-                missed += not row.is_kept
-                print(f"# {row}", flush=True)
-                for line in row.trouble[:5]:
-                    print(f"#     {line}", flush=True)
-    print(f"# {injected} faults")
-    run.bound("rows of the campaign in which a mechanism did not keep what it claims", missed, unit="rows", target=0)
-
-
-async def soaking(run: Run) -> None:
-    """Random attach, compose, transition, update, detach under full load, and random kills."""
-    seconds = float(os.environ.get("HOLDFAST_SOAK", "5" if run.quick else "60"))
-    found = await soak.run(seconds, random.Random(run.seed))
-    print(f"# soak: {found}")
-    run.bound("soak: lost, wrong or doubled", len(found.bad.all()), unit="requests", target=0)
-
-
 if __name__ == "__main__":
-    main([latency, throughput, failover, transitions, state_size, faults, soaking])
+    main([latency, throughput, failover, transitions, state_size, campaign, soaking])

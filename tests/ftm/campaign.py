@@ -2,7 +2,7 @@
 
 A fault is armed (`injection`), requests go on until it has happened, and then until the group is whole again. What
 clients then see decides: *masked*: nothing at all; *detected*: a typed error, or an alarm of the mechanism; *silent*:
-something is lost, wrong or done twice, and nobody says so. A *false alarm* is one without a fault.
+something is lost, wrong or done twice, and nobody says so. A *false alarm* is one that no fault of this kind explains.
 """
 
 from __future__ import annotations
@@ -14,129 +14,39 @@ import os
 import random
 import signal
 import tempfile
-from collections.abc import AsyncGenerator, Callable, Generator, Sequence
+from collections.abc import AsyncGenerator, Generator, Sequence
 from pathlib import Path
 from typing import Any
 
 import holdfast as hf
 from holdfast.ftm import host
-from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
+from holdfast.ftm.alarms import Diverged, Masked, Objected, Outvoted, ProtectionLost
 from holdfast.ftm.detector import Detection
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group import Group, Look
 from holdfast.ftm.mechanism import Mechanism
-from tests.ftm.injection import Fault, Page, recipe, unwrap, wrap_root
+from holdfast.ftm.sealed import FrameRefused
+from tests.ftm.faults import FRAMES, KINDS, LATE, VALUES, claims
+from tests.ftm.injection import READ, REQUEST, Fault, Page, recipe, unwrap, wrap_root
+from tests.ftm.stacks import enrolling
 from tests.ftm.workloads import CLIENTS, WORKLOADS, Bad
 
-REQUEST = "REQUEST"
-"""In place of the message that the workload's clients send most."""
 GIVE_UP = 3.0
 """Seconds in which an armed fault is reached, or is not on the way of this mechanism."""
-ALARMS = (FailedOver, WrongSuspicion, Diverged, Masked, ProtectionLost, ReplicaLost)
+STUCK = 60.0
+"""Seconds after which nothing goes on any more."""
+OF_VALUES = (Diverged, Masked, Objected, Outvoted)
+OF_CRASHES = (FailedOver, WrongSuspicion, ProtectionLost, ReplicaLost)
+TOLD = (Diverged, Objected, Outvoted, FrameRefused)
+"""Alarms that say that something is wrong, though not that it was mended."""
 QUICK = Detection(interval=0.02, pause=0.3)
 
 
-# -- faults -----------------------------------------------------------------------------------------------------------
-
-
-def way(layers: Sequence[Mechanism]) -> list[tuple[str, str, bool]]:
-    """The steps of a request through the one that leads (A44 to A53): slot, message, whether it may fail there."""
-    names = [one.name for one in layers]
-    steps = [("protocol", "Work", True)]
-    for index, name in enumerate(names):
-        if index:
-            steps.append((f"{name}.protocol", "Work", True))
-        steps.append((f"{name}.before", "Work", True))
-    steps += [("proceed", "Work", True), ("server", REQUEST, False)]
-    for name in reversed(names):
-        steps += [(f"{name}.after", "Done", True)]
-        if name != names[0]:
-            steps.append((f"{name}.protocol", "Done", True))
-    if "pbr" in names:
-        steps.append(("state", "Capture", True))
-    if "tr" in names:
-        steps += [("state", "LastRun", True), ("state", "RunAgain", True)]
-    steps.append(("protocol", "Done", True))
-    return steps
-
-
-def far(layers: Sequence[Mechanism]) -> list[tuple[str, str]]:
-    """The steps on the other replica (A52 to A54)."""
-    outer = layers[0].name
-    found = {"pbr": [("pbr.after", "Letter"), ("state", "Apply")]}
-    found["lfr"] = [("lfr.before", "Letter"), ("proceed", "Work"), ("lfr.after", "Letter")]
-    return found.get(outer, [])
-
-
-def at_each(action: str, layers: Sequence[Mechanism], *, bricks_only: bool = False) -> list[Fault]:
-    faults = [
-        Fault(action, slot, message, when, leads=True)
-        for slot, message, is_brick in way(layers)
-        if is_brick or not bricks_only
-        for when in ("before", "after")
-    ]
-    faults += [Fault(action, *step, when, leads=False) for step in far(layers) for when in ("before", "after")]
-    return faults
-
-
-def between(action: str, layers: Sequence[Mechanism]) -> list[Fault]:
-    faults = [Fault(action, slot, message, leads=True) for slot, message, is_brick in way(layers) if is_brick]
-    return faults + [Fault(action, *step, leads=False) for step in far(layers)]
-
-
-def of_joining(action: str) -> list[Fault]:
-    return [
-        Fault(action, "protocol", message, when, leads=False)
-        for message in ("Follow", "Letter")
-        for when in ("before", "after")
-    ]
-
-
-def of_root() -> list[Fault]:
-    parts = [("proxy", "Flush"), ("proxy", "Done"), ("detector", "Beat"), ("failover", "Look"), ("join", "Look")]
-    return [Fault("raise", *part, when) for part in parts for when in ("before", "after")]
-
-
-KINDS: dict[str, Callable[[Sequence[Mechanism]], list[Fault]]] = {
-    "nothing": lambda layers: [],
-    "crash of a replica": lambda layers: at_each("crash", layers),
-    "crash of a brick": lambda layers: at_each("raise", layers, bricks_only=True),
-    "crash while joining": lambda layers: of_joining("crash") + of_joining("raise"),
-    "crash of a root part": lambda layers: of_root(),
-    "hang": lambda layers: at_each("hang", layers),
-    "SIGSTOP": lambda layers: at_each("stop", layers),
-    "SIGSTOP, wake-up": lambda layers: at_each("stop", layers),
-    "message delayed": lambda layers: between("delay", layers),
-    "message doubled": lambda layers: between("double", layers),
-    "message reordered": lambda layers: between("reorder", layers),
-    "message lost": lambda layers: between("lose", layers),
-    "answer, transient": lambda layers: [Fault("answer", "server", REQUEST, "after")] * 6,
-    "state, transient": lambda layers: [Fault("state", "server", REQUEST, "after")] * 6,
-    "message, transient": lambda layers: [Fault("message", "proceed", "Work", leads=True)] * 6,
-    "answer, permanent": lambda layers: [Fault("answer", "server", REQUEST, "after", permanent=True)],
-}
-CRASHES = frozenset(kind for kind in KINDS if kind.startswith(("crash", "hang", "SIGSTOP")))
-LATE = frozenset({"message delayed", "message doubled", "message reordered"})
-
-
-def claims(layers: Sequence[Mechanism], kind: str) -> bool:
-    """Whether this composition says that it masks such a fault."""
-    tolerates = frozenset[str]().union(*(one.tolerates for one in layers))
-    if kind == "nothing" or kind in LATE or kind == "crash of a root part":
-        return True
-    if kind in CRASHES:
-        return "crash" in tolerates
-    if kind in ("answer, transient", "state, transient"):
-        return "transient_value" in tolerates or "permanent_value" in tolerates
-    return kind == "answer, permanent" and "permanent_value" in tolerates
-
-
-def makes_sense(layers: Sequence[Mechanism], kind: str) -> bool:
-    """One replica alone has no other to join, or to go on when it is gone."""
-    return kind not in CRASHES or max(one.replicas for one in layers) > 1
-
-
 # -- the campaign -----------------------------------------------------------------------------------------------------
+
+
+class Stuck(Exception):
+    """Requests are not answered any more, or the group does not get whole again."""
 
 
 @dataclasses.dataclass
@@ -156,6 +66,8 @@ class Row:
     lost: int = 0
     wrong: int = 0
     doubled: int = 0
+    failed: int = 0
+    stuck: str = ""
     unreached: list[str] = dataclasses.field(default_factory=list)
     trouble: list[str] = dataclasses.field(default_factory=list)
 
@@ -164,7 +76,8 @@ class Row:
         """Whether what was claimed is so."""
         if not self.claimed:
             return True
-        return self.masked == self.injected and not (self.lost or self.wrong or self.doubled or self.false_alarms)
+        bad = self.lost or self.wrong or self.doubled or self.failed or self.false_alarms or self.stuck
+        return self.masked == self.injected and not bad
 
     def __str__(self) -> str:
         claimed = "claimed" if self.claimed else "       "
@@ -177,6 +90,28 @@ HEAD = (
     f"{'mechanism':14} {'load':8} {'fault':22} {'':7} {'requests':>9}{'injected':>9}{'masked':>9}{'detected':>9}"
     f"{'silent':>9}{'false':>8}{'lost':>8}{'wrong':>8}{'twice':>8}"
 )
+
+
+def table(rows: Sequence[Row]) -> str:
+    """Mechanism x fault: of how many faults how many were masked, detected and silent; bold where it is claimed."""
+    names = list(dict.fromkeys(row.mechanism for row in rows))
+    kinds = [kind for kind in KINDS if any(row.kind == kind for row in rows)]
+    lines = [[kind, *(cell(rows, name, kind) for name in names)] for kind in kinds]
+    return "\n".join(f"| {' | '.join(line)} |" for line in [["fault", *names], ["---"] * (len(names) + 1), *lines])
+
+
+def cell(rows: Sequence[Row], name: str, kind: str) -> str:
+    """What stands in the table for one mechanism and one kind of fault, of all workloads."""
+    here = [row for row in rows if (row.mechanism, row.kind) == (name, kind)]
+    if not here:
+        return "-"
+    injected, masked = sum(row.injected for row in here), sum(row.masked for row in here)
+    text = f"{masked} of {injected}" if kind != "nothing" else f"{sum(row.requests for row in here)} requests"
+    for what in ("detected", "silent", "false_alarms"):
+        count = sum(getattr(row, what) for row in here)
+        text += f", {count} {what.replace('_', ' ')}" if count else ""
+    text += ", stuck" if any(row.stuck for row in here) else ""
+    return f"**{text}**" if here[0].claimed else text
 
 
 @dataclasses.dataclass
@@ -227,13 +162,29 @@ def group_of(ref: hf.ActorRef[Any]) -> Group | None:
 
 
 async def whole(ref: hf.ActorRef[Any]) -> None:
-    """Wait until the group is complete."""
-    async with asyncio.timeout(60):
-        while True:
-            group = group_of(ref)
-            if group is not None and group.primary is not None and all(map(group.is_well, group.names)):
-                return
-            await asyncio.sleep(0.002)
+    """Wait until the group is complete.
+
+    Raises:
+        Stuck: it never is.
+    """
+    loop = asyncio.get_running_loop()
+    end = loop.time() + STUCK
+    while loop.time() < end:
+        group = group_of(ref)
+        if group is not None and group.primary is not None and all(map(group.is_well, group.names)):
+            return
+        await asyncio.sleep(0.002)
+    raise Stuck(f"the group is not complete again: {described(group_of(ref))}")
+
+
+def described(group: Group | None) -> str:
+    """What is known of a group, for whoever wants to find out why it stands still."""
+    if group is None:
+        return "there is none"
+    names = ("epoch", "primary", "leading", "members", "condemned", "dropped", "up", "joining", "suspects", "is_over")
+    told = {name: getattr(group, name) for name in names}
+    out = group.out and (group.out.number, [one.feed.id for one in group.out.requests][:8])
+    return f"{told} out={out} waiting={len(group.waiting)} ledger={list(group.ledger)[:8]} why={group.why!r}"
 
 
 class Campaign:
@@ -243,8 +194,7 @@ class Campaign:
         self.layers, self.kind = tuple(layers), kind
         self.row = Row(name, workload, kind, claims(layers, kind))
         self.rng = random.Random(f"{seed} {name} {kind} {workload}")
-        timeout = 30.0 if self.row.claimed else 1.0
-        self.load = WORKLOADS[workload](timeout, self.rng)
+        self.load = WORKLOADS[workload](30.0 if self.row.claimed else 1.0, self.rng)
         self.trials: list[Trial] = []
 
     async def run(self, requests: int, *, most: int = 1_000_000) -> Row:
@@ -255,32 +205,44 @@ class Campaign:
         with injecting() as page:
             async with running() as system:
                 self.system, self.page, self.events = system, page, system.events()
+                await enrolling(system, self.layers)
                 self.ref = await load.start(system, self.layers)
                 await whole(self.ref)
                 self.events.take()
                 load.begin()
-                least = min(most, len(faults))
-                spread = max(8, requests // max(1, least))
-                if not faults:
-                    await load.reached(requests)
-                    row.false_alarms += sum(isinstance(one, ALARMS) for one in self.events.take())
-                count = 0
-                while count < least or (faults and load.done < requests and count < most):
-                    fault = faults[count % len(faults)]
-                    count += 1
-                    await self._trial(fault, max(4, spread // 3))
-                    await load.reached(max(4, spread * 2 // 3))
-                await load.stop()
-                bad = await load.bad()
-                self._judge(bad)
-                self.events.close()
+                try:
+                    await self._strike(faults, requests, most)
+                    await load.stop()
+                    self._judge(await load.bad())
+                except (Stuck, TimeoutError, hf.AskTimeout) as error:
+                    row.stuck, row.requests = str(error) or described(group_of(self.ref)), load.sent
+                    row.trouble.append(f"{row.stuck} after {self.trials[-1].fault if self.trials else 'nothing'}")
+                finally:
+                    load.abandon()
+                    self.events.close()
         return row
+
+    async def _strike(self, faults: list[Fault], requests: int, most: int) -> None:
+        row, load = self.row, self.load
+        least = min(most, len(faults))
+        spread = max(8, requests // max(1, least))
+        if not faults:
+            await load.reached(requests)
+            row.false_alarms += sum(isinstance(one, OF_VALUES + OF_CRASHES) for one in self.events.take())
+        count = 0
+        while count < least or (faults and load.done < requests and count < most):
+            fault = faults[count % len(faults)]
+            count += 1
+            await self._trial(fault, max(4, spread // 3))
+            await load.reached(max(4, spread * 2 // 3))
+        if load.done < requests:
+            await load.reached(requests - load.done)
 
     async def _trial(self, fault: Fault, more: int) -> None:
         page, load, row = self.page, self.load, self.row
-        if fault.message == REQUEST:
-            fault = dataclasses.replace(fault, message=load.main)
-        fault = dataclasses.replace(fault, nth=self.rng.randrange(1, 6) if "join" not in self.kind else 1)
+        names = {REQUEST: load.main, READ: load.read or load.main}
+        nth = self.rng.randrange(1, 6) if "join" not in self.kind else 1
+        fault = dataclasses.replace(fault, message=names.get(fault.message, fault.message), nth=nth)
         self.events.take()
         page.arm(fault)
         if self.kind == "crash while joining":
@@ -289,7 +251,7 @@ class Campaign:
             group = group_of(self.ref)
             assert group is not None
             for _ in range(fault.nth):
-                group.tell(fault.slot, group_look())
+                group.tell(fault.slot, Look())
                 await load.reached(1)
         loop = asyncio.get_running_loop()
         end = loop.time() + GIVE_UP
@@ -300,45 +262,58 @@ class Campaign:
             row.unreached.append(str(fault))
             return
         trial = Trial(fault, max(0, load.sent - CLIENTS))
-        row.injected += 1
-        await self._follow_up(fault, trial, more)
-        trial.last = load.sent
-        trial.alarms = [type(one).__name__ for one in self.events.take() if isinstance(one, (Diverged, Masked))]
         self.trials.append(trial)
+        row.injected += 1
+        await self._follow_up(fault, more)
+        trial.last = load.sent
+        self._hear(trial)
 
-    async def _follow_up(self, fault: Fault, trial: Trial, more: int) -> None:
+    def _hear(self, trial: Trial) -> None:
+        """What was told, and whether a fault of this kind explains it."""
+        told = self.events.take()
+        trial.alarms = [type(one).__name__ for one in told if isinstance(one, TOLD)]
+        false: tuple[type[Any], ...] = () if self.kind in VALUES else OF_VALUES
+        if self.kind in LATE | FRAMES:
+            false += OF_CRASHES
+        wrong = [one for one in told if isinstance(one, false)]
+        self.row.false_alarms += len(wrong)
+        self.row.trouble += [f"{trial.fault} nth={trial.fault.nth}: false alarm {one}" for one in wrong[:2]]
+
+    async def _follow_up(self, fault: Fault, more: int) -> None:
         load = self.load
         if self.kind == "SIGSTOP, wake-up":
-            await asyncio.sleep(0.05)
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self.page.pid, signal.SIGCONT)
-        elif fault.action == "lose":
-            await asyncio.sleep(0.3)
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(self.page.pid, signal.SIGKILL)  # It waits for ever.
+            await asyncio.sleep(self.rng.uniform(0.02, 0.45))  # About as long as it takes to be suspected.
+            self._signal(signal.SIGCONT)
+        elif fault.action == "lose" and self.kind not in FRAMES:
+            await asyncio.sleep(1.1 * load.timeout)
+            self._signal(signal.SIGKILL)  # It waits for ever.
         await load.reached(more)
         if fault.permanent:
             self.page.disarm()
         await whole(self.ref)
 
+    def _signal(self, number: signal.Signals) -> None:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(self.page.pid, number)
+
     async def _kill_backup(self) -> None:
         group = group_of(self.ref)
         assert group is not None
-        name = next(one for one in group.names if one != group.primary)
+        name = self.rng.choice([one for one in group.names if one != group.primary])
         pid = self.system._workers.processes().get(f"{self.ref.path}/ftm/{name}")
         if pid is not None:
             os.kill(pid, signal.SIGKILL)
 
     def _judge(self, bad: Bad) -> None:
         row, load = self.row, self.load
-        row.requests = load.sent
+        row.requests, row.failed = load.sent, len(load.failed)
         row.lost, row.wrong, row.doubled = len(bad.lost), len(bad.wrong), len(bad.doubled)
         left = bad.all()
         for trial in self.trials:
             inside = {number for number in left if trial.first <= number <= trial.last}
             errors = [number for number in load.failed if trial.first <= number <= trial.last]
             left -= inside
-            if errors or (inside and "Diverged" in trial.alarms):
+            if errors or (inside and trial.alarms):
                 row.detected += 1
             elif inside:
                 row.silent += 1
@@ -350,10 +325,6 @@ class Campaign:
                 row.trouble += [repr(load.failed[number]) for number in errors[:2]]
         if left:
             row.trouble.append(f"outside of all trials: {sorted(left)[:5]}")
-
-
-def group_look() -> Any:
-    return Look()
 
 
 async def run_row(

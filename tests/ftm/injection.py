@@ -2,7 +2,7 @@
 
 The handlers of the bricks (and of the protected actor) are wrapped in each replica's process. As long as nothing is
 armed they look at one byte. What is armed happens once, in whichever process comes to that step first; a permanent
-fault happens each time, in the first one.
+fault happens each time, in the replica in which it has happened first, whatever life that lives.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import mmap
 import os
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,26 @@ import msgspec
 import holdfast as hf
 from holdfast.actors.actor import Start
 from holdfast.actors.mail import Envelope
+from holdfast.checkpoint.records import OK, REPLY, Answer, TurnEnd
 from holdfast.ftm.bricks import Brick
 from holdfast.ftm.detector import Detector
 from holdfast.ftm.failover import FailoverManager
 from holdfast.ftm.join import Joiner
+from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanism import BUILT_IN, find
-from holdfast.ftm.messages import Work
+from holdfast.ftm.messages import Done, Follow, Lead, Work
+from holdfast.ftm.orders import Peer
 from holdfast.ftm.proxy import Proxy
 from holdfast.ftm.replica import Heart, Replica
+from holdfast.ftm.sealed import Sealed
 from holdfast.ftm.state import StateManager
+from tests.ftm.accounts import Bank, Counter
+from tests.ftm.stacks import HUGE
+from tests.ftm.store import Store
 
-ARMED, FIRED, PID, LENGTH, BODY, SIZE = 0, 1, 4, 8, 16, 4096
+ARMED, FIRED, UNIT, PID, LENGTH, BODY, SIZE = 0, 1, 2, 4, 8, 16, 4096
+REQUEST, READ = "REQUEST", "READ"
+"""In place of the messages that the workload's clients send most, and whose answers say most."""
 SLOTS: dict[type[Any], str] = {
     StateManager: "state",
     Heart: "beat",
@@ -54,7 +63,10 @@ class Fault:
     delay    the message waits                     reorder    others overtake it
     double   the message comes twice               lose       it never comes
     answer   the actor's answer is wrong           state      its state is wrong from now on
-    message  what it is asked is wrong             checkpoint what the other replica gets is wrong
+    message  what it is asked is wrong             alter      a bit of what is sealed is another one
+    forge    somebody else says something too
+
+    `permanent`: each time from then on, in that replica; `everywhere`: in all.
     """
 
     action: str
@@ -64,9 +76,10 @@ class Fault:
     nth: int = 1
     leads: bool | None = None
     permanent: bool = False
+    everywhere: bool = False
 
     def __str__(self) -> str:
-        return f"{self.action} {self.when} {self.slot}:{self.message}"
+        return f"{self.action} {self.when} {self.slot}:{self.message}" + {None: "", True: " L", False: " F"}[self.leads]
 
 
 class Page:
@@ -77,6 +90,8 @@ class Page:
         with Path(path).open("r+b") as file:
             self.memory = mmap.mmap(file.fileno(), SIZE)
         self._left: dict[str, int] = {}
+        self.unit = 0  # the number of the replica whose process this is
+        self.leads: Callable[[], bool] = lambda: True
 
     @classmethod
     def new(cls, path: Path) -> Page:
@@ -115,14 +130,14 @@ class Page:
         if fault.leads not in (None, leads):
             return None
         if fault.permanent and self.has_fired:
-            return fault if self.pid == os.getpid() else None
+            return fault if fault.everywhere or memory[UNIT] == self.unit else None
         left = self._left.get(number, fault.nth) - 1
         self._left = {number: left}
         if left > 0:
             return None
         if not fault.permanent:
             memory[ARMED] = 0
-        memory[PID : PID + 4] = os.getpid().to_bytes(4, "little")
+        memory[PID : PID + 4], memory[UNIT] = os.getpid().to_bytes(4, "little"), self.unit
         memory[FIRED] = 1
         return fault
 
@@ -132,7 +147,9 @@ class StruckReplica(Replica):
 
     def __init__(self, setting: Any, start: Start[Any], layers: Any, page: str) -> None:
         super().__init__(setting, start, layers)
-        wrap(Page(page), start.kind)
+        one = Page(page)
+        one.unit, one.leads = int(setting.name[1:]), lambda: self._standing.leads
+        wrap(one, start.kind)
 
 
 def recipe(page: Page) -> Any:
@@ -189,9 +206,7 @@ def struck(page: Page, handler: Any, slot: str, message: str) -> Any:
     def wrapped(actor: Any, item: Any) -> Any:
         if not memory[ARMED]:
             return handler(actor, item)
-        here = slot or actor.slot
-        standing = getattr(actor, "_standing", None)
-        leads = True if standing is None else standing.leads
+        here, leads = slot or actor.slot, page.leads()
         fault = page.strikes(here, message, leads=leads, when="before")
         if fault is not None:
             return before(fault, handler, actor, item)
@@ -240,21 +255,32 @@ def before(fault: Fault, handler: Any, actor: Any, item: Any) -> Any:
             return overtaken(actor, item)
         case "message":
             return handler(actor, other(item))
-        case "checkpoint":
-            body = bytearray(item.body)
-            body[-1] ^= 1
-            return handler(actor, msgspec.structs.replace(item, body=bytes(body)))
+        case "alter":
+            return handler(actor, altered(item))
+        case "forge":
+            forge(actor)
     return handler(actor, item)
 
 
 def after(fault: Fault, actor: Any, result: Any) -> Any:
     happen(fault)
     match fault.action:
-        case "answer" if isinstance(result, int):
-            return result + 1
+        case "answer":
+            return result + 1 if isinstance(result, int) else 12345
         case "state":
-            actor.total += 1000
+            spoil(actor)
     return result
+
+
+def spoil(actor: Any) -> None:
+    """Something in the protected actor's memory is another value."""
+    match actor:
+        case Counter():
+            actor.total += 1000
+        case Bank():
+            actor.done.append(-1)
+        case Store():
+            actor.values = {key: value + HUGE for key, value in actor.values.items()} or {"k0": HUGE}
 
 
 def is_ask(actor: Any) -> bool:
@@ -306,3 +332,33 @@ def other(item: Any) -> Any:
     body[-1] ^= 2
     feed = msgspec.structs.replace(first.feed, body=bytes(body))
     return msgspec.structs.replace(item, requests=[msgspec.structs.replace(first, feed=feed), *item.requests[1:]])
+
+
+def altered(item: Any) -> Any:
+    """One bit of what is sealed is another one."""
+    body = item.frame if isinstance(item, Sealed) else item.body
+    if len(body) < 40:
+        return item
+    wrong = body[:-30] + bytes([body[-30] ^ 4]) + body[-29:]
+    return Sealed(wrong) if isinstance(item, Sealed) else msgspec.structs.replace(item, body=wrong)
+
+
+def forge(actor: Any) -> None:
+    """What somebody else would like this actor to believe: in plain words, and as if it were sealed."""
+    ref = actor.ctx.cell.ref
+    asked: list[Any] = [Sealed(os.urandom(200)), Sealed(b"")]
+    if isinstance(actor, Proxy):
+        group = actor._group
+        wrong = Answer(REPLY, "", msgspec.msgpack.encode(-7))
+        ends = [TurnEnd(group.switch.turn + 1, key, OK, [], wrong) for key in list(group.switch.open)[:1]]
+        ref.tell(Done(group.epoch, group.config, group.number, ends, True))
+    elif actor.slot == "protocol":
+        standing = actor._standing
+        epoch, config = standing.epoch, standing.config
+        ref.tell(Work(epoch, config, 1 << 40, []))
+        asked += [Peer(epoch, None), Follow(epoch + 5, config), Lead(epoch + 5, config)]
+    else:
+        standing = actor._standing
+        asked = [Letter(standing.epoch, standing.config, kind, os.urandom(100)) for kind in ("sealed", "x:Checkpoint")]
+    for message in asked:
+        ref.ask(message, timeout=10.0).add_done_callback(lambda done: done.cancelled() or done.exception())

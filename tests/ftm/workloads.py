@@ -30,6 +30,9 @@ class Workload:
     """Clients that ask one after the other; each ask has a number of its own."""
 
     main = ""
+    """The message that changes something."""
+    read = ""
+    """The one whose answer says most; "": the same."""
 
     def __init__(self, timeout: float, rng: random.Random) -> None:
         self.timeout, self.rng = timeout, rng
@@ -74,6 +77,11 @@ class Workload:
     async def stop(self) -> None:
         self._stopping = True
         await asyncio.gather(*self._tasks)
+
+    def abandon(self) -> None:
+        """Whoever still waits for an answer waits no longer."""
+        for task in self._tasks:
+            task.cancel()
 
 
 def judged(answered: dict[int, Any], failed: dict[int, BaseException], tags: list[int]) -> Bad:
@@ -132,6 +140,7 @@ class Banking(Workload):
 
 class Storing(Workload):
     main = "Write"
+    read = "Look"
 
     async def start(self, system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
         self.history = linearizable.History()
