@@ -60,7 +60,7 @@ class ReplyEvicted(Refusal):
     number: int
 
 
-class Request(msgspec.Struct, array_like=True):
+class Request(msgspec.Struct, array_like=True, gc=False):
     """One request: who has sent it, in which life, and its number at the address (A45)."""
 
     client: str
