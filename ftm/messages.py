@@ -145,6 +145,7 @@ class State(msgspec.Struct, array_like=True, tag=1):
     live: bool
     stash_ids: list[int] = []
     traps: bool = False  # `ctx.trap_exits`
+    absent: list[str] = []  # variables that `__init__` has made, and that are no more
 
 
 class Change(msgspec.Struct, array_like=True, tag=2):
@@ -163,6 +164,7 @@ class Change(msgspec.Struct, array_like=True, tag=2):
     live: bool
     stash_ids: list[int] = []
     traps: bool = False
+    absent: list[str] = []
 
 
 class Lead(Message[int]):

@@ -19,7 +19,7 @@ from ..actors.cell import DOWN, Cell
 from ..actors.errors import DamagedValue, StartFailed
 from ..actors.mail import Item
 from ..actors.values import decode_value, encode_value
-from ..checkpoint.keys import key_names, restore_state, variables
+from ..checkpoint.keys import key_names, put_back, variables
 from ..checkpoint.method import Method
 from ..checkpoint.records import (
     FAILED,
@@ -113,6 +113,7 @@ class Points(lives.LocalHost):
         self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None
+        self._begun_names: set[str] = set()  # the variables that the life has begun with
         self._crashes = 0
         self._start_turn = -1
         self._async: frozenset[str] | None = None
@@ -176,7 +177,10 @@ class Points(lives.LocalHost):
         if point is not None:
             cell.extra().trap_exits = point.traps
         actor: Any = cell.actor
+        self._begun_names = set(variables(actor)) if self.has_access else set()
         if point is not None:
+            for name in self._begun_names.intersection(point.absent):  # `__init__` has made it, a turn has deleted it.
+                delattr(actor._state_root(), name)
             for delta in point.deltas:
                 actor.apply_delta(decode_value(delta))
             senders = cell.node
@@ -345,7 +349,8 @@ class Points(lives.LocalHost):
         self.point.stash_ids = [key for key in ids if all(fed.feed.id != key for fed in life.stash)]
         self._point_names = None
         if getattr(actor, "get_state", None) is None and key_names(actor) is None:
-            self._point_names = set(variables(actor))
+            self._point_names = names = set(variables(actor))
+            self.point.absent = sorted(self._begun_names - names)
         self.tail = []
         return self.point
 
@@ -375,8 +380,9 @@ class Points(lives.LocalHost):
                 return None
             patch = make_patch(base.data, point.data)
         check = checksum(deltas)
-        ids, traps = point.stash_ids, point.traps
-        return Change(point.turn, turn, patch, deltas, check, point.stash, point.returned, point.live, ids, traps)
+        ids, traps, absent = point.stash_ids, point.traps, point.absent
+        stash, returned = point.stash, point.returned
+        return Change(point.turn, turn, patch, deltas, check, stash, returned, point.live, ids, traps, absent)
 
     def _place_of(self, turn: int, point: State) -> int | None:
         """The first of the point's deltas that this turn has not got, if there only deltas are missing."""
@@ -404,7 +410,8 @@ class Points(lives.LocalHost):
         if state.patch is not None:
             data, deltas = state.patch.applied(point.data), state.deltas
         return State(
-            state.turn, data, deltas, state.stash, state.returned, state.live, state.stash_ids, state.traps
+            state.turn, data, deltas, state.stash, state.returned, state.live, state.stash_ids, state.traps,
+            state.absent,
         )  # fmt: skip
 
     def forget_point(self) -> None:
@@ -423,13 +430,14 @@ class Points(lives.LocalHost):
         assert life.feed is None
         actor: Any = life.cell.actor
         names = self._point_names
-        restore_state(actor, point.data.whole())
+        saved = point.data.value()
+        put_back(actor, saved)
         for delta in point.deltas:
             actor.apply_delta(decode_value(delta))
         if self.has_deltas:
             actor.get_delta()
         if names is not None:
-            for name in set(variables(actor)) - set(self._names_of(point)):
+            for name in set(variables(actor)) - set(saved[2]):
                 delattr(actor._state_root(), name)
         senders = life.cell.node
         life.cell.extra().trap_exits = point.traps
@@ -439,10 +447,6 @@ class Points(lives.LocalHost):
         ]
         self.point, self.tail = point, []
         self.marks = [UNKNOWN] * len(point.deltas)
-
-    @staticmethod
-    def _names_of(point: State) -> list[str]:
-        return list(point.data.value()[2])
 
     def skip_to(self, turn: int) -> None:
         """These numbers are used, though no turn has left anything."""

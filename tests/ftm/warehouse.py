@@ -106,7 +106,9 @@ class Warehouse(hf.Actor):
 
     @hf.on(Sum, readonly=True)
     def sum(self, message: Sum) -> bytes:
-        return state_digest({name: value for name, value in sorted(vars(self).items()) if name[0] != "_"})
+        return state_digest(
+            {name: value for name, value in sorted(vars(self).items()) if name[0] != "_" and name != "ctx"}
+        )
 
 
 class Ledger(hf.Actor):
