@@ -1,9 +1,10 @@
 """Images of states in blocks with checksums: what two of them have in common is there once, and is not sent again.
 
 A large state is encoded variable by variable (`checkpoint.image`), and each piece is cut into blocks. A block in which
-nothing has changed is the very object that the last image has; an array is compared where it lies, and only the blocks
-that differ are copied. A `Patch` has the blocks that another replica lacks. It fits one image only: that is known by a
-checksum of all checksums, and what comes out is compared with the checksum of what went in.
+nothing has changed is the very object that the last image has; an array is compared where it lies, a list of plain
+values entry by entry (`rows.py`), and only the blocks that differ are made. A `Patch` has the blocks that another
+replica lacks. It fits one image only: that is known by a checksum of all checksums, and what comes out is compared with
+the checksum of what went in.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ import msgspec
 
 from ..actors.errors import DamagedValue
 from ..actors.values import decode_value
-from ..checkpoint.image import Imager, Key, is_image, read_image
+from ..checkpoint.image import Imager, Key, is_image, pieces_of, read_image
 from ..checkpoint.keys import save_state, state_of
+from .rows import MANY, Rows
 
 if TYPE_CHECKING:
     from ..actors.actor import Actor
@@ -129,8 +131,12 @@ def image_of(pieces: list[Piece]) -> Image:
 
 def cut(pieces: Iterable[tuple[Key, Any]], before: Image | None = None) -> Image:
     """Buffers as an image; what is as it was in `before` is taken from there."""
+    return image_of(_pieces(pieces, before))
+
+
+def _pieces(buffers: Iterable[tuple[Key, Any]], before: Image | None) -> list[Piece]:
     known = {} if before is None else {piece.key: piece for piece in before.pieces}
-    return image_of([_piece(key, memoryview(buffer).cast("B"), known.get(key)) for key, buffer in pieces])
+    return [_piece(key, memoryview(buffer).cast("B"), known.get(key)) for key, buffer in buffers]
 
 
 def image_from(data: bytes) -> Image:
@@ -140,20 +146,21 @@ def image_from(data: bytes) -> Image:
 
 def _piece(key: Key, view: memoryview, before: Piece | None) -> Piece:
     """A buffer in blocks."""
-    old: list[bytes] = [] if before is None else before.blocks
-    blocks, sums, same = list[bytes](), list[int](), 0
-    for index, begin in enumerate(range(0, len(view), BLOCK)):
-        part = view[begin : begin + BLOCK]
-        # `startswith` compares as memcmp does, `==` of views number by number.
-        if before is not None and index < len(old) and len(old[index]) == len(part) and old[index].startswith(part):
-            blocks.append(old[index])
-            sums.append(before.sums[index])
-            same += 1
-        else:
-            blocks.append(bytes(part))
-            sums.append(zlib.crc32(part))
-    if before is not None and same == len(old) == len(blocks):
+    parts = [view[begin : begin + BLOCK] for begin in range(0, len(view), BLOCK)]
+    if before is None:
+        return Piece(*key, list(map(bytes, parts)), list(map(zlib.crc32, parts)))
+    old = before.blocks
+    # `startswith` compares as memcmp does, `==` of views number by number. Only the last blocks can be shorter.
+    same = list(map(bytes.startswith, old, parts))
+    if same and len(old[len(same) - 1]) != len(parts[len(same) - 1]):
+        same[-1] = False
+    if len(old) == len(parts) and all(same):
         return before
+    blocks, sums = old[: len(same)], before.sums[: len(same)]
+    for index in [index for index, one in enumerate(same) if not one]:
+        blocks[index], sums[index] = bytes(parts[index]), zlib.crc32(parts[index])
+    blocks += map(bytes, parts[len(same) :])
+    sums += map(zlib.crc32, parts[len(same) :])
     return Piece(*key, blocks, sums)
 
 
@@ -189,6 +196,7 @@ class Images:
 
     def __init__(self) -> None:
         self._imager = Imager()
+        self._rows: dict[str, Rows] = {}
 
     def take(self, actor: Actor, before: Image | None) -> Image:
         """The actor's state. The same state after the same one before makes the same image.
@@ -198,5 +206,30 @@ class Images:
         """
         if before is None or before.size <= BLOCK:
             return cut([(("", 0), save_state(actor))])
-        state = state_of(actor)
-        return cut(self._imager.image(state.version, state.form, state.value, actor.ctx.path), before)
+        state, where = state_of(actor), actor.ctx.path
+        if not (isinstance(state.value, dict) and all(type(name) is str for name in state.value)):
+            return cut(self._imager.image(state.version, state.form, state.value, where), before)
+        rows = self._take_rows(state.value)
+        rest = {name: value for name, value in state.value.items() if name not in rows}
+        sections = self._imager.sections(rest, where)
+        own = {id(state.value[name]) for name in rows}
+        if len(own) < len(rows) or not all(own.isdisjoint(one.seen) for one in sections):
+            rows, sections = {}, self._imager.sections(state.value, where)  # Two variables are one: so they stay.
+        more = [([name], one.size) for name, one in rows.items()]
+        pieces = _pieces(pieces_of(state.version, state.form, sections, more), before)
+        return image_of([*pieces, *(Piece(name, -1, one.blocks, one.sums) for name, one in rows.items())])
+
+    def _take_rows(self, state: dict[str, Any]) -> dict[str, Rows]:
+        """Those variables that are large lists or dicts of plain values."""
+        found: dict[str, Rows] = {}
+        for name, value in state.items():
+            kind = type(value)
+            if (kind is list or kind is dict) and len(value) >= MANY:
+                rows = self._rows.get(name)
+                if rows is None or rows.kind is not kind:
+                    rows = self._rows[name] = Rows(name, kind)
+                if rows.take(value):
+                    found[name] = rows
+                    continue
+            self._rows.pop(name, None)
+        return found

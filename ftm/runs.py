@@ -113,8 +113,10 @@ def state_form(state: State) -> Any:
 
 def digest_of_state(state: State) -> bytes:
     """A digest of a state; the order of sets and dicts does not count."""
-    stash = [feed.id for feed in state.stash]
-    return state_digest([state.turn, stash, [state.data.value(), *map(decode_value, state.deltas)]])
+    stash, saved = [feed.id for feed in state.stash], state.data.value()
+    if saved is not None and type(saved[2]) is dict and all(type(name) is str for name in saved[2]):
+        saved = (*saved[:2], sorted(saved[2].items()))  # Large and small ones have their own order in an image.
+    return state_digest([state.turn, stash, [saved, *map(decode_value, state.deltas)]])
 
 
 def vote(voter: AnyVoter, runs: Sequence[Run | None], *, with_state: bool = True) -> Agreed[Run] | Undecided:

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import random
+import zlib
 from typing import Any
 
 import pytest
 
 import holdfast as hf
 from holdfast.actors.errors import DamagedValue
+from holdfast.actors.values import encode_value
 from holdfast.ftm import points
 from holdfast.ftm.alarms import Masked
 from holdfast.ftm.images import BLOCK, Image, Misfit, Patch, cut, image_from, patch
 from holdfast.ftm.mechanisms.pbr import Checkpoint
 from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.messages import Change, State
+from holdfast.ftm.rows import Rows
 from tests.ftm.replicated import pair
 from tests.ftm.warehouse import KINDS, Break, Ledger, Resize, Sum, Touch, Warehouse
 
@@ -277,3 +280,50 @@ def test_an_image_with_a_block_too_few_or_in_another_place_is_damaged() -> None:
             Image([one], image.size, image.digest).check()
     with pytest.raises(DamagedValue):
         Image([type(piece)("", 0, piece.blocks[:2], piece.sums[:2])], image.size, image.digest).check()
+
+
+PLAIN: list[Any] = [
+    None, True, False, 0, -1, 127, 128, 2**16, -(2**31), 2**64 - 1, -(2**63), 1.5, float("inf"), "", "\u00fc" * 40,
+    b"", b"x" * 300,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_rows_are_encoded_as_the_whole_variable_is(seed: int) -> None:
+    dice = random.Random(seed)
+    size = dice.choice((64, 65, 100, 5000, 70_000))
+    value: Any = [dice.choice(PLAIN) for _ in range(size)]
+    if seed % 2:
+        value = {key if dice.random() < 0.5 else str(key): one for key, one in enumerate(value)}
+    rows = Rows("name", type(value))
+    for _ in range(6):
+        assert rows.take(value)
+        assert b"".join(rows.blocks) == encode_value({"name": value})
+        assert rows.sums == list(map(zlib.crc32, rows.blocks))
+        for _ in range(dice.randrange(3)):
+            key = dice.choice(list(value)) if seed % 2 else dice.randrange(len(value))
+            value[key] = dice.choice(PLAIN)
+        if dice.random() < 0.3 and len(value) > 70:
+            value.popitem() if seed % 2 else value.pop(dice.randrange(len(value)))
+
+
+@pytest.mark.parametrize("odd", [2**64, "\udc80", [], (1,), object()])
+def test_what_is_not_plain_is_no_row(odd: Any) -> None:
+    rows = Rows("name", list)
+    plain: list[Any] = list(range(200))
+    assert rows.take(plain)
+    assert not rows.take([*plain[:150], odd, *plain[150:]])
+    assert rows.take(plain)
+    assert b"".join(rows.blocks) == encode_value({"name": plain})
+
+
+async def test_two_variables_that_are_one_list_stay_one(system: hf.ActorSystem) -> None:
+    driver, _ = await warehouse(system, "list", "array")
+    actor = driver.standing("r1").server.life.cell.actor
+    actor.other = {"also": actor.list}
+    await driver.ask(Touch("list", 3))
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    await driver.ask(Touch("list", 4))
+    actor = driver.standing("r2").server.life.cell.actor
+    assert actor.other["also"] is actor.list
