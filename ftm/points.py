@@ -93,7 +93,7 @@ class Points(lives.LocalHost):
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None
         self._crashes = 0
-        self._is_work_lost = False
+        self._is_work_lost = self._is_given_up = False
         self._start_turn = -1
         self._async: frozenset[str] | None = None
 
