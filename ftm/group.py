@@ -25,7 +25,6 @@ from ..checkpoint.records import (
     Feed,
     Go,
     Live,
-    Out,
     Outcome,
     PipeDone,
     Released,
@@ -34,10 +33,12 @@ from ..checkpoint.records import (
     TurnEnd,
 )  # fmt: skip
 from ..checkpoint.saved import meta_now, put
+from .background import Background
 from .detector import Detection
-from .events import BackgroundWorkLost, ReplicaLost, WrongSuspicion
-from .messages import Done, Ended, Inward, Outward, Request, Work
+from .events import ReplicaLost, WrongSuspicion
+from .messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
 from .securing import Securing
+from .strays import Strays
 
 if TYPE_CHECKING:
     from ..actors.node import Node
@@ -80,6 +81,7 @@ class Group(Securing):
         self.up: dict[str, int] = {}  # name to life, of those heard of
         self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}
+        self.strays = Strays(self)
         self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
         self.failovers = 0
@@ -103,7 +105,7 @@ class Group(Securing):
         self.is_joining = False  # a replica is catching up
         self.is_poked = False
         self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
-        self.piped: set[tuple[int, int]] = set()  # background work that is out, by turn and output
+        self.background = Background(self)
         self._quiet: list[asyncio.Future[None]] = []
         self._stirred: list[asyncio.Future[None]] = []
         # Whom to tell.
@@ -192,6 +194,7 @@ class Group(Securing):
     def joined(self, name: str, life: int) -> None:
         """A replica has caught up, and could lead."""
         self.members[name] = life
+        self.strays.joined(name, life)
         self.stir()
         self.go_on()
         self.on_joined()
@@ -359,9 +362,15 @@ class Group(Securing):
         for record in done.more:
             if isinstance(record, Closed):
                 self.on_ended(record.reason)
+            elif isinstance(record, Strayed):
+                self.strays.told(record.path)
+            elif isinstance(record, WorkLost):
+                if self.background.is_lost(record.turn):
+                    self._give_up("a turn has failed with background work (pipe_to_self) out")
+                    return
             else:
                 if isinstance(record, PipeDone):
-                    self.piped.discard((record.turn, record.k))
+                    self.background.back(record)
                 self.switch.from_life(record)
         if done.live is not None and not self.is_live:
             self.is_live = True
@@ -397,21 +406,8 @@ class Group(Securing):
                     self._is_behind(record.turn)
                     return
                 if isinstance(record, Released):
-                    self._note_work(record.turn, record.outs)
+                    self.background.note(record.turn, record.outs)
                 self.switch.from_life(record)
-
-    def _note_work(self, turn: int, outs: list[Out]) -> None:
-        """Background work runs in the process of the replica that leads, and is part of no state."""
-        done = self.switch.pipes_done.get(turn, ())
-        self.piped.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
-
-    def work_is_lost(self) -> bool:
-        """Whoever led has died: is its background work only begun again if all is replayed? Tells of what is not."""
-        out, self.piped = self.piped, set()
-        if not out or self.switch.method.replays:
-            return bool(out)
-        self.node.emit(BackgroundWorkLost(self.path, self.epoch, len(out)))
-        return False
 
     def _is_front(self, record: Released) -> bool:
         """Whether it is of the turn that comes next, or of one that is known."""
@@ -427,9 +423,13 @@ class Group(Securing):
 
         It must never count: from the snapshot and the journal the life is as it was.
         """
+        self._give_up(f"{self.primary} has not got the state that was acknowledged at turn {turn}")
+
+    def _give_up(self, why: str) -> None:
+        """The life is over; another one begins as its home has it."""
         self.out = None  # It is nobody's fault that is inside.
-        self.is_over, self.why = True, f"{self.primary} has not got the state that was acknowledged at turn {turn}"
-        self.on_over(self.why)
+        self.is_over, self.why = True, why
+        self.on_over(why)
 
     def _is_of_now(self, epoch: int) -> bool:
         if epoch == self.epoch and not self.is_over and (self.primary or self.leading) is not None:
@@ -458,7 +458,7 @@ class Group(Securing):
             self.on_start_failed(end)
             return
         if end.outs:
-            self._note_work(end.turn, end.outs)
+            self.background.note(end.turn, end.outs)
         switch.from_life(end)
         if end.status != STASHED:
             self.ledger.pop(end.id, None)

@@ -39,7 +39,7 @@ from ..checkpoint.records import (
 from ..checkpoint.turns import Fed, GoLive, StopRecorded
 from .life import BLOCKED, ENDED, OVER, UNDONE, ServerLife
 from .mechanism import has_state_access
-from .messages import Request, State
+from .messages import Beside, Request, State
 from .points import Points
 
 PART: Final = 0.001
@@ -96,6 +96,7 @@ class Server(Points):
         if life is not self.life:
             return
         self.life = None
+        self.note_work(life)
         if not self._is_stopping and self._failed is None and reason.is_clean and life.ignored_why is None:
             self.is_over = True
             self.tell_more(Closed(0, pack_exit(reason), False))
@@ -131,6 +132,7 @@ class Server(Points):
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
         begin = time.perf_counter()
         self.begun, self.ends, self._is_abandoned, self._has_released = [], [], False, False
+        self._is_given_up = False
         self._pending = pending
         while pending and not self.is_over:
             if self.life is None:
@@ -160,11 +162,16 @@ class Server(Points):
         return ends
 
     async def part_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
-        """Nothing of the last part has happened: run it once more. `single`: one request at a time."""
+        """Nothing of the last part has happened: run it, and no more, again. `single`: one request at a time."""
         if single:
             self._singles = len(self.begun)
+        behind = list(pending)
+        pending.clear()
         self._take_back(pending)
-        return await self.part(pending)
+        ends = await self.part(pending)
+        if not self._is_given_up:
+            pending.extend(behind)
+        return ends
 
     def _take_back(self, pending: deque[Request]) -> None:
         """Nothing of this part has happened: the life begins again where it began."""
@@ -172,13 +179,13 @@ class Server(Points):
         self.begun, self.ends, self.life, self._withheld = [], [], None, []
         last = -1 if self.point is None else self.point.turn
         self.released = {turn: digests for turn, digests in self.released.items() if turn <= last}
-        self.more = [one for one in self.more if not isinstance(one, PipeDone)]
+        self.more = [one for one in self.more if not isinstance(one, PipeDone) or one.turn <= last]
 
     def _after_end(self, pending: deque[Request], chunk: list[Request]) -> bool:
         """The life has ended in the middle of a part. Whether to go on."""
         failed, self._failed = self._failed, None
         if self._is_abandoned:
-            self._is_abandoned = False
+            self._is_abandoned, self._is_given_up = False, True
             pending.clear()
             self.begun, self.ends = [], []
             return False
@@ -349,6 +356,7 @@ class Server(Points):
     async def adopt(self, state: State) -> None:
         """Go on from this state, with a life of its own; what led to it has happened elsewhere."""
         live = state.live or (self.life is not None and self.life.is_live)
+        self._is_work_lost = self.standing.leads  # What the turns that lead there have begun, they began elsewhere.
         await self.drop_life()
         self.install(msgspec.structs.replace(state, live=live))
         await self.ensure()
@@ -393,12 +401,12 @@ class Server(Points):
         if life is not None and cell is not None:
             cell.node.loop.call_soon(self._life_ended, life, cell.extra().reason)
 
-    def tell_more(self, record: PipeDone | Snapshot | Unsaved | Closed | Ignored) -> None:
+    def tell_more(self, record: Beside) -> None:
         """Something goes home behind the ends of the part at hand, or by itself."""
         self.more.append(record)
         self.on_more()
 
-    def take_more(self) -> list[PipeDone | Snapshot | Unsaved | Closed | Ignored]:
+    def take_more(self) -> list[Beside]:
         """What goes home behind the ends that are handed over now."""
         if self._snapshot_wanted:
             self._snapshot()

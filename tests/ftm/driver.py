@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,7 +25,7 @@ from holdfast.checkpoint.records import (
     TurnEnd,
 )
 from holdfast.ftm.mechanism import Mechanism
-from holdfast.ftm.messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Work
+from holdfast.ftm.messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Strayed, Work
 from holdfast.ftm.orders import Beat, Install, Join, Peer, Setting
 from holdfast.ftm.replica import Replica
 
@@ -40,6 +41,14 @@ class Proxy(hf.Actor):
     @hf.on(Done)
     def done(self, message: Done) -> Any:
         self._driver.take(message)
+        for one in message.more:
+            if isinstance(one, Strayed) and not self._driver.holds_strays:
+                self.ctx.create_task(self._again(one.path.rpartition("/")[2]))
+
+    async def _again(self, name: str) -> None:
+        """As the joiner does."""
+        with contextlib.suppress(hf.HoldfastError):
+            await self._driver.join(name)
 
     @hf.on(Outward)
     def outward(self, message: Outward) -> None:
@@ -79,7 +88,7 @@ class Driver:
         self.queue: list[Work] = []
         self.out_now: Work | None = None
         self.partial = -1
-        self.holds_ended = False
+        self.holds_ended = self.holds_strays = False
 
     async def start(self, names: Iterable[str] = ("r1", "r2"), isolation: str = "task", **setting: Any) -> None:
         """Start proxy, detector and replicas below a supervisor."""

@@ -164,6 +164,31 @@ async def test_a_turn_that_leaves_an_unsavable_state_fails(system: hf.ActorSyste
     assert await driver.ask(Read()) == [1, 3, 5]
 
 
+class _Slow:
+    """The clock of a busy machine: each look but every n-th finds that no time has passed."""
+
+    def __init__(self, every: int) -> None:
+        self._looks, self._every = 0, every
+
+    def perf_counter(self) -> float:
+        self._looks += 1
+        return float(self._looks // self._every)
+
+
+@pytest.mark.parametrize("every", range(2, 8))
+async def test_a_part_may_be_over_before_any_turn_that_is_run_again(
+    system: hf.ActorSystem, every: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a slow machine has left for the next part is not run with the one that is run again."""
+    driver = await pair(system)
+    driver.standing("r1").server._chunk = 1
+    monkeypatch.setattr("holdfast.ftm.server.time", _Slow(every))
+    keys = driver.send(Add(1), Spoil(2), Add(3), Fail(4), Spoil(5), Add(6), Add(7))
+    assert await driver.reply(keys[6]) == 17
+    assert [driver.ends[key].turn for key in keys] == [1, 2, 3, 4, 5, 6, 7]
+    assert [driver.ends[keys[at]].status for at in (1, 3, 4)] == ["failed"] * 3
+
+
 async def test_a_turn_that_fails_leaves_nothing_but_its_number(system: hf.ActorSystem) -> None:
     driver = await pair(system)
     keys = driver.send(Add(1), Fail(2), Add(3), Fail(4), Add(5))
@@ -265,9 +290,9 @@ async def test_lower_epochs_and_other_configurations_are_refused(system: hf.Acto
     body = system.node.codec.encoder.encode(Checkpoint(state, []))
     name = "holdfast.ftm.mechanisms.pbr:Checkpoint"
     with pytest.raises(StaleEpoch):
-        await after.ask(Letter(driver.epoch - 1, 0, name, body))
+        await after.ask(Letter(driver.epoch - 1, 0, name, body, size=len(body), stream=1, number=1))
     with pytest.raises(ConfigMismatch):
-        await after.ask(Letter(driver.epoch, 7, name, body))
+        await after.ask(Letter(driver.epoch, 7, name, body, size=len(body), stream=1, number=2))
     for order in (Lead(0, 0), Follow(0, 0), Join(0, driver.path("r2")), Export(0)):
         with pytest.raises((StaleEpoch, hf.RemoteCrash)):
             await driver.protocol("r1").ask(order)
