@@ -76,6 +76,7 @@ class Reconfiguration:
         self.stage = PREPARING
         self.prepared: dict[str, int] = {}  # name to life, of those that have the new bricks
         self.epoch = -1  # in which they were prepared
+        self.turn = -1  # the last one of the primary when it had come to rest
         self.behind: set[str] = set()  # those that have not got all that the primary had
         self.failed: dict[str, int] = {}  # name to life, of those that have not changed though they should have
         self.started: list[str] = []  # replicas that are new
@@ -179,8 +180,7 @@ class AdaptationEngine(Actor):
         members = {name: life for name, life in group.members.items() if group.is_well(name)}
         epoch = group.epoch
         self._step("prepare")
-        found = await self._ask_all(members, Prepare(change.config, change.descriptions), PREPARED_WITHIN)
-        errors = {name: error for name, error in found.items() if error is not None}
+        _, errors = await self._ask_all(members, Prepare(change.config, change.descriptions), PREPARED_WITHIN)
         if errors:
             await self._wait_for_change(LOOK_AGAIN)  # If it has died, that is known soon.
             for name, why in errors.items():
@@ -240,28 +240,29 @@ class AdaptationEngine(Actor):
     async def _is_at_rest(self, change: Reconfiguration) -> bool:
         group = self._group
         end = self._now() + change.rest_within
-        if not await self._ends(group.quiet(), change, end, "a turn of it has not ended"):
-            return False
         primary = group.primary
-        if primary is None or not self._is_as_prepared(change):
+        if primary is None:
             return False
         self._step("quiesce")
-        stands: dict[str, Stand] = {}
-        for name in (primary, *(one for one in change.prepared if one != primary)):
-            # The primary first: what it has sent has then reached the others.
-            asked = group.protocol(name).ask(Quiesce(group.epoch, group.config), change.rest_within + 1.0)
-            if not await self._ends(asked, change, end, f"{name} has not come to rest"):
+        # All at once, and behind the batch that is out: requests wait for one way there and back, not for one each.
+        order, seconds = Quiesce(group.epoch, group.config), change.rest_within + 1.0
+        asked = {name: group.protocol(name).ask(order, seconds) for name in change.prepared}
+        for future in asked.values():
+            future.add_done_callback(_heard)  # If this is given up, nobody looks at it.
+        if not await self._ends(group.quiet(), change, end, "a turn of it has not ended"):
+            return False
+        for name, future in asked.items():
+            if not await self._ends(future, change, end, f"{name} has not come to rest"):
                 return False
-            if asked.exception() is not None:
-                if isinstance(asked.exception(), (ConfigMismatch, StaleEpoch)):
-                    change.give_up(f"{name} stands elsewhere: {asked.exception()}")
+            if (error := future.exception()) is not None:
+                if isinstance(error, (ConfigMismatch, StaleEpoch)):
+                    change.give_up(f"{name} stands elsewhere: {error}")
                 return False
-            stands[name] = asked.result()
-        self._check_stands(change, stands, primary)
+        self._check_stands(change, {name: future.result() for name, future in asked.items()}, primary)
         return not change.why and self._is_as_prepared(change)
 
     def _check_stands(self, change: Reconfiguration, stands: dict[str, Stand], primary: str) -> None:
-        """Exactly one leads, and all have the same configuration; who has not the primary's state joins again."""
+        """Exactly one leads, and all have the same configuration."""
         group = self._group
         leading = [name for name, stand in stands.items() if stand.leads]
         if leading != [primary]:
@@ -269,21 +270,20 @@ class AdaptationEngine(Actor):
         configs = {stand.config for stand in stands.values()}
         if configs != {group.config}:
             change.give_up(f"the replicas have different configurations: {sorted(configs)}")
-        turn = stands[primary].turn
-        change.behind = {name for name, stand in stands.items() if stand.turn != turn}
+        change.turn = stands[primary].turn
 
     async def _commit(self, change: Reconfiguration) -> None:
         """Have all replicas bind their bricks anew. As soon as one has, there is no way back."""
         group = self._group
         group.is_resting = group.is_changing = True
         self._step("commit")
-        found = await self._ask_all(change.prepared, Commit(change.config), COMMITTED_WITHIN)
-        done = [name for name, error in found.items() if error is None]
+        turns, found = await self._ask_all(change.prepared, Commit(change.config), COMMITTED_WITHIN)
+        change.behind = {name for name, turn in turns.items() if turn != change.turn}
         for name, error in found.items():
-            if error is not None and group.life_of(name) == change.prepared[name]:
+            if group.life_of(name) == change.prepared[name]:
                 change.failed[name] = change.prepared[name]
                 group.suspect(name, change.prepared[name], f"it did not change its mechanism: {error}")
-        if not done:
+        if not turns:
             change.stage, change.why = UNDOING, f"no replica could: {'; '.join(str(one) for one in found.values())}"
             return
         self._step("switch")
@@ -376,10 +376,11 @@ class AdaptationEngine(Actor):
 
     async def _ask_all(
         self, names: dict[str, int], message: Message[Any], seconds: float
-    ) -> dict[str, BaseException | None]:
-        """Order all of these replicas at once: each one's error, if it has not done so."""
+    ) -> tuple[dict[str, Any], dict[str, BaseException]]:
+        """Order all of these replicas at once: replies, and the errors of those that have not done so."""
         group, asked = self._group, dict[str, asyncio.Future[Any]]()
-        found: dict[str, BaseException | None] = {}
+        replies: dict[str, Any] = {}
+        errors: dict[str, BaseException] = {}
         for name in names:
             cell = group.cell_of(name)
             try:
@@ -387,9 +388,17 @@ class AdaptationEngine(Actor):
                     raise CannotAdapt(group.place(name), "it has ended")
                 asked[name] = cell.ref.ask(message, timeout=seconds)
             except HoldfastError as error:
-                found[name] = error
+                errors[name] = error
         if asked:
             await asyncio.wait(asked.values())
         for name, future in asked.items():
-            found[name] = future.exception()
-        return found
+            if (failed := future.exception()) is not None:
+                errors[name] = failed
+            else:
+                replies[name] = future.result()
+        return replies, errors
+
+
+def _heard(done: asyncio.Future[Any]) -> None:
+    if not done.cancelled():
+        done.exception()

@@ -40,8 +40,11 @@ class Prepare(Message[None]):
     layers: list[Description]
 
 
-class Commit(Message[None]):
-    """Bind everything as that stack wants it, and end the bricks that are not needed. Nothing may be inside."""
+class Commit(Message[int]):
+    """Bind everything as that stack wants it, and end the bricks that are not needed. Nothing may be inside.
+
+    The reply is the last turn whose state is here.
+    """
 
     config: int
 
@@ -442,14 +445,14 @@ class Replica(Supervisor):
     async def _commit(self, message: Commit) -> Any:
         woven, self._prepared = self._prepared, None
         if self._woven.config == message.config:
-            return None  # It was done already.
+            return self._server.turn  # It was done already.
         if woven is None or woven.config != message.config:
             self._prepared = woven
             return self._fail(MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared"))
         await self._catch_up()
         await self._take_up(woven, behind=True)
         self._standing.peer_turn = -2  # What the other one has is not known to the new bricks.
-        return None
+        return self._server.turn
 
     async def _catch_up(self) -> None:
         """Nothing is inside the one that leads, but a follower may be behind it."""
