@@ -340,6 +340,16 @@ class ActorSystem(Recorded, Controls):
         """All recorded addresses, for those who change the tree."""
         return self._homes
 
+    def roll_back(self, path: str) -> None:
+        """Have a recorded actor that is stopped begin its next life with its snapshot before the newest.
+
+        What its turns since did to its state is undone (`RolledBack`); what has left stays out.
+
+        Raises:
+            ControlFailed: it is not recorded, it runs, or it has no older snapshot.
+        """
+        self._homes.roll_back(path, "it was asked for")
+
     def transaction(self, *, dry_run: bool = False, timeout: float = 10.0) -> Transaction:
         """Several changes of the running tree as one: `async with system.transaction() as change: change.add(...)`.
 
