@@ -36,6 +36,7 @@ from ..checkpoint.records import (
 from ..checkpoint.saved import meta_now, put
 from .detector import Detection
 from .events import BackgroundWorkLost, ReplicaLost, WrongSuspicion
+from .hold import Hold
 from .messages import Done, Ended, Inward, Outward, Request, Work
 from .securing import Securing
 
@@ -68,6 +69,7 @@ class Group(Securing):
         self.cell, self.switch, self.names, self.detection = cell, switch, names, detection
         self.path = cell.path
         self.config = config
+        self.hold = Hold(self.node, self.path)
         # Who leads, and who may.
         self.epoch = epoch
         self.primary: str | None = None

@@ -412,6 +412,7 @@ class GroupHost(Steered):
         group, self.group = self.group, None
         if group is not None:
             group.is_over = True
+            group.hold.give_back()
             if group.link is not None:
                 group.link.close()
             if group.change is not None:
@@ -432,6 +433,7 @@ class GroupHost(Steered):
         if ftm is not None and ftm.state is not GONE:
             if self.group is not None:
                 self.group.is_over = True
+                self.group.hold.give_back()
                 if self.group.change is not None:
                     self.group.change.close("it has stopped")
             ftm.kill()

@@ -228,9 +228,16 @@ class ActorSystem(Recorded, Controls):
         return LOCAL
 
     def _group_host(self, spec: ChildSpec) -> Host:
-        """Where the lives of a protected child are lived."""
-        from ..ftm.host import GroupHost  # Most systems protect nobody.
+        """Where the lives of a protected child are lived.
 
+        Raises:
+            MechanismRefused: its mechanisms do not go together, or not in this order.
+        """
+        from ..ftm.adaptation_rules import check_stack  # Most systems protect nobody.
+        from ..ftm.host import GroupHost
+        from ..ftm.mechanism import compose
+
+        check_stack(compose(spec.mechanism), spec.start.kind, spec.id)
         self._workers.want(spec.start.kind.__module__)
         self._workers.want(REPLICA)
         recovery = spec.recovery

@@ -28,8 +28,10 @@ from .messages import (
 from .policy import NORMAL, SAFE, Policy
 from .repairer import Repairer
 from .stock import (
+    attach_mechanism,
     bind_port,
     change_mechanism,
+    compose_mechanism,
     power_up,
     restart_child,
     restart_subtree,
@@ -39,6 +41,7 @@ from .stock import (
     shutdown,
     start_node,
     stop_node,
+    transition_mechanism,
 )
 
 __all__ = [
@@ -75,8 +78,10 @@ __all__ = [
     "SetMode",
     "Touched",
     "action",
+    "attach_mechanism",
     "bind_port",
     "change_mechanism",
+    "compose_mechanism",
     "power_up",
     "restart_child",
     "restart_subtree",
@@ -86,4 +91,5 @@ __all__ = [
     "shutdown",
     "start_node",
     "stop_node",
+    "transition_mechanism",
 ]
