@@ -80,6 +80,8 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
 
 
 def _both(one: Mechanism, above: Mechanism) -> str:
+    if one.name == above.name:
+        return "it stands in the composition twice"
     if one.replicas > 1 and above.replicas > 1:
         return f"it wants {one.replicas} replicas, and {above.name} outside of it keeps replicas already"
     return f"it and {above.name} are both of {one.layer}: two of them would work against each other"

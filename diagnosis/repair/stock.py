@@ -324,7 +324,7 @@ def _mechanism(
     options: Mapping[str, Any],
     **settings: Any,
 ) -> RepairAction:
-    whole = {"timeout": CHANGED_WITHIN, "cost": 5, "name": f"{verb}_{_word(mechanism)}"} | dict(options)
+    whole: dict[str, Any] = {"timeout": CHANGED_WITHIN, "cost": 5, "name": f"{verb}_{_word(mechanism)}", **options}
     seconds, cost, name = whole.pop("timeout"), whole.pop("cost"), whole.pop("name")
 
     async def run(act: Act, node: str) -> None:

@@ -52,11 +52,12 @@ class Gauge(Counter):
 
     @hf.on(Add)
     async def add(self, message: Add) -> int:  # type: ignore[override]  # pyright: ignore[reportIncompatibleMethodOverride]
-        reply = super().add(message)
+        self.total += message.amount
+        self.tags.append(message.tag)
         self._runs += 1
         is_wrong = self._runs % RARELY == 0 and os.path.exists(self._noise)
-        await self.ctx.publish("/readings", Reading(-1 if is_wrong else reply))
-        return reply
+        await self.ctx.publish("/readings", Reading(-1 if is_wrong else self.total))
+        return self.total
 
 
 class Lowest:
