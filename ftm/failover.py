@@ -93,7 +93,7 @@ class FailoverManager(Actor):
                 group.lost(leading, group.why)
                 group.leading = None
             left = group.backups()
-            if left and group.work_is_lost():  # From the journal it is begun again.
+            if left and group.background.is_lost():  # From the journal it is begun again.
                 group.why, left = f"{group.why}, with background work (pipe_to_self) out", []
             if not left:
                 group.is_over = True
@@ -143,6 +143,11 @@ class FailoverManager(Actor):
             if group.life_of(name) != life:  # Its next life has to be told first that it follows.
                 del group.joining[name]
                 group.dropped.add(name)
+        for name, life in list(group.strays.faulty.items()):
+            self._step("kill")
+            await bury(group, name, life)
+            group.strays.faulty.pop(name, None)
+            found = True
         for name in group.names:
             life = group.members.get(name, 0) or group.up.get(name, 0)
             if name == group.primary or not life:

@@ -347,8 +347,8 @@ class GroupHost(Steered):
         ended: ExitReason = KILLED
         while group.primary is not None or group.leading is not None:
             primary, epoch = group.primary, group.epoch
-            if primary is None:
-                await asyncio.sleep(0.005)  # Another one is being told to lead.
+            if primary is None or group.inside:
+                await asyncio.sleep(0.005)  # Another one is being told to lead, or knows more than the home.
                 continue
             try:
                 await group.protocol(primary).ask(Finish(epoch, dict(pack_exit(reason))), FINISHED_WITHIN)

@@ -141,12 +141,12 @@ class Arbiter:
         return self._in_the_way(address, hand, on_errand.get())
 
     def _in_the_way(self, address: str, hand: Hand, errand: object) -> InOtherHands | None:
-        # An adaptation waits by itself until its actor is up.
-        if hand is Hand.REPAIR and (busy := self._supervised(address)) is not None:
-            return InOtherHands(busy, "its supervisor", "it is being restarted")
         for other in list(self._overlapping(address)):
             if not (_is_one(errand, other) or hand.goes_before(other.hand) or hand.goes_beside(other.hand)):
                 return InOtherHands(other.address, other.hand.name.lower(), other.reason)
+        # An adaptation waits by itself until its actor is up.
+        if hand is Hand.REPAIR and (busy := self._supervised(address)) is not None:
+            return InOtherHands(busy, "its supervisor", "it is being restarted")
         return None
 
     @contextlib.contextmanager

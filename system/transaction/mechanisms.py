@@ -36,11 +36,11 @@ class OnProtection(OnLiving):
             raise busy
         place = self._place
         assert place is not None
-        if place.spec is None:
-            raise wrong(self.target, "nobody supervises it, so nobody would start it again")
         above = place.parent
         if above is not None and above.cell is not None and is_elsewhere(above.cell):
             raise wrong(self.target, "its supervisor lives in another process, which cannot have processes of its own")
+        if place.spec is None:
+            raise wrong(self.target, "nobody supervises it, so nobody would start it again")
 
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
         """Change it; whoever is cancelled gives up waiting, the change comes to its end."""

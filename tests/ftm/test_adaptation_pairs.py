@@ -84,7 +84,7 @@ async def change_to(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load, w
         raise
 
 
-def test_there_are_as_many_as_the_model_says() -> None:
+async def test_there_are_as_many_as_the_model_says() -> None:
     """With and without SEC: A&D over PBR or LFR, each way to keep replicas, each way to repeat."""
     assert len(STACKS) == 2 * (1 + 3 + 2) * 4 - 1
     way = tour(ALONE)

@@ -13,9 +13,6 @@ import holdfast as hf
 from holdfast.ftm.mechanism import ENTRY_POINTS, MechanismRefused, find
 from tests.ftm.accounts import Add, Counter, Tags
 
-# Processes do not care which event loop the root has.
-pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
-
 MODULE = "mechanisms_of_somebody"
 
 
@@ -53,6 +50,7 @@ def test_it_is_found_by_its_name_or_said_why_not(package: Path) -> None:
         find("nothing")
 
 
+@pytest.mark.asyncio(loop_factories=["uvloop"])  # Processes do not care which event loop the root has.
 async def test_it_is_attached_by_its_name(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter)))
     assert await ref.ask(Add(0)) == 1
