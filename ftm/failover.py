@@ -7,6 +7,7 @@ only then the proxy sends to it.
 
 from __future__ import annotations
 
+import asyncio
 import time
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,6 @@ from .messages import Lead
 from .orders import Peer
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Callable
 
     from .group import Group
@@ -59,6 +59,9 @@ class FailoverManager(Actor):
                 return  # It is short, and whoever does it wakes us.
             if group.primary is not None and not group.is_well(group.primary):
                 if group.is_awaited(group.primary):  # To end it would lose what only it has.
+                    self._later()
+                    return
+                if not group.hold.take(f"{group.primary} does not lead any more"):
                     self._later()
                     return
                 self._depose(group.primary)
@@ -127,6 +130,7 @@ class FailoverManager(Actor):
         for other in [one for one in group.members if one != name]:
             group.lost(other, "it has to catch up with the new primary")
         group.failovers += 1
+        group.hold.give_back()
         seconds = time.monotonic() - group.noticed if group.noticed else 0.0
         group.noticed = 0.0
         group.send_again(careful=True)
@@ -188,6 +192,15 @@ class FailoverManager(Actor):
 
 async def bury(group: Group, name: str, life: int) -> None:
     """Kill a replica's process, if it is that life, and wait until it has been reaped."""
+    while not group.is_over:
+        with group.hold.of(group.place(name), "it does not count any more") as is_ours:
+            if is_ours:
+                await _killed(group, name, life)
+                return
+        await asyncio.sleep(AGAIN_AFTER)
+
+
+async def _killed(group: Group, name: str, life: int) -> None:
     cell = group.cell_of(name)
     if cell is None or cell.life != life or cell.state is not RUNNING:
         return

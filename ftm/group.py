@@ -36,6 +36,7 @@ from ..checkpoint.saved import meta_now, put
 from .background import Background
 from .detector import Detection
 from .events import ReplicaLost, WrongSuspicion
+from .hold import Hold
 from .messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
 from .securing import Securing
 from .strays import Strays
@@ -69,6 +70,7 @@ class Group(Securing):
         self.cell, self.switch, self.names, self.detection = cell, switch, names, detection
         self.path = cell.path
         self.config = config
+        self.hold = Hold(self.node, self.path)
         # Who leads, and who may.
         self.epoch = epoch
         self.primary: str | None = None
@@ -93,6 +95,7 @@ class Group(Securing):
         self.finished: list[Ended] = []  # parts whose outcomes somebody waits to be at home
         self.ledger: dict[int, Feed] = {}  # what the home has fed and not heard the end of, in that order
         self.careful: set[int] = set()  # inputs in whose company a replica has died: each is sent alone
+        self.inside: set[int] = set()  # inputs that a replica had that does not lead any more, not ended since
         self.out: Work | None = None
         self.number = 0
         self.is_again = False
@@ -260,24 +263,26 @@ class Group(Securing):
             self.tell("proxy", Flush())
 
     def next_inward(self) -> Inward | None:
-        """What goes past the bricks."""
+        """What goes past the bricks; a snapshot is asked for when the home knows all that a replica does."""
         if not self.inward or self.primary is None:
             return None
         records, self.inward = self.inward, []
-        return Inward(self.epoch, records)
+        if self.inside:
+            self.inward = [one for one in records if isinstance(one, SnapshotNow)]
+            records = [one for one in records if not isinstance(one, SnapshotNow)]
+        return Inward(self.epoch, records) if records else None
 
     def next_work(self) -> Work | None:
-        """The next batch, if there is something, and none is out."""
-        if self.out is not None or self.primary is None or not self.waiting or self.is_suspended or self.is_stopping:
+        """The next batch, if there is something, and none is out. What was inside once is ended in any case."""
+        if self.out is not None or self.primary is None or not self.waiting or (self.has_gone and self.is_held):
             return None
-        if self.is_resting:
-            return None
-        if self.has_gone and self.is_held:
-            return None
+        takes_new = not (self.is_suspended or self.is_stopping or self.is_resting)
         requests, go, size = list[Request](), None, 0
         lives: dict[str, int] = {}
         while self.waiting and len(requests) < MOST_REQUESTS and size < MOST_BYTES:
             first = self.waiting[0]
+            if not takes_new and (isinstance(first, Go) or first.id not in self.inside):
+                break
             if isinstance(first, Go):
                 go = first
                 self.has_gone = True
@@ -289,6 +294,7 @@ class Group(Securing):
             self.waiting.popleft()
             if self.is_live and first.id not in self.switch.open:
                 self.ledger.pop(first.id, None)  # The home has dropped it meanwhile.
+                self._ended({first.id})
                 continue
             requests.append(self._request(first, lives))
             size += len(first.body)
@@ -320,6 +326,8 @@ class Group(Securing):
             self.careful = {one.feed.id for one in self.out.requests if one.feed.id in self.ledger}
         left = [feed for feed in self.ledger.values() if not self.is_live or feed.id in self.switch.open]
         self.ledger = {feed.id: feed for feed in left}
+        unsent = {one.id for one in self.waiting if isinstance(one, Feed)} - self.inside
+        self.inside = self.ledger.keys() - unsent
         left.sort(key=lambda feed: feed.id != begun)
         gone = [one for one in self.waiting if isinstance(one, Go)]
         self.waiting = deque(left)
@@ -378,8 +386,9 @@ class Group(Securing):
         out = self.out
         if done.is_last and out is not None and out.number == done.number:
             self.out = None
-            self._told_quiet()
-            self.careful.difference_update(one.feed.id for one in out.requests)
+            ended = {one.feed.id for one in out.requests}
+            self.careful -= ended
+            self._ended(ended)
             self._forget_turns()
         if done.wait:
             self.finished.append(Ended(self.epoch, done.part))
@@ -388,11 +397,17 @@ class Group(Securing):
         """A future that ends when nothing is inside any more; somebody has seen to it that nothing new goes in."""
         future: asyncio.Future[None] = self.node.loop.create_future()
         self._quiet.append(future)
-        if self.out is None and self.primary is not None:
-            self._told_quiet()
+        self._ended(set())
         return future
 
-    def _told_quiet(self) -> None:
+    def _ended(self, ids: set[int]) -> None:
+        """These have; whoever waits for that hears when there are no others inside."""
+        if self.inside:
+            self.inside -= ids
+            if not self.inside:
+                self.poke()  # What was held back meanwhile.
+        if self.inside or self.out is not None or self.primary is None:
+            return
         waiting, self._quiet = self._quiet, []
         for future in waiting:
             if not future.done():

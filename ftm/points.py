@@ -62,6 +62,11 @@ def checksum(parts: Iterable[bytes]) -> int:
     return found
 
 
+def is_blank(point: State) -> bool:
+    """Whether it only says how far turns were counted before this life: there is no state to go back to."""
+    return not point.data.size
+
+
 class Points(lives.LocalHost):
     """The lives of the protected actor, and the points that they begin at."""
 
@@ -160,7 +165,7 @@ class Points(lives.LocalHost):
         start = cell.extra().start
         assert start is not None
         life = ServerLife(cell, cast("Server", self), self.method)
-        has_state = point is not None and point.data.size > 0
+        has_state = point is not None and not is_blank(point)
         if point is not None and has_state:
             try:
                 data = point.data.whole()
@@ -334,12 +339,13 @@ class Points(lives.LocalHost):
             assert point is not None
             return point
         assert life.feed is None, "a state is captured between two turns, never in the middle of one"
-        if point is not None and point.turn == life.turn and point.live == life.is_live and not self.tail:
+        is_known = point is not None and point.turn == life.turn and point.live == life.is_live and not self.tail
+        if point is not None and is_known and not is_blank(point):
             return point
         actor: Any = life.cell.actor
         stash = [fed.feed for fed in life.stash]
         returned = [fed.feed for fed in life.returned.values()]
-        if self.has_deltas and point is not None and self._takes_delta(point):
+        if self.has_deltas and point is not None and not is_blank(point) and self._takes_delta(point):
             delta = encode_value(actor.get_delta(), where=f"{self.address}.get_delta()")
             self.marks = [*self.marks, point.turn]
             self.point = State(life.turn, point.data, [*point.deltas, delta], stash, returned, life.is_live)
