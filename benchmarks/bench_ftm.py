@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import itertools
 import json
 import os
@@ -55,6 +56,9 @@ WINDOW = 0.15  # seconds around a change, and of the quiet time beside it
 
 @contextlib.asynccontextmanager
 async def _system() -> AsyncGenerator[hf.ActorSystem, None]:
+    # As a program does that wants short pauses: a full collection of all that was imported takes longer than a change.
+    gc.collect()
+    gc.freeze()
     async with hf.ActorSystem("bench", log=False, intensity=100_000) as system:
         yield system
 
@@ -228,8 +232,8 @@ class Paced:
         return max(b - a for a, b in itertools.pairwise(inside)) * 1e3
 
 
-async def _windows(clients: Paced, change: Any) -> float:
-    """The longest gap around a change minus that of the quiet window before it."""
+async def _windows(clients: Paced, change: Any) -> tuple[float, float]:
+    """The longest gap in a quiet window, and that around the change behind it."""
     quiet = time.perf_counter()
     await asyncio.sleep(WINDOW)
     begin = time.perf_counter()
@@ -238,29 +242,43 @@ async def _windows(clients: Paced, change: Any) -> float:
     if rest > 0:
         await asyncio.sleep(rest)
     end = time.perf_counter()
-    gap = clients.longest(begin, end) - clients.longest(quiet, begin)
+    gaps = clients.longest(quiet, begin), clients.longest(begin, end)
     del clients.replies[:-10]
-    return gap
+    return gaps
 
 
 async def transitions(run: Run) -> None:
     """Client gaps while mechanisms are changed, beside stopping the child and starting it with the new spec."""
     for name, (first, second) in CHANGES.items():
-        gaps = await _transitions(first, second, run.size(200))
-        restarts = await _restarts(first, second, run.size(20))
-        p99 = statistics.quantiles(gaps, n=100)[98]
+        windows = await _transitions(first, second, run.size(200))
+        gaps = [around - quiet for quiet, around in windows]
+        noise = [after[0] - before[0] for before, after in itertools.pairwise(windows)]
+        restarts = [around - quiet for quiet, around in await _restarts(first, second, run.size(20))]
         print(
-            f"# {name}: longest client gap beyond the quiet one, ms: median {statistics.median(gaps):.2f} p90 "
-            f"{statistics.quantiles(gaps, n=10)[8]:.2f} p99 {p99:.2f} worst {max(gaps):.2f}; by stopping and starting "
-            f"the child: median {statistics.median(restarts):.1f} worst {max(restarts):.1f}"
+            f"# {name}: longest client gap beyond that of the quiet window before, ms: {_spread(gaps)}; "
+            f"of a quiet window beyond that of another: {_spread(noise)}; "
+            f"by stopping and starting the child: {_spread(restarts)}",
+            flush=True,
         )
-        run.bound(f"transition, {name}, client gap, p99 of {len(gaps)}", p99, unit="ms", target=5.0)
+        job = f"transition, {name}, client gap, p99 of {len(gaps)}"
+        run.bound(job, _percentile(gaps, 99), unit="ms", target=5.0)
 
 
-async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) -> list[float]:
+def _percentile(values: list[float], at: int) -> float:
+    return statistics.quantiles(values, n=100, method="inclusive")[at - 1]
+
+
+def _spread(values: list[float]) -> str:
+    return (
+        f"median {statistics.median(values):.2f} p90 {_percentile(values, 90):.2f} "
+        f"p99 {_percentile(values, 99):.2f} worst {max(values):.2f}"
+    )
+
+
+async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) -> list[tuple[float, float]]:
     async with _system() as system:
         ref = await _protected(system, "c", first)
-        clients, gaps = Paced(lambda: ref), list[float]()
+        clients, gaps = Paced(lambda: ref), list[tuple[float, float]]()
         await asyncio.sleep(0.3)
         for number in range(count):
             target = first if number % 2 else second
@@ -277,10 +295,10 @@ async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) 
     return gaps
 
 
-async def _restarts(first: Sequence[Any], second: Sequence[Any], count: int) -> list[float]:
+async def _restarts(first: Sequence[Any], second: Sequence[Any], count: int) -> list[tuple[float, float]]:
     async with _system() as system:
         holder = [await _protected(system, "c", first)]
-        clients, gaps = Paced(lambda: holder[0]), list[float]()
+        clients, gaps = Paced(lambda: holder[0]), list[tuple[float, float]]()
         await asyncio.sleep(0.3)
         for number in range(count):
             target = first if number % 2 else second
