@@ -81,7 +81,7 @@ def _pid(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> int:
 
 async def latency(run: Run) -> None:
     """An ask of each mechanism beside the unprotected one, and where its time goes."""
-    count = run.size(3000)
+    count = run.size(1500)
     async with _system() as system:
         plain = await system.start(hf.child("plain", hf.start(Count), isolation="process"))
         await ask_all(plain.ask, Bump(), 500)
@@ -119,7 +119,8 @@ async def _print_bricks(name: str, layers: Sequence[Any], count: int) -> None:
             for line in file.read_text().splitlines():
                 seen += [(moment, step) for moment, step in json.loads(line)]
     steps = ftm_timing.by_brick(asks, seen)
-    print(f"# {name}: us until each step  " + "  ".join(f"{step} {seconds * 1e6:.0f}" for step, seconds in steps))
+    line = "  ".join(f"{step} {seconds * 1e6:.0f}" for step, seconds in steps)
+    print(f"# {name}: us until each step  {line}", flush=True)
 
 
 async def throughput(run: Run) -> None:
@@ -319,6 +320,7 @@ async def state_size(run: Run) -> None:
     """One request after the other under PBR, as the state grows to 10 MB."""
     sizes = (10_000, 100_000, 1_000_000, 10_000_000)
     times: dict[type, list[float]] = {Whole: [], Parts: []}
+    used: dict[type, list[float]] = {Whole: [], Parts: []}
     bounds: list[float] = []
     for kind in (Parts, Whole):
         for size in sizes:
@@ -327,18 +329,27 @@ async def state_size(run: Run) -> None:
                 ref = await _protected(system, "big", STACKS["PBR"], start)
                 count = run.size(200 if size < 10**7 or kind is Parts else 40)
                 await _changes(ref, 5)
-                times[kind].append(min([await _changes(ref, max(5, count // 2)) for _ in range(run.n)]))
+                pids = [*system._workers.processes().values(), os.getpid()]
+                before, rounds = sum(map(_processor, pids)), max(5, count // 2)
+                times[kind].append(min([await _changes(ref, rounds) for _ in range(run.n)]))
+                used[kind].append((sum(map(_processor, pids)) - before) / rounds / run.n)
             if kind is Whole:
                 bounds.append(_encoded_and_compared(size))
     print("# size of the state: " + ", ".join(f"{size / 1000:g} kB" for size in sizes))
-    print("#   with deltas, us a request: " + ", ".join(f"{one * 1e6:.0f}" for one in times[Parts]))
-    print("#   whole, us a request: " + ", ".join(f"{one * 1e6:.0f}" for one in times[Whole]))
-    print("#   one comparison plus one encoding, us: " + ", ".join(f"{one * 1e6:.0f}" for one in bounds))
+    for kind, name in ((Parts, "with deltas"), (Whole, "whole")):
+        print(f"#   {name}, us a request: " + ", ".join(f"{one * 1e6:.0f}" for one in times[kind]))
+        print(f"#   {name}, us of processor, all processes: " + ", ".join(f"{one * 1e6:.0f}" for one in used[kind]))
+    print("#   one comparison plus one encoding, us: " + ", ".join(f"{one * 1e6:.0f}" for one in bounds), flush=True)
     growth = times[Parts][-1] / times[Parts][0]
     run.bound("cost of a request with deltas, state of 10 MB over 10 kB", growth, unit="x", target=2.0)
     added = (times[Whole][-1] - times[Whole][0]) / bounds[-1]
     job = "cost of a request beyond that with 10 kB, whole state of 10 MB, over one comparison plus one encoding"
     run.bound(job, added, unit="x", target=1.5)
+
+
+def _processor(pid: int) -> float:
+    """Seconds that a process has computed."""
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[0]) / 1e9
 
 
 async def _changes(ref: hf.ActorRef[Any], count: int) -> float:

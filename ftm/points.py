@@ -9,6 +9,7 @@ import asyncio
 import zlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
+from operator import is_
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import msgspec
@@ -60,6 +61,10 @@ def checksum(parts: Iterable[bytes]) -> int:
     for part in parts:
         found = zlib.crc32(part, found)
     return found
+
+
+def _begins_with(parts: list[bytes], first: list[bytes]) -> bool:
+    return len(first) <= len(parts) and all(map(is_, first, parts))
 
 
 def is_blank(point: State) -> bool:
@@ -388,9 +393,14 @@ class Points(lives.LocalHost):
         else:
             before = None if self.previous is None else self.previous[0]
             base = next((one for one in (given, before) if one is not None and one.turn == turn), None)
-            if base is None or point.data.size <= BLOCK:
+            if base is None:
                 return None
-            patch = make_patch(base.data, point.data)
+            if base.data is point.data and _begins_with(point.deltas, base.deltas):  # It was taken back meanwhile.
+                deltas = point.deltas[len(base.deltas) :]
+            elif point.data.size <= BLOCK:
+                return None
+            else:
+                patch = make_patch(base.data, point.data)
         check = checksum(deltas)
         ids, traps, absent = point.stash_ids, point.traps, point.absent
         stash, returned = point.stash, point.returned

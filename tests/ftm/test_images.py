@@ -347,3 +347,21 @@ async def test_two_variables_that_are_one_list_stay_one(system: hf.ActorSystem) 
     await driver.ask(Touch("list", 4))
     actor = driver.standing("r2").server.life.cell.actor
     assert actor.other["also"] is actor.list
+
+
+async def test_after_a_turn_that_was_taken_back_only_new_deltas_are_sent(system: hf.ActorSystem) -> None:
+    driver = await pair(system, Ledger)
+    heard = Heard(driver)
+    for at in range(5):
+        await driver.ask(Touch("", at))
+    with pytest.raises(hf.RemoteCrash):
+        await driver.ask(Break())
+    heard.take()
+    await driver.ask(Touch("", 9))
+    (said,) = heard.take()
+    assert isinstance(said, Change)
+    assert len(said.deltas) == 1
+    seen = await driver.ask(Sum())
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Sum()) == seen

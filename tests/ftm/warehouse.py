@@ -123,6 +123,11 @@ class Ledger(hf.Actor):
         self.values[message.at] = self._changed[message.at] = self.values.get(message.at, 0) + 1
         return self.values[message.at]
 
+    @hf.on(Break)
+    def fail(self, message: Break) -> int:
+        self.values.clear()
+        raise RuntimeError("broken")
+
     @hf.on(Sum, readonly=True)
     def sum(self, message: Sum) -> bytes:
         return state_digest(self.values)
