@@ -35,6 +35,8 @@ SCRIPTS = "holdfast_script_"
 """How the modules of reconfiguration scripts are called: only the process that runs the script has them by name."""
 ENTRY_POINTS = "holdfast.mechanisms"
 BUILT_IN = ("pbr", "lfr", "tr", "ad", "rb", "nvp", "tmr", "sec")
+COMMON = tuple(f"{__package__}.mechanisms.{name}" for name in BUILT_IN if name != "sec")
+"""Modules that each replica has from its first moment; not that which needs an extra."""
 
 
 class MechanismRefused(HoldfastError):

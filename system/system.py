@@ -235,11 +235,13 @@ class ActorSystem(Recorded, Controls):
         """
         from ..ftm.adaptation_rules import check_stack  # Most systems protect nobody.
         from ..ftm.host import GroupHost
-        from ..ftm.mechanism import compose
+        from ..ftm.mechanism import COMMON, compose
 
         check_stack(compose(spec.mechanism), spec.start.kind, spec.id)
         self._workers.want(spec.start.kind.__module__)
         self._workers.want(REPLICA)
+        for name in COMMON:  # A replica that changes over must not import, and perhaps compile, while requests wait.
+            self._workers.want(name)
         recovery = spec.recovery
         return GroupHost(self._homes, recovery if recovery is not None and recovery.records else None, spec.mechanism)
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import sys
 from typing import Any
 
 import pytest
 
 import holdfast as hf
 from holdfast.ftm.events import ReplicaJoined
+from holdfast.ftm.mechanism import COMMON
 from tests.ftm.accounts import Add, Counter, Tags
 
 STACKS = {
@@ -43,3 +45,19 @@ async def test_kills_of_the_one_that_leads_lose_and_double_nothing(system: hf.Ac
     events.close()
     assert replies == list(range(1, 301))
     assert await ref.ask(Tags()) == list(range(300))
+
+
+class Known(hf.Message[list[str]]): ...
+
+
+class Modules(hf.Actor):
+    """Says what its process has imported."""
+
+    @hf.on(Known)
+    def known(self, message: Known) -> list[str]:
+        return [name for name in COMMON if name in sys.modules]
+
+
+async def test_a_replica_has_what_it_may_change_over_to(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("c", hf.start(Modules), mechanism=hf.PBR()))
+    assert await ref.ask(Known()) == list(COMMON)
