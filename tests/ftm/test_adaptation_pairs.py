@@ -18,22 +18,15 @@ from holdfast.ftm.declaration import LAYERS
 from holdfast.ftm.mechanism import BUILT_IN, Mechanism, code_of, find
 from holdfast.ftm.model import nesting_problems
 from holdfast.ftm.sec.authority import CertificationAuthority
-from tests.ftm import versions
 from tests.ftm.accounts import Counter, Load, Tags
 from tests.ftm.test_adaptation import stack, transition
 from tests.ftm.test_adaptation_trouble import fails, struck
 from tests.ftm.test_failover import group_of, two_again
+from tests.ftm.versions import SETTINGS
 
 # Processes do not care which event loop the root has.
 pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
 
-CA = "/app/ca"
-SETTINGS: dict[str, dict[str, Any]] = {
-    "ad": {"assertions": (versions.tags_are_known,)},
-    "rb": {"alternates": (versions.SameCounter,), "test": (versions.tags_are_known,)},
-    "nvp": {"versions": (versions.SameCounter, versions.OtherCounter)},
-    "sec": {"authority": CA},
-}
 Stack = tuple[str, ...]
 
 
