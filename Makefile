@@ -16,9 +16,12 @@ demo: $(VENV)/.demo
 test: $(VENV)/.dev
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(PYTEST_ARGS)
 
-# Hours of it: every kind of end, again and again, and every safety check removed once. See docs/testing.md.
+# Hours of it: every kind of end, again and again, every safety check removed once, and every test under both event
+# loops. See docs/testing.md.
 campaign: $(VENV)/.dev
+	HOLDFAST_LOOPS=both $(MAKE) --no-print-directory test
 	HOLDFAST_KILLS=10000 HOLDFAST_CUTS=5000 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
+	    -o faulthandler_timeout=900 \
 	    tests/checkpoint/test_kills.py tests/checkpoint/sqlite/test_power.py tests/checkpoint/test_removed.py
 
 # The static part of `check`, cheapest first.

@@ -14,12 +14,14 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # Before numpy: sums are to be rounded alike here and in processes.
 
 import dataclasses
+import multiprocessing
 import random
 import resource
 import statistics
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 
 from harness import Run, main
@@ -38,6 +40,7 @@ INTERVAL = 2.0  # seconds of the recording between snapshots
 KILL_AT = 9.0  # seconds of the recording, as in the paper
 RANDOM_KILLS = 5
 QUICK_LIMIT = 60  # messages
+FIRST_STARTS = 5
 METHODS = ("fresh", "checkpoint_only", "replay_only", "hybrid")
 MARKS = {True: "correct", False: "NOT", None: "some"}
 
@@ -73,7 +76,7 @@ class Baseline:
 
     digest: str
     span: float  # seconds of the recording
-    starting: float  # seconds until the actor is up: its own `__init__`, that is
+    starting: float  # seconds that its own `__init__` takes in a new process, at most
     handling: tuple[float, ...]  # seconds in the handler, of each message
     times: tuple[float, ...]  # when each message was recorded
 
@@ -121,10 +124,28 @@ def method_of(name: str, interval: float) -> Method:
 async def baseline_of(kind: type[common.Program], limit: int | None) -> Baseline:
     """Run a program as a task: an ask adds a few microseconds to its handlers."""
     program = Timing(kind(common.DATA, limit))
+    starting = first_start(program.start())
     result = await common.run(program, hf.fresh(), isolation="task")
-    return Baseline(
-        result.digest, max(program.times[-1], 1e-3), result.start_seconds, result.waits, tuple(program.times)
-    )
+    return Baseline(result.digest, max(program.times[-1], 1e-3), starting, result.waits, tuple(program.times))
+
+
+def first_start(recipe: hf.Start[hf.Actor]) -> float:
+    """Seconds that an actor's own `__init__` takes in a process that has done nothing yet, without holdfast around it.
+
+    A recovery starts the program in a new process, where it takes longer than where it was started before: memory is
+    touched for the first time and libraries set themselves up. How much longer varies: the `__init__` of
+    `scan_localisation` takes 92 ms the second time and 98 to 208 ms the first time. That is the program's, not ours, so
+    the longest of several is what a recovery is compared with.
+    """
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(1, mp_context=context, max_tasks_per_child=1) as processes:
+        return max(processes.submit(_seconds_of_init, recipe).result() for _ in range(FIRST_STARTS))
+
+
+def _seconds_of_init(recipe: hf.Start[hf.Actor]) -> float:
+    began = time.perf_counter()
+    recipe.kind(*recipe.args, **recipe.kwargs)
+    return time.perf_counter() - began
 
 
 class Timing(common.Program):
@@ -190,7 +211,7 @@ async def correctness_and_times(run: Run) -> None:
     _plot_times(times)
     missed = sum(1 for (_, method), (_, same, runs) in table.items() if method == "hybrid" and same != runs)
     run.bound("programs with a hybrid run that does not end bit-identical", missed, unit="programs", target=0)
-    job = "recovery beyond 1.1 times the handlers of what is replayed and the program's own start, worst run"
+    job = "recovery beyond 1.1 times the handlers of what is replayed and the program's own first start, worst run"
     run.bound(job, worst, unit="ms", target=20.0)
 
 

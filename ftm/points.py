@@ -49,6 +49,11 @@ TurnHook = Callable[[Any, TurnEnd], TurnEnd]
 """Takes the server and the end of a turn, and returns what the end is to be."""
 
 
+def is_blank(point: State) -> bool:
+    """Whether it only says how far turns were counted before this life: there is no state to go back to."""
+    return point.data == b""
+
+
 class Points(lives.LocalHost):
     """The lives of the protected actor, and the points that they begin at."""
 
@@ -93,7 +98,7 @@ class Points(lives.LocalHost):
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None
         self._crashes = 0
-        self._is_work_lost = False
+        self._is_work_lost = self._is_given_up = False
         self._start_turn = -1
         self._async: frozenset[str] | None = None
 
@@ -143,7 +148,7 @@ class Points(lives.LocalHost):
         start = cell.extra().start
         assert start is not None
         life = ServerLife(cell, cast("Server", self), self.method)
-        has_state = point is not None and point.data != b""
+        has_state = point is not None and not is_blank(point)
         if point is not None and has_state:
             life.from_home(Restore(point.data))
         turn = self._start_turn if point is None else point.turn
@@ -310,12 +315,13 @@ class Points(lives.LocalHost):
             assert point is not None
             return point
         assert life.feed is None, "a state is captured between two turns, never in the middle of one"
-        if point is not None and point.turn == life.turn and point.live == life.is_live and not self.tail:
+        is_known = point is not None and point.turn == life.turn and point.live == life.is_live and not self.tail
+        if point is not None and is_known and not is_blank(point):
             return point
         actor: Any = life.cell.actor
         stash = [fed.feed for fed in life.stash]
         returned = [fed.feed for fed in life.returned.values()]
-        is_chain = self.has_deltas and point is not None and not point.stash_ids
+        is_chain = self.has_deltas and point is not None and not is_blank(point) and not point.stash_ids
         if is_chain and point is not None and sum(map(len, point.deltas)) <= max(COMPACT_BYTES, len(point.data)):
             delta = encode_value(actor.get_delta(), where=f"{self.address}.get_delta()")
             self.marks = [*self.marks, point.turn]

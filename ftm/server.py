@@ -132,6 +132,7 @@ class Server(Points):
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
         begin = time.perf_counter()
         self.begun, self.ends, self._is_abandoned, self._has_released = [], [], False, False
+        self._is_given_up = False
         self._pending = pending
         while pending and not self.is_over:
             if self.life is None:
@@ -161,11 +162,16 @@ class Server(Points):
         return ends
 
     async def part_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
-        """Nothing of the last part has happened: run it once more. `single`: one request at a time."""
+        """Nothing of the last part has happened: run it, and no more, again. `single`: one request at a time."""
         if single:
             self._singles = len(self.begun)
+        behind = list(pending)
+        pending.clear()
         self._take_back(pending)
-        return await self.part(pending)
+        ends = await self.part(pending)
+        if not self._is_given_up:
+            pending.extend(behind)
+        return ends
 
     def _take_back(self, pending: deque[Request]) -> None:
         """Nothing of this part has happened: the life begins again where it began."""
@@ -179,7 +185,7 @@ class Server(Points):
         """The life has ended in the middle of a part. Whether to go on."""
         failed, self._failed = self._failed, None
         if self._is_abandoned:
-            self._is_abandoned = False
+            self._is_abandoned, self._is_given_up = False, True
             pending.clear()
             self.begun, self.ends = [], []
             return False

@@ -1,14 +1,22 @@
-"""Every async test runs under both event loops, and no test leaves anything behind.
+"""Every folder of tests meets both event loops, and no test leaves anything behind.
 
-A test that must not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories=["uvloop"])`; one
-that is about time asks for `loop_factories=["virtual"]`, where nothing waits (`holdfast.testing.clock`). The loops are
-named in pyproject.toml (`holdfast_loops`) and made by our own plugin.
+The tests of `actors/`, which is what touches the loop, run under both loops. Of any other async test each set of
+parameters runs under one of the two, in turn; `HOLDFAST_LOOPS=both` has all of them run under both. A test that must
+not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories=["uvloop"])`, one that shall always run
+under both with `loop_factories=["uvloop", "asyncio"]`, and one that is about time, where nothing waits, with
+`loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops are named in pyproject.toml (`holdfast_loops`) and
+made by our own plugin.
 """
 
+import asyncio
 import os
+import sys
 import time
+import zlib
+from collections import defaultdict
 from collections.abc import AsyncIterator, Iterator
 from importlib.metadata import entry_points
+from pathlib import Path
 
 import hypothesis
 import psutil
@@ -22,12 +30,59 @@ from holdfast.testing.leaks import Leaks, end_processes, is_of_test
 IS_INSTALLED = bool(entry_points(group="pytest11", name="holdfast"))
 pytest_plugins = ["pytester", *([] if IS_INSTALLED else ["holdfast.testing.plugin"])]
 
+# The tests start thousands of processes that import holdfast. Where the environment forbids byte code, each of them
+# would compile all of it, which takes longer than most tests do.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
 # A whole actor system may start and stop within one example, on a machine that is busy with other things.
 hypothesis.settings.register_profile("holdfast", deadline=None, print_blob=True)
 hypothesis.settings.load_profile("holdfast")
 
+LOOP = "_asyncio_loop_factory"  # the parameter that pytest-asyncio adds
+UNDER_BOTH = Path(__file__).parent / "actors"
+
 # Inherited by every process that a test starts, so that orphans are found: they are nobody's children any more.
 MARK = "HOLDFAST_TEST_RUN"
+
+
+@pytest.hookimpl(trylast=True)  # Behind -k and -m: what these have left of a test is run.
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave each test the loops that it shall run under."""
+    if os.environ.get("HOLDFAST_LOOPS") == "both":
+        return
+    places = Places()
+    runs: defaultdict[tuple[object, ...], defaultdict[int, list[pytest.Item]]] = defaultdict(lambda: defaultdict(list))
+    for item in items:
+        callspec = getattr(item, "callspec", None)
+        if callspec is not None and LOOP in callspec.params and not _chooses_loops(item):
+            params = dict(callspec.params)
+            loop, test = id(params.pop(LOOP)), item.nodeid.partition("[")[0]
+            runs[(test, *(places.of(test, name, value) for name, value in params.items()))][loop].append(item)
+    dropped: set[pytest.Item] = set()
+    for (test, *parameters), under in runs.items():
+        # In turn along each parameter. The name, or all tests without parameters would run under the same loop.
+        chosen = (zlib.crc32(str(test).encode()) + sum(map(int, parameters))) % len(under)
+        dropped.update(item for number, some in enumerate(under.values()) if number != chosen for item in some)
+    if dropped:
+        config.hook.pytest_deselected(items=list(dropped))
+        items[:] = [item for item in items if item not in dropped]
+
+
+class Places:
+    """The values of each parameter by number: the very objects, for they need not be comparable."""
+
+    def __init__(self) -> None:
+        self._places: defaultdict[tuple[str, str], dict[int, int]] = defaultdict(dict)
+
+    def of(self, test: str, name: str, value: object) -> int:
+        known = self._places[test, name]
+        return known.setdefault(id(value), len(known))
+
+
+def _chooses_loops(item: pytest.Item) -> bool:
+    marker = item.get_closest_marker("asyncio")
+    return item.path.is_relative_to(UNDER_BOTH) or (marker is not None and "loop_factories" in marker.kwargs)
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -62,7 +117,13 @@ def no_task_left_if_async(nothing_left: None, request: pytest.FixtureRequest) ->
 
 @pytest.fixture
 async def no_task_left() -> AsyncIterator[None]:
-    """Fail an async test that leaves a task running; its own fixtures have been torn down by then."""
+    """Fail an async test that leaves a task running; its own fixtures have been torn down by then.
+
+    The stock loop (and the virtual clock, which is one) is in debug mode, which sees calls from other threads and keeps
+    the origin of each callback. That takes more time than the tests themselves, so uvloop runs as it does for users.
+    """
+    loop = asyncio.get_running_loop()
+    loop.set_debug(isinstance(loop, asyncio.BaseEventLoop))
     leaks = Leaks()
     yield
     left = await leaks.tasks()

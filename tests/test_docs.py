@@ -45,6 +45,15 @@ def module_names(paths: list[str], prefix: str) -> Iterator[str]:
             yield from module_names([f"{path}/{found.name.removeprefix(prefix)}" for path in paths], f"{found.name}.")
 
 
+def source_of(name: str) -> Path:
+    """The file of a module, without importing it."""
+    path = ROOT.joinpath(*name.split(".")[1:])
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+MODULES = ["holdfast", *module_names(list(holdfast.__path__), "holdfast.")]
+
+
 def python_blocks(text: str) -> Iterator[Block]:
     for found in FENCE.finditer(text):
         language = found["info"].strip()
@@ -87,11 +96,17 @@ def run(path: Path) -> tuple[int, str]:
     return process.returncode, output
 
 
-@pytest.mark.parametrize("name", ["holdfast", *module_names(list(holdfast.__path__), "holdfast.")])
+@pytest.mark.parametrize("name", [name for name in MODULES if ">>>" in source_of(name).read_text("utf-8")])
 def test_docstring_examples(name: str) -> None:
     module = importlib.import_module(name)
-    failures, _ = doctest.testmod(module, optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
+    failures, count = doctest.testmod(module, optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
     assert failures == 0, "see the captured output"
+    assert count > 0
+
+
+def test_every_module_can_be_imported() -> None:
+    for name in MODULES:
+        assert Path(str(importlib.import_module(name).__file__)).samefile(source_of(name))
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))

@@ -77,7 +77,7 @@ async def planner(system: hf.ActorSystem, isolation: str, name: str = "planner",
 
 
 async def words(ref: hf.ActorRef[Any]) -> list[str]:
-    return await ref.ask(Words(), timeout=8.0)
+    return await ref.ask(Words(), timeout=30.0)
 
 
 async def over(system: hf.ActorSystem) -> None:

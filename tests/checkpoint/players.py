@@ -273,7 +273,7 @@ class Unsavable(hf.Actor):
         self.lock = asyncio.Lock()
 
 
-async def until(is_so: Any, seconds: float = 20.0) -> None:
+async def until(is_so: Any, seconds: float = 60.0) -> None:
     """Wait for something that only shows when it is looked at."""
     async with asyncio.timeout(seconds):
         while not is_so():

@@ -34,7 +34,7 @@ def strike(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
 
 
 async def event(stream: hf.EventStream, kind: type[E]) -> E:
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         async for one in stream:
             if isinstance(one, kind):
                 return one

@@ -75,17 +75,17 @@ async def test_tells_beyond_the_capacity(
             await held.let_go(system)
             told = await event(stream, hf.HeldMessages)
         expected = ["before", "waits", *kept]
-        assert await ref.ask(Seen(), timeout=8.0) == expected
+        assert await ref.ask(Seen(), timeout=30.0) == expected
         assert failures == refused
         assert letters == [n for n in map(str, range(6)) if n not in kept][: 6 - refused - len(kept)]
         assert (told.held, told.dropped, told.refused) == (len(kept), len(letters), refused)
         held.go_on.set()
         await struck(system, ref)
-        assert await ref.ask(Seen(), timeout=8.0) == expected, "the replay is the same"
+        assert await ref.ask(Seen(), timeout=30.0) == expected, "the replay is the same"
     if store is not None:
         async with running(store) as system:
             ref = await doer(system, isolation)
-            assert await ref.ask(Seen(), timeout=8.0) == expected, "also from the store"
+            assert await ref.ask(Seen(), timeout=30.0) == expected, "also from the store"
 
 
 async def test_sends_and_asks_wait_at_block_and_come_behind_what_is_held(isolation: str) -> None:
@@ -95,7 +95,7 @@ async def test_sends_and_asks_wait_at_block_and_come_behind_what_is_held(isolati
         await held.strike(system, ref)
         ref.tell(Note("1"))
         ref.tell(Note("2"))
-        asked = ref.ask(Note("asked"), timeout=8.0)
+        asked = ref.ask(Note("asked"), timeout=30.0)
         late = ref.ask(Note("late"), timeout=0.05)
         sending = asyncio.ensure_future(ref.send(Note("sent")))
         with pytest.raises(hf.AskTimeout) as late_error:
@@ -115,7 +115,7 @@ async def test_held_asks_keep_their_deadline(isolation: str) -> None:
     async with running(recovery_hooks=held.hooks) as system:
         ref = await doer(system, isolation, held=hf.held(10))
         await held.strike(system, ref)
-        late, patient = ref.ask(Note("late"), timeout=0.05), ref.ask(Note("patient"), timeout=8.0)
+        late, patient = ref.ask(Note("late"), timeout=0.05), ref.ask(Note("patient"), timeout=30.0)
         with pytest.raises(hf.AskTimeout):
             await late
         await held.let_go(system)
@@ -129,7 +129,7 @@ async def test_an_ask_that_loses_its_place_hears_of_it(isolation: str, overflow:
     async with running(recovery_hooks=held.hooks) as system:
         ref = await doer(system, isolation, held=hf.held(1, overflow=overflow))
         await held.strike(system, ref)
-        first, second = ref.ask(Note("first"), timeout=8.0), ref.ask(Note("second"), timeout=8.0)
+        first, second = ref.ask(Note("first"), timeout=30.0), ref.ask(Note("second"), timeout=30.0)
         loser, winner = (second, first) if overflow == "reject" else (first, second)
         with pytest.raises(hf.MailboxFull):
             await loser
@@ -144,7 +144,7 @@ async def test_a_send_from_a_recorded_turn_waits_too(isolation: str) -> None:
         system.homes.recoveries.hooks = hooks
         ref, sender = await doer(system, isolation, held=hf.held(2)), await doer(system, "task", "sender")
         await held.strike(system, ref)
-        sent = sender.ask(Do(["send a", "send b", "add done"], ref), timeout=8.0)
+        sent = sender.ask(Do(["send a", "send b", "add done"], ref), timeout=30.0)
         await until(lambda: ref._cell.host.switch.backlog(-1) >= 2)  # type: ignore[attr-defined]
         assert not sent.done()
         await held.let_go(system)
@@ -210,14 +210,14 @@ async def test_each_topic_has_its_own_rule(store: str | None, isolation: str, pu
                     await system.publish("/scan", Scan(n))
                     await system.publish("/command", Command(str(n)))
             else:
-                await talker.ask(Talk(), timeout=8.0)
+                await talker.ask(Talk(), timeout=30.0)
             ref.tell(Scan(7))
             await held.let_go(system)
         once = ["0", "1", "scan 2", "2", "scan 7"]
-        assert await ref.ask(Seen(), timeout=8.0) == ["scan -1", *once, *once], "only what is published counts"
+        assert await ref.ask(Seen(), timeout=30.0) == ["scan -1", *once, *once], "only what is published counts"
         await system.publish("/scan", Scan(8))
         await system.publish("/scan", Scan(9))
-        assert (await ref.ask(Seen(), timeout=8.0))[-2:] == ["scan 8", "scan 9"], "outside recoveries nothing is lost"
+        assert (await ref.ask(Seen(), timeout=30.0))[-2:] == ["scan 8", "scan 9"], "outside recoveries nothing is lost"
         await system.stop(ref)
         await system.publish("/scan", Scan(10))
 
@@ -237,7 +237,7 @@ async def test_a_bounded_mailbox_keeps_its_own_rule_as_well(isolation: str) -> N
         await held.let_go(system)
         await until(lambda: ref._cell.host.switch.backlog(-1) == 0)  # type: ignore[attr-defined]
         ref.tell(Note("4"))
-        assert await ref.ask(Seen(), timeout=8.0) == ["1", "2", "4"]
+        assert await ref.ask(Seen(), timeout=30.0) == ["1", "2", "4"]
 
 
 async def test_whoever_waits_hears_when_the_actor_is_given_up(isolation: str) -> None:
@@ -247,7 +247,7 @@ async def test_whoever_waits_hears_when_the_actor_is_given_up(isolation: str) ->
         ref.kill()
         await held.reached.wait()
         ref.tell(Note("held"))
-        asked = ref.ask(Note("asked"), timeout=8.0)
+        asked = ref.ask(Note("asked"), timeout=30.0)
         sending = asyncio.ensure_future(ref.send(Note("sent")))
         await asyncio.sleep(0)
         top = system.ref("/app/of-doer", hf.Actor) if isolation == "subtree" else None
@@ -273,7 +273,7 @@ async def test_nothing_of_a_dead_or_replaying_life_gets_out(
         ref, notes = await doer(system, isolation), await sink(system)
         await system.start(hf.child("listener", hf.start(Driver)))
         listener = system.ref("/app/listener", Driver)
-        await ref.ask(Do(["tell one", "ask two", "send three", "after 3600", "subscribe /none"], notes), timeout=8.0)
+        await ref.ask(Do(["tell one", "ask two", "send three", "after 3600", "subscribe /none"], notes), timeout=30.0)
         unfinished = ref.ask(Do(["tell four", f"pipe {gate}", f"gate {gate}x", "tell five"], notes), timeout=20.0)
         await until(lambda: Path(f"{gate}x").exists())
         system.homes.recoveries.hooks = held.hooks
@@ -287,7 +287,7 @@ async def test_nothing_of_a_dead_or_replaying_life_gets_out(
         await unfinished
         await until(lambda: ref._cell.host.switch.backlog(-1) == 0)  # type: ignore[attr-defined]
         assert await notes.ask(Notes()) == ["one", "two", "three", "four", "five"]
-        while len(seen := await ref.ask(Seen(), timeout=8.0)) < 2:
+        while len(seen := await ref.ask(Seen(), timeout=30.0)) < 2:
             await asyncio.sleep(0.002)  # The background work was begun anew.
         assert seen == ["two:2", "piped"]
         assert await listener.ask(Seen()) == []

@@ -141,7 +141,7 @@ async def test_a_part_is_killed_at_every_point(point: tuple[str, str], victim: s
         await robot.ask(Do(["tell one", "add one"], notes))
         with system.events() as stream:
             strike(system, robot)
-            asked = robot.ask(Do(["tell two", "add two"], notes), timeout=8.0)
+            asked = robot.ask(Do(["tell two", "add two"], notes), timeout=30.0)
             assert await asked == "2"
             await until(lambda: not system.homes.recoveries.all())
             await until(
@@ -168,7 +168,7 @@ async def test_a_part_that_is_down_for_good_is_not_waited_for(isolation: str, vi
             part(system, "").kill()
         if victim:
             await until(lambda: part(system, victim)._cell.actor is None)
-        async with asyncio.timeout(8.0):
+        async with asyncio.timeout(30.0):
             await struck(system, robot)
             await until(lambda: not system.homes.recoveries.all())
         assert await words(ref) == ["safe", "free"]
@@ -203,7 +203,7 @@ async def test_a_controller_that_does_not_come_to_it_is_not_waited_for(isolation
         ref = await wheels(system)
         robot = await planner(system, isolation)
         await system.suspend(part(system, "controller"))
-        async with asyncio.timeout(8.0):
+        async with asyncio.timeout(30.0):
             await struck(system, robot)
         assert await words(ref) == ["safe"]
         await system.resume(part(system, "controller"))
@@ -264,10 +264,10 @@ async def test_the_actor_ends_again_in_each_phase(isolation: str, point: tuple[s
         ref = await wheels(system)
         robot, notes = await planner(system, isolation), await sink(system)
         times = -1000
-        await robot.ask(Do(["tell one", "add one"], notes), timeout=8.0)
+        await robot.ask(Do(["tell one", "add one"], notes), timeout=30.0)
         times = 0
         strike(system, robot)
-        assert await robot.ask(Do(["tell two", "add two"], notes), timeout=8.0) == "2"
+        assert await robot.ask(Do(["tell two", "add two"], notes), timeout=30.0) == "2"
         await over(system)
         assert await robot.ask(Seen()) == ["one", "two"]
         assert await words(ref) == ["safe", "free"]
@@ -322,7 +322,7 @@ async def test_a_sibling_has_it_started_anew_in_the_middle(kind: Any) -> None:
             await asyncio.sleep(0.01)
             assert (robot._cell.state, robot._cell.life) == ("down", 1)
         go_on.set()
-        assert await robot.ask(Seen(), timeout=8.0) == ["one"]
+        assert await robot.ask(Seen(), timeout=30.0) == ["one"]
         await over(system)
         assert robot._cell.life == 2
 

@@ -34,7 +34,7 @@ async def test_a_receiver_is_safe_from_the_crash_to_the_release(store: str | Non
     async def look(step: hf.RecoveryStep) -> None:
         seen.append((f"{step.when} {step.phase}", await words(ref)))
 
-    hooks = hf.recovery_hooks(before={"restart": look, "release": look}, after={"release": look}, timeout=8.0)
+    hooks = hf.recovery_hooks(before={"restart": look, "release": look}, after={"release": look}, timeout=30.0)
     async with running(store, recovery_hooks=hooks) as system:
         ref = await wheels(system)
         robot = await planner(system, isolation)
@@ -162,7 +162,7 @@ async def test_it_stays_when_the_recovery_fails_and_ends_when_the_actor_is_back(
         top = hf.supervisor("top", children=[child], intensity=2, period=60.0, restart="temporary", isolation=top_kind)
         await system.start(top)
         robot = system.ref("/app/top/planner", hf.Actor)
-        await robot.ask(Do([f"replayed {tmp_path / 'marker'}"]), timeout=8.0)
+        await robot.ask(Do([f"replayed {tmp_path / 'marker'}"]), timeout=30.0)
         with system.events() as stream:
             strike(system, robot)
             kept = await event(stream, hf.SafeStateKept)
@@ -229,8 +229,12 @@ async def event_on(stream: hf.EventStream, kind: type[hf.Event]) -> None:
             return
 
 
-async def test_what_is_restarted_in_good_order_makes_nobody_safe(isolation: str) -> None:
-    async with running() as system:
+@pytest.mark.parametrize("hooked", [False, True])
+async def test_what_is_restarted_in_good_order_makes_nobody_safe(isolation: str, hooked: bool) -> None:
+    """Neither on its quick way nor on the one past the points at which the hooks of a recovery are called."""
+    called: list[str] = []
+    hooks = hf.recovery_hooks(after={"safe_state": lambda step: called.append(step.phase)}) if hooked else None
+    async with running(recovery_hooks=hooks) as system:
         ref = await wheels(system)
         robot = await planner(system, isolation)
         with system.events() as stream:
@@ -239,6 +243,7 @@ async def test_what_is_restarted_in_good_order_makes_nobody_safe(isolation: str)
         await over(system)
         assert await words(ref) == []
         assert await robot.ask(Seen()) == ["one"]
+        assert bool(called) == hooked
 
 
 async def test_nobody_to_tell_holds_nothing_up(isolation: str) -> None:

@@ -71,7 +71,7 @@ async def drive(system: hf.ActorSystem, isolation: str) -> tuple[float, int]:
     await ref.ask(Drive(2.0))
     life = ref._cell.life
     strike(system, ref)
-    reply: tuple[float, int] = await ref.ask(Where(), timeout=8.0)
+    reply: tuple[float, int] = await ref.ask(Where(), timeout=30.0)
     assert ref._cell.life == life + 1 or isolation == "subtree"
     return reply
 

@@ -269,9 +269,9 @@ async def test_the_supervisor_answers_while_a_child_is_recovered_and_later_sibli
         gate.unlink()
         at(system).kill()
         await until(gate.exists)
-        states = {one.id: one.state for one in await top(system).ask(hf.WhichChildren(), timeout=5.0)}
+        states = {one.id: one.state for one in await top(system).ask(hf.WhichChildren(), timeout=30.0)}
         assert states == {"doer": "recovering", "later": "restarting"}
-        assert (await top(system).ask(hf.CountChildren(), timeout=5.0)).specs == 2
+        assert (await top(system).ask(hf.CountChildren(), timeout=30.0)).specs == 2
         let_through(gate)
         assert await seen(system) == ["one"]
         assert await seen(system, "later") == []
@@ -290,14 +290,14 @@ async def test_the_supervisor_answers_while_a_recorded_child_starts_by_order(
         if how == "restart":
             let_through(gate)
             await asked
-            await top(system).ask(hf.TerminateChild("late"), timeout=5.0)
+            await top(system).ask(hf.TerminateChild("late"), timeout=30.0)
             Path(f"{gate}.open").unlink()
             gate.unlink()
             asked = asyncio.ensure_future(top(system).ask(hf.RestartChild("late"), timeout=20.0))
             await until(gate.exists)
-        infos = await top(system).ask(hf.WhichChildren(), timeout=5.0)
+        infos = await top(system).ask(hf.WhichChildren(), timeout=30.0)
         assert [(one.id, one.state) for one in infos] == [("late", "recovering")]
-        again = await asyncio.gather(top(system).ask(hf.StartChild(late), timeout=5.0), return_exceptions=True)
+        again = await asyncio.gather(top(system).ask(hf.StartChild(late), timeout=30.0), return_exceptions=True)
         assert isinstance(again[0], hf.AlreadyStarted)
         assert not asked.done()
         if end == "up":
@@ -305,7 +305,7 @@ async def test_the_supervisor_answers_while_a_recorded_child_starts_by_order(
             assert (await asked).path == "/app/top/late"
             assert await seen(system, "late") == []
         elif end == "terminated":
-            await top(system).ask(hf.TerminateChild("late"), timeout=5.0)
+            await top(system).ask(hf.TerminateChild("late"), timeout=30.0)
             with pytest.raises(hf.StartFailed, match="stopped while it started"):
                 await asked
         else:
@@ -321,7 +321,7 @@ async def test_a_recorded_child_that_cannot_start_by_order_leaves_nothing(store:
         for _ in range(2):
             with pytest.raises(hf.StartFailed, match="no such device"):
                 await top(system).ask(hf.StartChild(bad), timeout=20.0)
-            assert await top(system).ask(hf.WhichChildren(), timeout=5.0) == []
+            assert await top(system).ask(hf.WhichChildren(), timeout=30.0) == []
 
 
 class Unable(hf.Actor):

@@ -98,7 +98,7 @@ async def test_an_ask_whose_turn_had_not_ended(name: str, sent: bool, isolation:
         ref, notes = await doer(system, isolation, name), await system.start(hf.child("sink", hf.start(Sink)))
         await ref.ask(Do(["tell first", "add first"], notes))
         steps = ["add begun", *(["ask out"] if sent else []), f"gate {gate}", "tell end"]
-        asked, behind = ref.ask(Do(steps, notes), timeout=8.0), ref.ask(Note("behind"), timeout=8.0)
+        asked, behind = ref.ask(Do(steps, notes), timeout=30.0), ref.ask(Note("behind"), timeout=30.0)
         await until(gate.exists)
         gate.unlink()
         strike(system, ref)
@@ -408,7 +408,7 @@ async def test_timers_and_subscriptions_go_back_with_the_state(isolation: str, s
         assert "tick" not in await ref.ask(Seen())
         await system.publish("/lost", Note("lost"))
         await system.publish("/kept", Note("kept"))
-        async with asyncio.timeout(8.0):
+        async with asyncio.timeout(30.0):
             while "tick" not in await ref.ask(Seen()):
                 await asyncio.sleep(0.01)
         await asyncio.sleep(0.7)
@@ -429,7 +429,7 @@ async def test_a_tick_that_waits_does_not_come_twice(isolation: str, store: str 
         strike(system, ref)
         await until(gate.exists)
         let_through(gate)
-        await ref.ask(Seen(), timeout=8.0)
+        await ref.ask(Seen(), timeout=30.0)
         await asyncio.sleep(0.3)  # As long as a second one would take.
         assert await ref.ask(Seen()) == ["tick"]
 

@@ -125,7 +125,7 @@ async def test_methods_are_called_by_messages_and_the_state_comes_back(isolation
         assert await ref.ask(robot.move(2.0, times=2)) == 7.0
         for _ in range(2):
             strike(system, ref)
-            assert await ref.ask(robot.look("x", ["y"]), timeout=8.0) == ["move 2.0", "move 2.0", "x", "y"]
+            assert await ref.ask(robot.look("x", ["y"]), timeout=30.0) == ["move 2.0", "move 2.0", "x", "y"]
         assert await ref.ask(robot.move(0.0)) == 7.0
 
 
@@ -138,7 +138,7 @@ async def test_chosen_methods_by_fields_or_with_the_whole_message(isolation: str
         switch = home(ref)
         await until(lambda: switch.state_turn >= 2)
         strike(system, ref)
-        assert await ref.ask(Move(0, 0.0), timeout=8.0) == 6.0
+        assert await ref.ask(Move(0, 0.0), timeout=30.0) == 6.0
 
 
 async def test_a_callback_style_program_is_fed_from_topics_and_recovered(isolation: str, store: str | None) -> None:
@@ -151,7 +151,7 @@ async def test_a_callback_style_program_is_fed_from_topics_and_recovered(isolati
             await system.publish("/scan", Scan(n))
             with contextlib.suppress(ProcessLookupError, hf.NoSuchActor):  # It is still dead from the time before.
                 strike(system, ref)
-        assert await ref.ask(State(), timeout=8.0) == [10, 10, -1, 20, -2, 30, -3]
+        assert await ref.ask(State(), timeout=30.0) == [10, 10, -1, 20, -2, 30, -3]
         assert await out.ask(Notes()) == ["10:1", "10:2", "10:3"]
 
 

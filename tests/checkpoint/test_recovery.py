@@ -22,7 +22,7 @@ async def test_state_and_queued_messages_come_back_after_kills(system: hf.ActorS
             ref.tell(Note(f"{kill}.{n}"))
             expected.append(f"{kill}.{n}")
         strike(system, ref)
-        asked = ref.ask(Note(f"{kill}.asked"), timeout=8.0)
+        asked = ref.ask(Note(f"{kill}.asked"), timeout=30.0)
         expected.append(f"{kill}.asked")
         assert await asked == len(expected)
     assert await ref.ask(Seen()) == expected
@@ -32,7 +32,7 @@ async def test_a_message_whose_handler_crashes_is_not_run_again(system: hf.Actor
     ref, notes = await doer(system, isolation), await sink(system)
     await ref.ask(Note("before"))
     failing = ref.ask(Do(["tell unreleased", "add bad", "raise no luck"], notes))
-    after = ref.ask(Note("after"), timeout=8.0)
+    after = ref.ask(Note("after"), timeout=30.0)
     with pytest.raises(hf.RemoteCrash, match="no luck"):
         await failing
     assert await after == 2
@@ -45,8 +45,8 @@ async def test_a_message_whose_life_is_killed_is_run_again_and_answered(
     system: hf.ActorSystem, isolation: str, gate: Path
 ) -> None:
     ref = await doer(system, isolation)
-    asked = ref.ask(Do(["add one", f"gate {gate}"]), timeout=8.0)
-    behind = ref.ask(Note("two"), timeout=8.0)
+    asked = ref.ask(Do(["add one", f"gate {gate}"]), timeout=30.0)
+    behind = ref.ask(Note("two"), timeout=30.0)
     await until(gate.exists)
     recovered = await struck(system, ref)
     let_through(gate)
@@ -66,7 +66,7 @@ async def test_a_refusal_is_an_answer_and_no_crash(system: hf.ActorSystem, isola
 
 async def test_an_expired_ask_is_not_begun(system: hf.ActorSystem, isolation: str, gate: Path) -> None:
     ref = await doer(system, isolation)
-    busy = ref.ask(Do([f"gate {gate}"]), timeout=8.0)
+    busy = ref.ask(Do([f"gate {gate}"]), timeout=30.0)
     await until(gate.exists)
     with pytest.raises(hf.AskTimeout):
         await ref.ask(Note("expired"), timeout=0.05)
@@ -87,7 +87,7 @@ async def test_what_left_before_the_kill_leaves_once_and_in_order(
     """T19: the crash falls between what is released in the turn and the turn's end."""
     ref, notes = await doer(system, isolation), await sink(system)
     middle = "flush" if release == "flush" else f"{release} 2"
-    asked = ref.ask(Do(["tell 1", middle, "tell 3", f"gate {gate}", "tell 4"], notes), timeout=8.0)
+    asked = ref.ask(Do(["tell 1", middle, "tell 3", f"gate {gate}", "tell 4"], notes), timeout=30.0)
     await until(gate.exists)
     for _ in range(3):
         gate.unlink()
@@ -115,8 +115,8 @@ async def test_a_turn_that_raises_keeps_what_an_ask_has_released(system: hf.Acto
     ref, notes = await doer(system, isolation), await sink(system)
     for n in range(2):
         with pytest.raises(hf.RemoteCrash):
-            await ref.ask(Do([f"tell out{n}", f"ask in{n}", f"tell lost{n}", "raise x"], notes), timeout=8.0)
-        await ref.ask(Note(f"good{n}"), timeout=8.0)
+            await ref.ask(Do([f"tell out{n}", f"ask in{n}", f"tell lost{n}", "raise x"], notes), timeout=30.0)
+        await ref.ask(Note(f"good{n}"), timeout=30.0)
     await struck(system, ref)
     assert await notes.ask(Notes()) == ["out0", "in0", "out1", "in1"]
     assert await ref.ask(Seen()) == ["good0", "good1"]
@@ -128,9 +128,9 @@ async def test_an_ask_between_two_recorded_actors_survives_both(
     """The asker is struck first, then the asked, then both; the one question has one answer."""
     asker, asked = await doer(system, isolation, "asker"), await doer(system, isolation, "asked")
     through = await doer(system, "task", "through")
-    busy = asked.ask(Do([f"gate {gate}"]), timeout=8.0)
+    busy = asked.ask(Do([f"gate {gate}"]), timeout=30.0)
     await until(gate.exists)
-    answer = asker.ask(Do(["add begun", "ask hello"], asked), timeout=8.0)
+    answer = asker.ask(Do(["add begun", "ask hello"], asked), timeout=30.0)
     await through.ask(Note("x"))
     for victims in ([asker], [asked], [asker, asked]):
         lives = {victim: victim._cell.life for victim in victims}
@@ -150,7 +150,7 @@ async def test_an_ask_that_timed_out_times_out_again_under_replay(
     system: hf.ActorSystem, isolation: str, gate: Path
 ) -> None:
     ref, slow = await doer(system, isolation), await system.start(hf.child("slow", hf.start(Doer)))
-    await ref.ask(Do([f"hurry {gate}"], slow), timeout=8.0)
+    await ref.ask(Do([f"hurry {gate}"], slow), timeout=30.0)
     let_through(gate)
     await struck(system, ref)
     assert await ref.ask(Seen()) == ["timeout"]
@@ -177,7 +177,7 @@ async def test_a_forwarded_ask_is_answered_by_the_receiver(system: hf.ActorSyste
     recovery = hf.hybrid() if target == "recorded" else None
     other = await system.start(hf.child("other", hf.start(Doer), isolation=kind, recovery=recovery))
 
-    asked = ref.ask(Do(["forward", "add here"], other), timeout=8.0)
+    asked = ref.ask(Do(["forward", "add here"], other), timeout=30.0)
     assert await asked == "1"
     await struck(system, ref)
     assert await ref.ask(Seen()) == ["here"]

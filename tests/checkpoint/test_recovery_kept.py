@@ -43,7 +43,7 @@ async def test_a_cancelled_timer_ticks_no_more_not_even_from_the_queue(
 ) -> None:
     ref = await doer(system, isolation, interval=interval)
     await ref.ask(Do(["after 0.01"]))
-    busy = ref.ask(Do([f"gate {gate}", "cancel"]), timeout=8.0)
+    busy = ref.ask(Do([f"gate {gate}", "cancel"]), timeout=30.0)
     switch = ref._cell.host.switch  # type: ignore[attr-defined]
     await until(lambda: any(source.kind == "tick" for source in switch.open.values()))
     let_through(gate)
@@ -59,13 +59,13 @@ async def test_a_cancelled_timer_ticks_no_more_not_even_from_the_queue(
 async def test_the_stash_survives(system: hf.ActorSystem, isolation: str, interval: float) -> None:
     """With snapshots and without; unstashed messages come in their order, before what is queued."""
     ref = await doer(system, isolation, interval=interval)
-    asked = [ref.ask(Do([f"stash {n}"]), timeout=8.0) for n in range(3)]
+    asked = [ref.ask(Do([f"stash {n}"]), timeout=30.0) for n in range(3)]
     await ref.ask(Seen())
     if interval < 1:
         await snapshot_after(system, ref, 3)
     await struck(system, ref)
-    opened = ref.ask(Do(["unstash"]), timeout=8.0)
-    last = ref.ask(Note("last"), timeout=8.0)
+    opened = ref.ask(Do(["unstash"]), timeout=30.0)
+    last = ref.ask(Note("last"), timeout=30.0)
     assert [await one for one in (opened, *asked)] == ["1", "2", "3", "4"]
     assert await last == 5
     await struck(system, ref)
@@ -75,9 +75,9 @@ async def test_the_stash_survives(system: hf.ActorSystem, isolation: str, interv
 async def test_a_stashed_message_that_crashes_later_is_not_run_again(system: hf.ActorSystem, isolation: str) -> None:
     """Replay stashes and unstashes it once more; its own turn failed, so it must not come a second time."""
     ref = await doer(system, isolation)
-    bad = ref.ask(Do(["stash bad", "raise when open"]), timeout=8.0)
-    good = ref.ask(Do(["stash good"]), timeout=8.0)
-    await ref.ask(Do(["unstash"]), timeout=8.0)
+    bad = ref.ask(Do(["stash bad", "raise when open"]), timeout=30.0)
+    good = ref.ask(Do(["stash good"]), timeout=30.0)
+    await ref.ask(Do(["unstash"]), timeout=30.0)
     with pytest.raises(hf.RemoteCrash):
         await bad
     assert await good == "2"
@@ -88,7 +88,7 @@ async def test_a_stashed_message_that_crashes_later_is_not_run_again(system: hf.
 @pytest.mark.parametrize("interval", [0.01, NEVER])
 async def test_delayed_replies_survive(system: hf.ActorSystem, isolation: str, interval: float) -> None:
     ref = await doer(system, isolation, interval=interval)
-    asked = [ref.ask(Do(["later"]), timeout=8.0) for _ in range(2)]
+    asked = [ref.ask(Do(["later"]), timeout=30.0) for _ in range(2)]
     await ref.ask(Seen())
     if interval < 1:
         await snapshot_after(system, ref, 3)
@@ -169,8 +169,8 @@ async def test_snapshots_are_taken_while_turns_are_in_flight_and_cut_the_journal
         ref.tell(Do([f"add {n}", f"ask {n}", f"tell x{n}"], notes))
         if n % 20 == 19:
             strike(system, ref)
-            await ref.ask(Note("-"), timeout=8.0)
-    seen = [text for text in await ref.ask(Seen(), timeout=8.0) if text != "-"]
+            await ref.ask(Note("-"), timeout=30.0)
+    seen = [text for text in await ref.ask(Seen(), timeout=30.0) if text != "-"]
     assert seen == [text for n in range(60) for text in (str(n), f"{n}:{2 * n + 1}")]
     assert await notes.ask(Notes()) == [text for n in range(60) for text in (str(n), f"x{n}")]
     switch: Any = ref._cell.host.switch  # type: ignore[attr-defined]
@@ -209,6 +209,6 @@ async def test_the_journal_limit_refuses_and_a_snapshot_makes_room(system: hf.Ac
                 break
             except hf.MailboxFull:
                 await ref.send(Note("room"))
-    seen = [text.split(" ")[0] for text in await ref.ask(Seen(), timeout=8.0)]
+    seen = [text.split(" ")[0] for text in await ref.ask(Seen(), timeout=30.0)]
     assert [text for text in seen if text != "room"] == [str(n) for n in range(30)]
     assert "room" in seen

@@ -47,8 +47,8 @@ async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
     ref, notes = await doer(system, "process", max_deliveries=3), await sink(system)
     await ref.ask(Note("before"))
     with system.events() as stream:
-        bad = ref.ask(Do(["ask bad", f"die {tmp_path}/deaths"], notes), timeout=8.0)
-        after = ref.ask(Do(["tell 1", "ask good", "tell 2"], notes), timeout=8.0)
+        bad = ref.ask(Do(["ask bad", f"die {tmp_path}/deaths"], notes), timeout=30.0)
+        after = ref.ask(Do(["tell 1", "ask good", "tell 2"], notes), timeout=30.0)
         with pytest.raises(hf.Quarantined):
             await bad
         assert (await event(stream, hf.MessageQuarantined)).deliveries == 3
@@ -61,7 +61,7 @@ async def test_a_message_that_kills_its_process_again_and_again_is_quarantined(
 
 async def test_deaths_that_the_runtime_ordered_do_not_quarantine(system: hf.ActorSystem, gate: Path) -> None:
     ref = await doer(system, "process", max_deliveries=2)
-    asked = ref.ask(Do([f"gate {gate}"]), timeout=8.0)
+    asked = ref.ask(Do([f"gate {gate}"]), timeout=30.0)
     for _ in range(4):
         await until(gate.exists)
         gate.unlink()
@@ -93,7 +93,7 @@ async def test_an_actor_that_stopped_itself_comes_back_as_it_was(system: hf.Acto
     ref = await doer(system, isolation)
     ref.tell(Do(["add kept", "stop"]))
     ref.tell(Note("queued"))
-    assert await ref.ask(Note("last"), timeout=8.0) == 3
+    assert await ref.ask(Note("last"), timeout=30.0) == 3
     assert await ref.ask(Seen()) == ["kept", "queued", "last"]
 
 
@@ -101,8 +101,8 @@ async def test_an_actor_that_stopped_itself_comes_back_as_it_was(system: hf.Acto
 async def test_fresh_loses_the_state_and_keeps_the_queue(system: hf.ActorSystem, isolation: Any, gate: Path) -> None:
     ref = await system.start(hf.child("doer", hf.start(Doer), isolation=isolation, recovery=hf.fresh()))
     await ref.ask(Note("lost"))
-    hold = ref.ask(Do([f"gate {gate}"]), timeout=8.0)
-    queued = ref.ask(Note("queued"), timeout=8.0)
+    hold = ref.ask(Do([f"gate {gate}"]), timeout=30.0)
+    queued = ref.ask(Note("queued"), timeout=30.0)
     await until(gate.exists)
     strike(system, ref)
     with pytest.raises(hf.AskFailed):

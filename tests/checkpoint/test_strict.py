@@ -88,7 +88,7 @@ class Asker(hf.Actor):
         np.random.default_rng(3).random()
         dt.datetime.fromtimestamp(self.ctx.now(), dt.UTC)
         self.ctx.pipe_to_self(asyncio.sleep(0), lambda _: Done())
-        async with asyncio.timeout(5.0):
+        async with asyncio.timeout(30.0):
             await asyncio.sleep(0)
         return f"{self.ctx.uuid().version} {asyncio.current_task() is not None}"
 

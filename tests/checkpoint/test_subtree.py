@@ -50,7 +50,7 @@ async def test_every_home_survives_the_process(system: hf.ActorSystem) -> None:
         kill_process(system)
         for ref in refs:
             ref.tell(Note(f"{round_} sent while nobody lived there"))
-        assert [await ref.ask(Note("asked"), timeout=8.0) for ref in refs] == [3 * round_ + 3] * 3
+        assert [await ref.ask(Note("asked"), timeout=30.0) for ref in refs] == [3 * round_ + 3] * 3
     for ref, name in zip(refs, names, strict=True):
         assert await ref.ask(Seen()) == await at(system, name).ask(Seen()), "old refs and new ones reach the same"
 
@@ -61,7 +61,7 @@ async def test_what_is_sent_by_address_while_the_tree_is_down_arrives(system: hf
     outside = await system.start(hf.child("outside", hf.start(Doer), isolation="process", recovery=hf.hybrid()))
     deep = at(system, "inner/deep")
     gate = tmp_path / "gate"
-    sending = outside.ask(Do([f"gate {gate}", "tell while down", "ask while down"], deep), timeout=8.0)
+    sending = outside.ask(Do([f"gate {gate}", "tell while down", "ask while down"], deep), timeout=30.0)
     await until(gate.exists)
     kill_process(system)
     Path(f"{gate}.open").touch()
@@ -73,11 +73,11 @@ async def test_what_is_sent_by_address_while_the_tree_is_down_arrives(system: hf
 async def test_siblings_send_and_ask_through_their_homes(system: hf.ActorSystem) -> None:
     await system.start(team())
     one, two, plain = at(system, "one"), at(system, "two"), at(system, "plain", Sink)
-    assert await one.ask(Do(["ask first", "send second", "tell third", "flush"], two), timeout=8.0) == "1"
-    assert await one.ask(Do(["ask to-plain", "send again"], plain), timeout=8.0) == "2"
+    assert await one.ask(Do(["ask first", "send second", "tell third", "flush"], two), timeout=30.0) == "1"
+    assert await one.ask(Do(["ask to-plain", "send again"], plain), timeout=30.0) == "2"
     kill_process(system)
-    assert await two.ask(Seen(), timeout=8.0) == ["first", "second", "third"]
-    assert await one.ask(Seen(), timeout=8.0) == ["first:1", "to-plain:1"]
+    assert await two.ask(Seen(), timeout=30.0) == ["first", "second", "third"]
+    assert await one.ask(Seen(), timeout=30.0) == ["first:1", "to-plain:1"]
     assert await at(system, "plain", Sink).ask(Notes()) == [], "what is not recorded starts from nothing"
 
 
@@ -89,7 +89,7 @@ async def test_a_crash_ends_one_and_its_siblings_go_on(system: hf.ActorSystem) -
     await two.ask(Note("kept"))
     with pytest.raises(hf.RemoteCrash, match="no luck"):
         await one.ask(Do(["add lost", "raise no luck"]))
-    assert await one.ask(Note("after"), timeout=8.0) == 2
+    assert await one.ask(Note("after"), timeout=30.0) == 2
     assert await two.ask(Note("after")) == 2
     assert system.pid_of(one) == pid
     assert (one._cell.life, two._cell.life) == (2, 1)
@@ -117,7 +117,7 @@ async def test_monitors_and_links_across_the_border_of_the_process(system: hf.Ac
     one = at(system, "one")
     await watcher.ask(Do(["monitor", "link"], one))
     kill_process(system)
-    assert await one.ask(Note("back"), timeout=8.0) == 1
+    assert await one.ask(Note("back"), timeout=30.0) == 1
     assert await watcher.ask(Seen()) == ["down True"]
     assert watcher._cell.life == 1, "the link has not fired"
 
@@ -132,8 +132,8 @@ async def test_a_message_that_kills_the_process_is_quarantined_and_its_neighbour
     with pytest.raises(hf.Quarantined):
         await one.ask(Do([f"die {tmp_path}/deaths"]), timeout=15.0)
     assert (tmp_path / "deaths").read_text() == "x" * 5
-    assert await one.ask(Note("after"), timeout=8.0) == 1
-    assert await two.ask(Note("after"), timeout=8.0) == 2
+    assert await one.ask(Note("after"), timeout=30.0) == 1
+    assert await two.ask(Note("after"), timeout=30.0) == 2
 
 
 async def test_the_subtree_stopped_and_started_again_has_its_state(system: hf.ActorSystem) -> None:

@@ -12,7 +12,7 @@ import holdfast as hf
 
 async def until_there(path: Path) -> None:
     """What another process does is seen by the files it makes."""
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         while not path.exists():
             await asyncio.sleep(0.005)
 

@@ -111,7 +111,7 @@ async def test_a_suspended_actor_obeys_its_supervisor(
 async def test_a_suspension_ends_with_the_life(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account))
     await system.suspend(one)
-    added = one.ask(Add(1), timeout=8.0)
+    added = one.ask(Add(1), timeout=30.0)
     one.kill()
     assert await added == 1
     assert (await system.get_status(one)).state == "running"
@@ -221,7 +221,7 @@ async def test_control_waits_until_an_actor_is_recovered(
     await gone
     await until_there(tmp_path / "gate.begun")  # the replay has come as far as that
     assert (await system.get_status(one)).state == "restarting"
-    replaced = asyncio.create_task(system.replace_state(one, functools.partial(plus, 10), timeout=8.0))
+    replaced = asyncio.create_task(system.replace_state(one, functools.partial(plus, 10), timeout=30.0))
     done, _ = await asyncio.wait([replaced], timeout=0.1)
     assert not done
     gate.touch()
@@ -254,7 +254,7 @@ async def test_a_replaced_state_that_cannot_be_saved_is_undone(tmp_path: Path, i
         with pytest.raises(hf.ControlFailed, match="the new state could not be saved"):
             await system.replace_state(one, large)
         folder.mkdir()
-        assert await one.ask(Add(1), timeout=8.0) == 2
+        assert await one.ask(Add(1), timeout=30.0) == 2
         assert await system.get_state(one) == {"total": 2, "seen": [1, 1]}
 
 
@@ -267,7 +267,7 @@ def _strike(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
 
 
 async def _recovered(stream: hf.EventStream) -> None:
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         async for event in stream:
             if isinstance(event, hf.Recovered):
                 return
@@ -345,7 +345,7 @@ async def test_control_while_a_process_starts_waits_for_it(system: hf.ActorSyste
     gone = one._cell.ended()
     one.kill()
     await gone
-    assert await system.get_state(one, timeout=8.0) == {"total": 0, "seen": []}
+    assert await system.get_state(one, timeout=30.0) == {"total": 0, "seen": []}
 
 
 async def test_what_cannot_leave_the_process_is_shown_as_text(system: hf.ActorSystem) -> None:

@@ -40,7 +40,7 @@ async def test_a_status_says_what_the_actor_does(system: hf.ActorSystem, start_o
     one.tell(Add(1))
     status = await system.get_status(one)
     assert status.turn == "tests.control.players.Wait"
-    assert 0 < status.turn_seconds < 8.0
+    assert 0 < status.turn_seconds < 60.0
     assert status.queued == 2
     gate.touch()
     await waiting
@@ -60,7 +60,7 @@ async def test_statistics_count_from_when_they_are_switched_on(system: hf.ActorS
     counts = await system.statistics(one)
     assert counts is not None
     assert (counts.turns, counts.messages_out, counts.restarts) == (4, 1, 0)
-    assert 0 < counts.longest_turn <= counts.turn_seconds < 8.0
+    assert 0 < counts.longest_turn <= counts.turn_seconds < 60.0
     if "/top/" not in one.path:
         assert counts.messages_in == 4
     assert await system.statistics(one, False) is None
@@ -73,7 +73,7 @@ async def test_statistics_see_restarts(system: hf.ActorSystem, start_one: Starte
     await system.statistics(one, True)
     with pytest.raises(hf.RemoteCrash):
         await one.ask(Crash())
-    assert await one.ask(Add(1), timeout=8.0) == 1
+    assert await one.ask(Add(1), timeout=30.0) == 1
     counts = await system.statistics(one)
     assert counts is not None
     assert counts.restarts == 1
@@ -97,7 +97,7 @@ async def test_a_trace_tells_turns_and_messages(system: hf.ActorSystem, start_on
 
 async def _until_ended(stream: hf.EventStream, turns: int) -> list[Any]:
     told: list[Any] = []
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         async for event in stream:
             told.append(event)
             turns -= isinstance(event, hf.TurnEnded)
@@ -114,11 +114,11 @@ async def test_a_trace_goes_on_over_a_restart_and_ends_with_the_address(
         one.tell(Crash())
         (began,) = [event for event in await _until_ended(stream, 1) if isinstance(event, hf.TurnEnded)]
         assert began.outcome == "crashed: ValueError"
-        await one.ask(Total(), timeout=8.0)
+        await one.ask(Total(), timeout=30.0)
         one.tell(Add(1))
         await _until_ended(stream, 1)
         await system.stop(one)
-        async with asyncio.timeout(8.0):
+        async with asyncio.timeout(30.0):
             async for _ in stream:
                 pass
 

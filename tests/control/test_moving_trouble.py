@@ -88,7 +88,7 @@ async def test_a_system_that_ends_does_not_wait_for_moves(here: Any) -> None:
         one = await system.start(hf.child("one", hf.start(Account), isolation=here))
         moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here]))
         await asyncio.sleep(0)
-    done, _ = await asyncio.wait((moving,), timeout=8.0)
+    done, _ = await asyncio.wait((moving,), timeout=30.0)
     assert done
     assert moving.cancelled() or moving.exception() is None or isinstance(moving.exception(), hf.HoldfastError)
 
@@ -103,9 +103,9 @@ async def test_stop_and_kill_reach_an_actor_on_its_way(system: hf.ActorSystem, r
                 await asyncio.sleep(0)
             gone = one._cell.ended()
             getattr(one, end)()
-            async with asyncio.timeout(8.0):
+            async with asyncio.timeout(30.0):
                 assert await gone in (hf.SHUTDOWN, hf.KILLED)
-            await asyncio.wait((moving,), timeout=8.0)
+            await asyncio.wait((moving,), timeout=30.0)
             assert moving.done()
             moving.exception()
 
@@ -121,7 +121,7 @@ async def test_an_actor_that_stops_itself_in_the_turn_that_is_waited_for_stops(
     moving = asyncio.ensure_future(system.set_isolation(one, OTHER[here]))
     await asyncio.wait((moving,), timeout=0.3)  # The order has reached it, and waits for the end of the turn.
     gate.touch()
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         assert await gone == hf.NORMAL
     with pytest.raises(hf.CannotMove, match="its life has ended"):
         await moving
@@ -159,7 +159,7 @@ async def test_the_old_process_ends_after_a_move(system: hf.ActorSystem, recover
     one = await system.start(hf.child("one", hf.start(Account), recovery=recovery, isolation="process"))
     pid = system.pid_of(one)
     await system.set_isolation(one, "task")
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         while True:
             try:
                 os.kill(pid, 0)

@@ -22,7 +22,7 @@ class Asker(hf.Actor):
     @hf.on(Asks)
     async def ask(self, message: Asks) -> str:
         try:
-            return str(await message.whom.ask(Add(1), timeout=8.0, restarting="fail"))
+            return str(await message.whom.ask(Add(1), timeout=30.0, restarting="fail"))
         except hf.ActorRestarting as error:
             return f"restarting {error.actor}"
 
@@ -59,7 +59,7 @@ async def test_an_ask_fails_while_the_next_life_comes_up(system: hf.ActorSystem,
     assert await one.ask(Add(1)) == 1
     await crashed(one)
     failed = one.ask(Add(1), restarting="fail")
-    assert await one.ask(Add(2), timeout=8.0) in (2, 3)
+    assert await one.ask(Add(2), timeout=30.0) in (2, 3)
     with pytest.raises(hf.ActorRestarting):
         await failed
     assert await one.ask(Add(0), restarting="fail") in (2, 3)
@@ -69,7 +69,7 @@ async def test_a_recorded_asker_waits_all_the_same(system: hf.ActorSystem) -> No
     one = await system.start(hf.child("one", hf.start(Account), backoff=hf.Backoff(initial=0.05, jitter=0.0)))
     asker = await system.start(hf.child("asker", hf.start(Asker), recovery=hf.hybrid()))
     await crashed(one)
-    assert await asker.ask(Asks(one), timeout=8.0) == "1"
+    assert await asker.ask(Asks(one), timeout=30.0) == "1"
 
 
 async def test_an_actor_that_is_gone_is_not_restarting(system: hf.ActorSystem) -> None:

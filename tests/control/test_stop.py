@@ -31,10 +31,10 @@ async def test_draining_handles_what_is_queued_and_refuses_what_is_new(
     system: hf.ActorSystem, start_one: Starter, tmp_path: Path
 ) -> None:
     one, gate = await start_one(hf.start(Account), shutdown=8.0), tmp_path / "gate"
-    waiting = one.ask(Wait(str(gate)), timeout=8.0)
-    queued = [one.ask(Add(1), timeout=8.0) for _ in range(3)]
+    waiting = one.ask(Wait(str(gate)), timeout=30.0)
+    queued = [one.ask(Add(1), timeout=30.0) for _ in range(3)]
     await until_there(tmp_path / "gate.begun")
-    stopping = asyncio.create_task(system.stop(one, drain=True, deadline=8.0))
+    stopping = asyncio.create_task(system.stop(one, drain=True, deadline=30.0))
     await asyncio.sleep(0)
     before = system.dead_letters
     with pytest.raises(hf.ActorStopped):
@@ -53,8 +53,8 @@ async def test_without_draining_what_is_queued_is_not_handled(
     system: hf.ActorSystem, start_one: Starter, tmp_path: Path
 ) -> None:
     one, gate = await start_one(hf.start(Account), shutdown=8.0), tmp_path / "gate"
-    waiting = one.ask(Wait(str(gate)), timeout=8.0)
-    queued = one.ask(Add(1), timeout=8.0)
+    waiting = one.ask(Wait(str(gate)), timeout=30.0)
+    queued = one.ask(Add(1), timeout=30.0)
     await until_there(tmp_path / "gate.begun")
     stopping = asyncio.create_task(system.stop(one))
     for _ in range(5):  # These answers come behind the stop, wherever the supervisor is.
@@ -69,10 +69,10 @@ async def test_without_draining_what_is_queued_is_not_handled(
 
 async def test_draining_goes_on_over_a_crash(system: hf.ActorSystem, start_one: Starter, way: str) -> None:
     one = await start_one(hf.start(Account), shutdown=8.0)
-    first = one.ask(Add(1), timeout=8.0)
-    crashed = one.ask(Crash(), timeout=8.0)
-    last = one.ask(Add(1), timeout=8.0)
-    await system.stop(one, drain=True, deadline=8.0)
+    first = one.ask(Add(1), timeout=30.0)
+    crashed = one.ask(Crash(), timeout=30.0)
+    last = one.ask(Add(1), timeout=30.0)
+    await system.stop(one, drain=True, deadline=30.0)
     assert await first == 1
     with pytest.raises(hf.RemoteCrash):
         await crashed
@@ -82,7 +82,7 @@ async def test_draining_goes_on_over_a_crash(system: hf.ActorSystem, start_one: 
 async def test_draining_ends_at_its_deadline(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account), shutdown=8.0)
     await system.suspend(one)
-    queued = one.ask(Add(1), timeout=8.0)
+    queued = one.ask(Add(1), timeout=30.0)
     await system.stop(one, drain=True, deadline=0.1)
     with pytest.raises(hf.ActorStopped):
         await queued
@@ -153,7 +153,7 @@ async def test_an_actor_may_stop_itself_in_a_handler(system: hf.ActorSystem, sup
     one = await system.start(hf.child("one", recipe)) if supervised else system.spawn(recipe, "one")
     gone = one._cell.ended()
     assert await one.ask(Leave()) == "leaving"
-    assert await asyncio.wait_for(gone, 4.0) == BY_HAND
+    assert await asyncio.wait_for(gone, 30.0) == BY_HAND
     assert told == [BY_HAND]
     await system.stop(one)  # it may not be gone quite yet; then it is
     assert system.tree() == ["/app"]
@@ -164,7 +164,7 @@ async def test_an_actor_may_stop_itself_in_on_start(system: hf.ActorSystem, supe
     told: list[Any] = []
     recipe = hf.start(Leaver, system, told, True)
     one = await system.start(hf.child("one", recipe)) if supervised else system.spawn(recipe, "one")
-    await asyncio.wait_for(asyncio.shield(one._cell.ended()), 4.0)
+    await asyncio.wait_for(asyncio.shield(one._cell.ended()), 30.0)
     assert told == ["started", BY_HAND]
     await system.stop(one)
     assert system.tree() == ["/app"]

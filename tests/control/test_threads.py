@@ -71,12 +71,12 @@ async def test_a_blocking_handler_blocks_only_its_actor(
     system: hf.ActorSystem, start_one: Starter, tmp_path: Path
 ) -> None:
     one, gate = await start_one(hf.start(Blocks)), tmp_path / "gate"
-    blocked = one.ask(Block(str(gate)), timeout=8.0)
+    blocked = one.ask(Block(str(gate)), timeout=30.0)
     await until_there(tmp_path / "gate.begun")
     other = await system.start(hf.child("other", hf.start(Account)))
     assert await other.ask(Add(1)) == 1  # the loop goes on
     assert (await system.get_status(one)).turn == "tests.control.test_threads.Block"  # that of its process too
-    after = one.ask(Now(), timeout=8.0)
+    after = one.ask(Now(), timeout=30.0)
     done, _ = await asyncio.wait([after], timeout=0.05)
     assert not done  # one turn at a time
     gate.touch()
@@ -89,8 +89,8 @@ async def test_what_a_thread_does_through_refs_and_ctx_works(system: hf.ActorSys
     sink = await system.start(hf.child("sink", hf.start(Account)))
     for n in range(3):
         one.tell(Hand(sink, n))
-    assert await one.ask(Now(), timeout=8.0) == 3
-    async with asyncio.timeout(8.0):
+    assert await one.ask(Now(), timeout=30.0) == 3
+    async with asyncio.timeout(30.0):
         while await sink.ask(Total()) != 3:
             await asyncio.sleep(0.005)
 
@@ -101,10 +101,10 @@ async def test_a_recorded_turn_in_a_thread_comes_back_after_a_kill(system: hf.Ac
     sink = await system.start(hf.child("sink", hf.start(Account)))
     for _ in range(3):
         one.tell(Hand(sink, 1))
-    assert await one.ask(Now(), timeout=8.0) == 3
+    assert await one.ask(Now(), timeout=30.0) == 3
     one.kill()
-    assert await one.ask(Now(), timeout=8.0) == 3
-    async with asyncio.timeout(8.0):
+    assert await one.ask(Now(), timeout=30.0) == 3
+    async with asyncio.timeout(30.0):
         while await sink.ask(Total()) != 3:
             await asyncio.sleep(0.005)
     assert await sink.ask(Total()) == 3  # nothing was sent twice
@@ -198,13 +198,13 @@ async def test_a_killed_life_does_not_wait_for_its_thread(
 
     def stay(actor: Blocks) -> None:
         (tmp_path / "begun").touch()
-        gate.wait(8.0)
+        gate.wait(30.0)
         try:
             sink.tell(Add(1))
         except hf.HoldfastError as error:
             result.append(type(error))
 
-    asked = one.ask(Do(stay), timeout=8.0)
+    asked = one.ask(Do(stay), timeout=30.0)
     await until_there(tmp_path / "begun")
     gone = one._cell.ended()
     one.kill()
@@ -212,7 +212,7 @@ async def test_a_killed_life_does_not_wait_for_its_thread(
     with pytest.raises(hf.AskFailed):
         await asked
     gate.set()
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         while not result:
             await asyncio.sleep(0.005)
     assert result == [hf.ActorStopped]

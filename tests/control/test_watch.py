@@ -64,7 +64,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 
 
 async def event(stream: hf.EventStream, kind: type[E]) -> E:
-    async with asyncio.timeout(8.0):
+    async with asyncio.timeout(30.0):
         async for one in stream:
             if isinstance(one, kind):
                 return one

@@ -42,7 +42,7 @@ class Proxy(hf.Actor):
     def done(self, message: Done) -> Any:
         self._driver.take(message)
         for one in message.more:
-            if isinstance(one, Strayed):
+            if isinstance(one, Strayed) and not self._driver.holds_strays:
                 self.ctx.create_task(self._again(one.path.rpartition("/")[2]))
 
     async def _again(self, name: str) -> None:
@@ -88,7 +88,7 @@ class Driver:
         self.queue: list[Work] = []
         self.out_now: Work | None = None
         self.partial = -1
-        self.holds_ended = False
+        self.holds_ended = self.holds_strays = False
 
     async def start(self, names: Iterable[str] = ("r1", "r2"), isolation: str = "task", **setting: Any) -> None:
         """Start proxy, detector and replicas below a supervisor."""

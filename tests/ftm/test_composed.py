@@ -16,6 +16,7 @@ from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.rb import RB
 from holdfast.ftm.mechanisms.tr import TR
 from tests.ftm import versions
+from tests.ftm.accounts import Add as Count
 from tests.ftm.accounts import Counter, Load, Tags
 from tests.ftm.replicated import Add, Read, Total, pair
 from tests.ftm.test_failover import pid_of, two_again
@@ -46,6 +47,18 @@ async def test_a_transient_fault_and_crashes_are_both_masked(system: hf.ActorSys
     finally:
         await load.stop()
     load.check(await ref.ask(Tags()))
+
+
+async def test_one_that_begins_afresh_is_computed_twice_from_its_first_turn(system: hf.ActorSystem) -> None:
+    """Its turns are counted on, and there is no state to go with that number: neither behind a stop nor a crash."""
+    spec = hf.child("alice", hf.start(Counter), mechanism=(PBR(), TR()))
+    ref = await system.start(spec)
+    assert await ref.ask(Count(0)) == 1
+    await system.stop(ref)
+    ref = await system.start(spec)
+    assert await ref.ask(Count(0)) == 1
+    await system.terminate(ref, hf.Crash("ValueError", "boom"))
+    assert await ref.ask(Count(0), timeout=60) == 1
 
 
 @pytest.mark.parametrize("what", ["answer", "state"])

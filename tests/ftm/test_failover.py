@@ -428,9 +428,11 @@ async def until_there(path: Path) -> None:
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
 @pytest.mark.parametrize("recovery", [hf.hybrid(interval=0.05), None])
+@pytest.mark.parametrize("how", ["kill", "fail"])
 async def test_background_work_is_begun_again_or_said_to_be_lost(
-    system: hf.ActorSystem, recovery: Any, tmp_path: Path
+    system: hf.ActorSystem, recovery: Any, how: str, tmp_path: Path
 ) -> None:
+    """The one that leads dies, or a turn of it fails, while the work of an earlier turn is out."""
     ref = await started(system, hf.start(Waiter), recovery=recovery)
     events, there = system.events(), tmp_path / "there"
     await ref.ask(Add(0))
@@ -438,7 +440,11 @@ async def test_background_work_is_begun_again_or_said_to_be_lost(
     assert await ref.ask(Add(2)) == 2
     primary = group_of(ref).primary
     assert primary is not None
-    os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    if how == "kill":
+        os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    else:
+        with pytest.raises(hf.RemoteCrash):
+            await ref.ask(Boom())
     assert await ref.ask(Add(3), timeout=30) == 3
     there.touch()
     lost = [one for one in events.take() if isinstance(one, hf.BackgroundWorkLost)]

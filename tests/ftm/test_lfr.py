@@ -14,9 +14,10 @@ from holdfast.ftm.alarms import Diverged
 from holdfast.ftm.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.messages import CannotJoin
+from holdfast.ftm.messages import CannotJoin, CannotLead
 from holdfast.ftm.orders import Peer
 from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Guess, Put, Read, Say, Total, pair
+from tests.ftm.versions import FAULTY
 
 
 async def settled(driver: Any, name: str, turn: int) -> None:
@@ -170,3 +171,49 @@ async def test_kills_at_any_moment_lose_and_double_nothing(system: hf.ActorSyste
         assert end.status == ("failed" if isinstance(message, Fail) else OK)
     assert sorted(await driver.ask(Read())) == sorted(expected)
     assert driver.doubled == []
+
+
+@pytest.mark.parametrize("what", ["answer", "state"])
+async def test_a_follower_that_is_wrong_each_time_holds_nobody_up(system: hf.ActorSystem, what: str) -> None:
+    """It joins again each time, and diverges again; no reply waits for it."""
+    driver = await pair(system, Total, LFR(), FAULTY(what=what, always=True, replica="r2"))
+    expected = 0
+    with system.events() as events:
+        for n in range(60):
+            expected += n
+            assert await driver.ask(Add(n)) == expected
+        assert sum(isinstance(one, Diverged) for one in events.take()) > 1
+    assert await driver.ask(Read()) == list(range(60))
+
+
+async def test_a_follower_that_has_diverged_does_not_lead(system: hf.ActorSystem) -> None:
+    """Its state is not the leader's: better nobody leads than it."""
+    driver = await pair(system, Total, LFR(), FAULTY(what="answer", replica="r2"))
+    driver.holds_strays = True
+    with system.events() as events:
+        assert await driver.ask(Add(1)) == 1
+        async with asyncio.timeout(10):
+            while not any(isinstance(one, Diverged) for one in events.take()):
+                await asyncio.sleep(0.001)
+    async with asyncio.timeout(10):
+        while driver.standing("r1").peer is not None:
+            await asyncio.sleep(0.001)
+    assert await driver.ask(Add(2)) == 3, "no reply counts on it any more"
+    await driver.stop_replica("r1")
+    with pytest.raises(CannotLead):
+        await driver.lead("r2")
+
+
+async def test_what_was_on_its_way_when_a_state_was_taken_is_not_run_on_top_of_it(system: hf.ActorSystem) -> None:
+    """Inner layers take a batch a few steps to Proceed; a state that comes meanwhile has its requests in it."""
+    driver = await pair(system, Total, LFR(), TR())
+    before = system.node.cell_at(driver.path("r2") + "/tr.before").ref
+    await system.suspend(before)
+    assert await driver.ask(Add(1)) == 1, "the follower has it, though it has not come to its Proceed"
+    await driver.join("r2")
+    await system.resume(before)
+    assert await driver.ask(Add(2)) == 3
+    await settled(driver, "r2", 2)
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Read()) == [1, 2]

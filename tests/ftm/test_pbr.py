@@ -163,6 +163,31 @@ async def test_a_turn_that_leaves_an_unsavable_state_fails(system: hf.ActorSyste
     assert await driver.ask(Read()) == [1, 3, 5]
 
 
+class _Slow:
+    """The clock of a busy machine: each look but every n-th finds that no time has passed."""
+
+    def __init__(self, every: int) -> None:
+        self._looks, self._every = 0, every
+
+    def perf_counter(self) -> float:
+        self._looks += 1
+        return float(self._looks // self._every)
+
+
+@pytest.mark.parametrize("every", range(2, 8))
+async def test_a_part_may_be_over_before_any_turn_that_is_run_again(
+    system: hf.ActorSystem, every: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a slow machine has left for the next part is not run with the one that is run again."""
+    driver = await pair(system)
+    driver.standing("r1").server._chunk = 1
+    monkeypatch.setattr("holdfast.ftm.server.time", _Slow(every))
+    keys = driver.send(Add(1), Spoil(2), Add(3), Fail(4), Spoil(5), Add(6), Add(7))
+    assert await driver.reply(keys[6]) == 17
+    assert [driver.ends[key].turn for key in keys] == [1, 2, 3, 4, 5, 6, 7]
+    assert [driver.ends[keys[at]].status for at in (1, 3, 4)] == ["failed"] * 3
+
+
 async def test_a_turn_that_fails_leaves_nothing_but_its_number(system: hf.ActorSystem) -> None:
     driver = await pair(system)
     keys = driver.send(Add(1), Fail(2), Add(3), Fail(4), Add(5))

@@ -17,7 +17,7 @@ async def test_a_day_passes_at_once() -> None:
     loop, began = asyncio.get_running_loop(), time.monotonic()
     await asyncio.sleep(86_400 * 3)
     assert loop.time() == 86_400 * 3
-    assert time.monotonic() - began < 5.0
+    assert time.monotonic() - began < 60.0
 
 
 @virtual

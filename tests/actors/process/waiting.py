@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import holdfast as hf
 
-SECONDS = 30.0
+SECONDS = 60.0
 
 E = TypeVar("E", bound=hf.Event)
 
