@@ -79,11 +79,12 @@ class Baseline:
     starting: float  # seconds that its own `__init__` takes in a new process, at most
     handling: tuple[float, ...]  # seconds in the handler, of each message
     times: tuple[float, ...]  # when each message was recorded
+    played: float  # seconds that it took from the first message to the last: handlers, and what makes the messages
 
     @property
     def interval(self) -> float:
-        """Seconds between snapshots that are two seconds of the recording at the speed of this machine."""
-        return max(0.02, INTERVAL * sum(self.handling) / self.span)
+        """Seconds between snapshots that are two seconds of the recording at the speed at which it is played."""
+        return max(0.02, INTERVAL * self.played / self.span)
 
     def number_at(self, moment: float) -> int:
         """The number of the message on its way at a moment of the recording; of a shorter one, in its last third."""
@@ -126,7 +127,8 @@ async def baseline_of(kind: type[common.Program], limit: int | None) -> Baseline
     program = Timing(kind(common.DATA, limit))
     starting = first_start(program.start())
     result = await common.run(program, hf.fresh(), isolation="task")
-    return Baseline(result.digest, max(program.times[-1], 1e-3), starting, result.waits, tuple(program.times))
+    span, times = max(program.times[-1], 1e-3), tuple(program.times)
+    return Baseline(result.digest, span, starting, result.waits, times, program.last - program.first)
 
 
 def first_start(recipe: hf.Start[hf.Actor]) -> float:
@@ -149,21 +151,24 @@ def _seconds_of_init(recipe: hf.Start[hf.Actor]) -> float:
 
 
 class Timing(common.Program):
-    """A program that remembers when its messages were recorded."""
+    """A program that remembers when its messages were recorded, and when the first and the last were asked for."""
 
     def __init__(self, program: common.Program) -> None:
         self._program = program
         self.times: list[float] = []
+        self.first = self.last = 0.0
 
     def start(self) -> hf.Start[hf.Actor]:
         return self._program.start()
 
     def feed(self) -> common.Feed:
         feed, reply = self._program.feed(), None
+        self.first = time.perf_counter()
         while True:
             try:
                 timed = feed.send(reply)
             except StopIteration:
+                self.last = time.perf_counter()
                 return
             self.times.append(timed.time)
             reply = yield timed

@@ -197,11 +197,9 @@ class Commits:
 
     def _write(self, most: int | None = None) -> None:
         """Write what was submitted, the first `most` of it if that is given."""
-        pending, rest = self._pending, []
+        pending = self._pending[:most]
         if not pending or self.stopped is not None:
             return
-        if most is not None and len(pending) > most:
-            pending, rest = pending[:most], pending[most:]
         entries = [entry for submission, _ in pending for entry in submission.entries]
         try:
             positions = self.engine.append(entries) if entries else []
@@ -214,8 +212,8 @@ class Commits:
         except HoldfastError as error:
             self._stop(error)
             return
-        self._pending = rest
-        self._is_urgent = any(not number for _, number in rest)
+        del self._pending[: len(pending)]
+        self._is_urgent = any(not number for _, number in self._pending)
         begin = 0
         for submission, number in pending:
             end = begin + len(submission.entries)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import re
+import sys
 from typing import Any, Final, cast
 
 from ..errors import DamagedValue, UnsavableValue
@@ -11,21 +13,45 @@ from .forms import ARRAY, BITS, GENERATOR, RANDOM_STATE, SEED, TEXT, Blob, Make
 
 _LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0, "SFC64": 0}
 # Of numbers, text, bytes, times. Other names mean objects, or (a time unit of 0 seconds) end the process.
+_SMALL: Final = 1024  # bytes of an array that are copied at once
 _DTYPE: Final = re.compile(r"[<>|=]([biufcSUV]\d{1,9}|[qQ]|[mM]8(\[([1-9]\d{0,8})?[a-zA-Z]+\])?)")
 
 
+def is_array(kind: type) -> bool:
+    """Whether it is numpy's array: nobody has one without numpy."""
+    np: Any = sys.modules.get("numpy")
+    return np is not None and kind is getattr(np, "ndarray", None)
+
+
+def parts_of_array(x: Any, *, in_order: bool) -> tuple[Any, tuple[int, ...], str, Blob]:
+    """dtype, shape, order and bytes of an array or a scalar; `in_order` keeps Fortran order."""
+    known = _plain_dtypes().get(id(x.dtype))
+    is_fortran = in_order and x.ndim > 1 and x.flags.f_contiguous and not x.flags.c_contiguous
+    order = "F" if is_fortran else "C"
+    if known is not None and x.nbytes <= _SMALL:
+        return known, x.shape, order, Blob(x.tobytes(order))
+    np = _numpy()
+    if x.dtype.names:  # What happens to be between its fields is left out.
+        x, old = np.zeros_like(x), x
+        x[...] = old
+    flat = np.ascontiguousarray(x.T if is_fortran else x).reshape(-1)
+    return _dtype_parts(x.dtype), x.shape, order, Blob(flat.view(np.uint8) if flat.nbytes else b"")
+
+
+@functools.cache
+def _plain_dtypes() -> dict[int, str]:
+    """The names of the dtypes of numbers, which exist once, by id."""
+    dtypes = [_numpy().dtype(char) for char in "?bBhHiIlLqQefdgFDG"]
+    return {id(dtype): _dtype_parts(dtype) for dtype in dtypes}
+
+
 def array_form(np: Any, kind: Any, x: Any, *, in_order: bool) -> list[Any] | None:
-    """A mark and the parts of `x`, or None if it is not one of numpy's; `in_order` keeps Fortran order."""
+    """A mark and the parts of `x`, or None if it is not one of numpy's; `in_order` as for an array."""
     if kind is np.str_ or kind is np.bytes_:  # as an array it would lose the NULs at its end
         return [TEXT, str.__str__(x) if kind is np.str_ else bytes(x)]
-    if kind is np.ndarray or (issubclass(kind, np.generic) and kind is x.dtype.type):
-        order = "F" if in_order and x.flags.f_contiguous and not x.flags.c_contiguous else "C"
-        if x.dtype.names:  # What happens to be between its fields is left out.
-            x, old = np.zeros_like(x), x
-            x[...] = old
-        flat = np.ascontiguousarray(x.T if order == "F" else x).reshape(-1)
-        dtype, blob = _dtype_parts(x.dtype), Blob(flat.view(np.uint8) if flat.nbytes else b"")
-        return [ARRAY, dtype, x.shape, order if kind is np.ndarray else "", blob]
+    if issubclass(kind, np.generic) and kind is x.dtype.type:
+        dtype, shape, _, blob = parts_of_array(x, in_order=in_order)
+        return [ARRAY, dtype, shape, "", blob]
     if kind is np.random.Generator:
         return [GENERATOR, x.bit_generator]
     if kind is np.random.RandomState and (state := x.get_state(legacy=False))["bit_generator"] == "MT19937":

@@ -13,12 +13,12 @@ import msgpack
 from msgpack import ExtType
 
 from ..errors import UnsavableValue, type_name
-from .arrays import array_form
+from .arrays import array_form, is_array, parts_of_array
 from .classes import class_mark, class_name, class_parts, factory_name, slots_of
 from .forms import (
     AGAIN,
+    ARRAY,
     BUFFER,
-    CHANGING,
     DEFAULTDICT,
     FORMAT,
     HEAD,
@@ -69,6 +69,8 @@ class _Encoder:
         self.met_again: set[int] = set()  # and of what turned out to be
         self.numbers: dict[int, int] = {}  # of the shared ones that are in the tree already, by id
         self.walked: dict[int, object] = {}  # by id: None while inside it, then itself, so that the id stays in use
+        self.trees: dict[int, Any] = {}  # what those became
+        self.changing: dict[type, bool] = {}  # `can_change`, asked once
         self.classes: dict[type, tuple[ExtType, str, dict[str, Any]]] = {}
         self.blobs: list[Any] = []
         self.has_marks = False
@@ -77,24 +79,40 @@ class _Encoder:
         kind, key = type(x), id(x)
         if kind in SCALARS:
             return x
-        if kind not in CHANGING and not can_change(kind):
+        changing = self.changing.get(kind)
+        if changing is None:
+            changing = self.changing[kind] = can_change(kind)
+        if not changing:
             return self.inside(kind, x)
         if key in self.walked:
             if self.walked[key] is None:
                 raise UnsavableValue("", f"a {type_name(kind)} that contains itself")
             if key in self.numbers:
                 return [AGAIN, self.numbers[key]]
-            self.met_again.add(key)
             if not self.canonical:
-                return None  # This tree is thrown away: the next walk knows what is shared.
+                return self.again(key, x)
         self.walked[key] = None
-        lowered = self.inside(kind, x)
+        lowered = self.trees[key] = self.inside(kind, x)
         self.walked[key] = x
         if key in self.shared:
-            self.has_marks = True
-            self.numbers[key] = len(self.numbers)
-            return [SHARED, self.numbers[key], lowered]
+            return [SHARED, self.number(key), lowered]
         return lowered
+
+    def number(self, key: int) -> int:
+        """Of what is shared."""
+        self.has_marks = True
+        self.numbers[key] = number = len(self.numbers)
+        return number
+
+    def again(self, key: int, x: object) -> Any:
+        """What stands where `x` is met for the second time: the first place becomes one that can be referred to."""
+        first = self.trees[key]
+        if first is x or type(first) is not list:  # Not ours to change: one more walk, which knows that it is shared.
+            self.met_again.add(key)
+            return None
+        number = self.number(key)
+        first[:] = [SHARED, number, [*first]]
+        return [AGAIN, number]
 
     def inside(self, kind: type, x: Any) -> Any:
         if kind is list:
@@ -104,6 +122,10 @@ class _Encoder:
         if kind is tuple:  # as `form` would do it, only faster
             self.has_marks = True
             return [TUPLE, *(x if are_scalars(map(type, x)) else self.each(x, x))]
+        if is_array(kind):
+            self.has_marks = True
+            dtype, shape, order, blob = parts_of_array(x, in_order=not self.canonical)
+            return [ARRAY, dtype if type(dtype) is str else self.lowered(dtype), [TUPLE, *shape], order, blob]
         mark, *parts = self.form(kind, x)
         return [mark, *(parts if are_scalars(map(type, parts)) else self.each(x, parts))]
 

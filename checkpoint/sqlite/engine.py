@@ -17,12 +17,12 @@ from .packs import Packs
 from .reading import ChainReader
 from .rows import (
     CHUNK,
+    PLACE,
     check_entry,
     crc_of,
     entry_packer,
     is_plain,
     pack_positions,
-    row_crc,
     snapshot_digest,
     unpack_positions,
 )
@@ -118,14 +118,17 @@ class SqliteJournal:
     def _rows(self, entries: Sequence[tuple[str, Entry]], packed: list[bytes]) -> list[Row]:
         """Give each entry its position and its place in its chain."""
         rows: list[Row] = []
-        position, address, chain = self._store.last, None, None
+        place, crc32 = PLACE.pack, zlib.crc32  # `row_crc`, but this is done for every message
+        position, address = self._store.last, entries[0][0]
+        chain = self._store.chain(address)
         for (where, entry), data in zip(entries, packed, strict=True):
-            if chain is None or where != address:
+            if where != address:
                 address, chain = where, self._store.chain(where)
             position += 1
             number = chain.last = chain.last + 1
             chain.positions.append(position)
-            rows.append((position, chain.id, number, entry[0], data, row_crc(position, chain.id, number, data)))
+            key = chain.id
+            rows.append((position, key, number, entry[0], data, crc32(data, crc32(place(position, key, number)))))
         self._store.last = position
         self._store.live += len(rows)
         return rows

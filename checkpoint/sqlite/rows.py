@@ -16,7 +16,7 @@ from ..journal import Entry, Primitive
 CHUNK: Final = 500  # Rows removed in one transaction: about 1 ms, which a caller of `append` may have to wait.
 _PLAIN: Final = frozenset({int, float, str, bytes, bool, type(None)})
 _BIG_INT: Final = 1  # msgpack extension type
-_PLACE: Final = struct.Struct("<QQQ")  # position, address id, chain number
+PLACE: Final = struct.Struct("<QQQ")  # position, address id, chain number
 
 
 def entry_packer() -> Callable[[Entry], bytes]:
@@ -65,7 +65,7 @@ def decode_entry(data: bytes) -> Entry:
 
 def row_crc(position: int, address: int, chain: int, data: bytes) -> int:
     """Checksum of an entry, over its place and content."""
-    return zlib.crc32(data, zlib.crc32(_PLACE.pack(position, address, chain)))
+    return zlib.crc32(data, zlib.crc32(PLACE.pack(position, address, chain)))
 
 
 def crc_of(*fields: object) -> int:
