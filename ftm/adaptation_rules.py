@@ -62,8 +62,8 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
         if above is not None and ORDER.index(one.layer) < ORDER.index(above.layer):
             why = f"({one.layer}) must stand outside of {above.name} ({above.layer}), not inside"
             raise MechanismRefused(one.name, f"it {why}")
-        if above is not None and one.layer == above.layer:
-            raise MechanismRefused(one.name, _both(one, above))
+        if above is not None and (why := _both(one, above)):
+            raise MechanismRefused(one.name, why)
         others = [other for other in layers[: layers.index(one)] if 1 < other.replicas != one.replicas > 1]
         if others:
             why = f"it wants {one.replicas} replicas, and {others[0].name} outside of it {others[0].replicas}"
@@ -80,11 +80,16 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
 
 
 def _both(one: Mechanism, above: Mechanism) -> str:
+    """Why two of one layer do not go together; what masks nothing goes with all."""
+    if one.layer != above.layer:
+        return ""
     if one.name == above.name:
         return "it stands in the composition twice"
     if one.replicas > 1 and above.replicas > 1:
         return f"it wants {one.replicas} replicas, and {above.name} outside of it keeps replicas already"
-    return f"it and {above.name} are both of {one.layer}: two of them would work against each other"
+    if one.tolerates and above.tolerates:
+        return f"it and {above.name} are both of {one.layer}: two of them would work against each other"
+    return ""
 
 
 def describe(layers: Any) -> list[Description] | None:

@@ -269,7 +269,7 @@ class Group(Securing):
         records, self.inward = self.inward, []
         if self.inside:
             self.inward = [one for one in records if isinstance(one, SnapshotNow)]
-            records = [one for one in records if not isinstance(one, SnapshotNow)]
+            records = [one for one in records if one not in self.inward]
         return Inward(self.epoch, records) if records else None
 
     def next_work(self) -> Work | None:

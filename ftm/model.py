@@ -180,11 +180,13 @@ def nesting_problems(layers: Mechanisms) -> tuple[str, ...]:
 
 
 def _pair_problem(outer: Entry, inner: Entry) -> str:
-    if outer.layer == inner.layer:
+    # What masks nothing, such as an audit, goes with all.
+    masks, replicates = bool(outer.tolerates and inner.tolerates), min(outer.replicas, inner.replicas) > 1
+    if outer.layer == inner.layer and (outer.name == inner.name or masks or replicates):
         return f"{outer.name} and {inner.name} are both of {inner.layer}: two of them would work against each other"
     if 1 < outer.replicas != inner.replicas > 1:
         return f"{outer.name} keeps {outer.replicas} replicas, and {inner.name} {inner.replicas}"
-    if LAYERS.index(outer.layer) < LAYERS.index(inner.layer):
+    if LAYERS.index(outer.layer) <= LAYERS.index(inner.layer):
         return ""
     if inner.layer == "link":
         return f"{inner.name} must be outermost: outside of it, {outer.name} would see ciphered data"

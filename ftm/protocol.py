@@ -198,7 +198,8 @@ class RequestProtocol(Transfer):
     def _answer(self, work: Coroutine[Any, Any, Any]) -> ReplyHandle[Any]:
         """Answer when the work is done; the bricks may need us meanwhile. One such work at a time."""
         handle = self.ctx.reply_handle()
-        self.ctx.create_task(self._answered(handle, work))
+        task = self.ctx.create_task(self._answered(handle, work))
+        task.add_done_callback(lambda done: work.close())  # We may end before it has begun.
         return handle
 
     async def _answered(self, handle: ReplyHandle[Any], work: Awaitable[Any]) -> None:

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...actors.errors import HoldfastError
 from ...actors.message import Message
@@ -48,29 +48,29 @@ def root_file(folder: str, authority: str) -> Path:
     return Path(folder) / f"{hashlib.sha256(authority.encode()).hexdigest()[:32]}.root"
 
 
+class End(NamedTuple):
+    """Whose end of secured links it is."""
+
+    node: Node
+    """Of this process."""
+    address: str
+    """The protected actor's."""
+    path: str
+    """This participant's."""
+    mechanism: SEC
+    """Its settings."""
+    epoch: Callable[[], int]
+    """The present one."""
+    enrols: Callable[[], list[str]] | None = None
+    """Of whom this one orders certificates; None: it is enrolled by another."""
+
+
 class Identity(Secret):
-    """One participant. Its key and certificate are got when they are needed, and renewed in time.
+    """One participant. Its key and certificate are got when they are needed, and renewed in time."""
 
-    Args:
-        node: of this process.
-        address: the protected actor's.
-        path: this participant's.
-        mechanism: its settings.
-        epoch: the present one.
-        enrols: of whom this one orders certificates; None: it is enrolled by another.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        address: str,
-        path: str,
-        mechanism: SEC,
-        epoch: Callable[[], int],
-        enrols: Callable[[], list[str]] | None = None,
-    ) -> None:
-        self.mechanism, self.path = mechanism, path
-        self._node, self._address, self._epoch, self._enrols = node, address, epoch, enrols
+    def __init__(self, end: End) -> None:
+        self.mechanism, self.path = end.mechanism, end.path
+        self._node, self._address, self._epoch, self._enrols = end.node, end.address, end.epoch, end.enrols
         self.rejected: Counter[str] = Counter()
         self._me: Participant | None = None
         self._lock = asyncio.Lock()

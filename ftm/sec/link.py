@@ -10,8 +10,7 @@ import asyncio
 import contextvars
 import hashlib
 from collections import deque
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -42,13 +41,9 @@ from .errors import (
     Rejected,
 )
 from .handshake import Participant, Response
-from .identity import Identity, certified, root_file
+from .identity import End, Identity, certified, root_file
 from .keys import Secret
 from .session import HEAD, Session
-
-if TYPE_CHECKING:
-    from ...actors.node import Node
-    from ..mechanisms.sec import SEC
 
 CALL, BACK = b"call", b"back"
 PLAIN, OUT_OF_ORDER = "plain", "out_of_order"
@@ -91,29 +86,12 @@ class Partner(Secret):
 
 
 class Link(Identity):
-    """One end of secured links.
+    """One end of secured links."""
 
-    Args:
-        node: of this process.
-        address: the protected actor's.
-        path: this participant's.
-        mechanism: its settings.
-        epoch: the present one.
-        enrols: of whom this one orders certificates; None: it is enrolled by another.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        address: str,
-        path: str,
-        mechanism: SEC,
-        epoch: Callable[[], int],
-        enrols: Callable[[], list[str]] | None = None,
-    ) -> None:
-        super().__init__(node, address, path, mechanism, epoch, enrols)
-        self._proxy = certified(f"{address}/ftm/proxy")
-        self._replicas = frozenset(certified(f"{address}/ftm/r{number}") for number in range(1, MOST_REPLICAS + 1))
+    def __init__(self, end: End) -> None:
+        super().__init__(end)
+        self._proxy = certified(f"{end.address}/ftm/proxy")
+        self._replicas = frozenset(certified(f"{end.address}/ftm/r{number}") for number in range(1, MOST_REPLICAS + 1))
         self._partners: dict[str, Partner] = {}
         self._sessions: dict[bytes, Session] = {}
         self._responses: dict[bytes, Response] = {}

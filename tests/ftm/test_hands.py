@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextvars
 import os
 import signal
 from collections.abc import Callable
@@ -378,6 +379,46 @@ async def test_a_supervisor_restart_in_the_middle_of_a_failover_comes_behind_it(
     await load.stop()
     load.check(await alice.ask(Tags()))
     assert judge.holder("/app/s/alice") is None
+
+
+@pytest.mark.parametrize("how", ["stop", "detach"])
+async def test_what_the_new_primary_knows_and_its_home_does_not_is_not_done_twice(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """The primary dies when the backup has its state, and nobody its outcomes; then a state is saved or moved."""
+    ref = await protected(system, recovery=hf.hybrid())
+    group, dropped = group_of(ref), list[Any]()
+    real, above = group.take_done, system.ref("/app", hf.Supervisor)
+
+    def take_done(done: Any) -> None:
+        if dropped or not any(end.status == "ok" for end in done.ends):
+            real(done)
+            return
+        dropped.append(done)  # As if it were still in the pipe when its sender dies.
+        kill(system, ref)
+
+    async def leave() -> None:
+        if how == "stop":
+            await above.ask(hf.TerminateChild("alice"), SECONDS)
+            await above.ask(hf.RestartChild("alice"), SECONDS)
+        else:
+            async with system.transaction(timeout=SECONDS) as change:
+                change.detach(ref)
+
+    made = at_step(ref, "lead", lambda: asyncio.create_task(leave(), context=contextvars.Context()))
+    monkeypatch.setattr(group, "take_done", take_done)
+    asked = [ref.ask(Add(tag), timeout=SECONDS) for tag in range(5)]
+    replies = await asyncio.gather(*asked, return_exceptions=True)
+    await made[0]
+    assert dropped
+    there = system.ref(ALICE, Counter)
+    tags = await there.ask(Tags())
+    assert len(tags) == len(set(tags))
+    answered = [tag for tag, reply in enumerate(replies) if isinstance(reply, int)]
+    assert set(answered) <= set(tags)
+    assert answered, replies
+    if how == "detach":
+        assert (answered, tags) == (list(range(5)), list(range(5)))
 
 
 async def test_a_life_that_ends_in_the_middle_of_a_failover_is_its_supervisors(system: hf.ActorSystem) -> None:

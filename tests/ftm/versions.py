@@ -150,3 +150,12 @@ class OtherCounter(Counter):
         self.tags = [*self.tags, message.tag]
         self.total = message.amount + self.total
         return self.total
+
+
+CA = "/app/ca"
+SETTINGS: dict[str, dict[str, Any]] = {  # for a Counter, of the mechanisms that do not go without
+    "ad": {"assertions": (tags_are_known,)},
+    "rb": {"alternates": (SameCounter,), "test": (tags_are_known,)},
+    "nvp": {"versions": (SameCounter, OtherCounter)},
+    "sec": {"authority": CA},
+}
