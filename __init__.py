@@ -4,6 +4,10 @@ Actors live in supervision trees, each in a task or in an OS process of its own.
 mailbox come back as if nothing had happened.
 """
 
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
+
 from holdfast.actors.actor import Actor, Start, on, start, subscribe
 from holdfast.actors.bindings import Binding, Unbound
 from holdfast.actors.context import ActorContext
@@ -181,7 +185,37 @@ from holdfast.system.transaction.events import (
 )
 from holdfast.system.transaction.operation import Operation, Step
 
+if TYPE_CHECKING:
+    from holdfast.ftm.adaptation import CannotAdapt
+    from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
+    from holdfast.ftm.detector import Detection
+    from holdfast.ftm.events import (
+        BackgroundWorkLost,
+        FailedOver,
+        MechanismAttached,
+        MechanismChanged,
+        MechanismDetached,
+        ReplicaFaulty,
+        ReplicaJoined,
+        ReplicaLost,
+        WrongSuspicion,
+    )
+    from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
+    from holdfast.ftm.mechanisms.ad import AD
+    from holdfast.ftm.mechanisms.lfr import LFR
+    from holdfast.ftm.mechanisms.nvp import NVP
+    from holdfast.ftm.mechanisms.pbr import PBR
+    from holdfast.ftm.mechanisms.rb import RB
+    from holdfast.ftm.mechanisms.sec import SEC
+    from holdfast.ftm.mechanisms.tmr import TMR
+    from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.sealed import FrameRefused
+    from holdfast.ftm.sec.authority import CertificationAuthority
+    from holdfast.ftm.voters import NoMajority
+    from holdfast.system.protection import AdaptationUndone
+
 __all__ = [
+    "AD",
     "Actor",
     "ActorContext",
     "ActorCrashed",
@@ -190,6 +224,7 @@ __all__ = [
     "ActorStarted",
     "ActorStopped",
     "ActorSystem",
+    "AdaptationUndone",
     "AlreadyPresent",
     "AlreadyRegistered",
     "AlreadyStarted",
@@ -197,12 +232,15 @@ __all__ = [
     "AskFailed",
     "AskTimeout",
     "AutoShutdown",
+    "BackgroundWorkLost",
     "Backoff",
     "BadMessage",
     "Binding",
     "Bus",
     "Calls",
+    "CannotAdapt",
     "CannotMove",
+    "CertificationAuthority",
     "Change",
     "ChangeSupervisor",
     "CheckpointFailed",
@@ -220,13 +258,17 @@ __all__ = [
     "DamagedStore",
     "DeadLetter",
     "DeleteChild",
+    "Detection",
+    "Diverged",
     "DynamicSupervisor",
     "Event",
     "EventStream",
     "ExitReason",
     "Exited",
     "Failed",
+    "FailedOver",
     "Flags",
+    "FrameRefused",
     "GetChildSpec",
     "Held",
     "HeldMessages",
@@ -243,11 +285,18 @@ __all__ = [
     "KeyFreed",
     "KeyRegistered",
     "Killed",
+    "LFR",
     "Limits",
     "LogLine",
     "LoopLagged",
     "MailboxFull",
+    "Masked",
     "MaxChildren",
+    "Mechanism",
+    "MechanismAttached",
+    "MechanismChanged",
+    "MechanismDetached",
+    "MechanismRefused",
     "Message",
     "MessageIn",
     "MessageOut",
@@ -257,7 +306,9 @@ __all__ = [
     "Moved",
     "NOPROC",
     "NORMAL",
+    "NVP",
     "NameTaken",
+    "NoMajority",
     "NoPartitions",
     "NoProc",
     "NoRoute",
@@ -276,6 +327,7 @@ __all__ = [
     "Opaque",
     "Operation",
     "OutOfMemory",
+    "PBR",
     "PartitionSupervisor",
     "Plan",
     "PoolInfo",
@@ -289,8 +341,10 @@ __all__ = [
     "ProgramInfo",
     "ProgramInput",
     "ProgramStatus",
+    "ProtectionLost",
     "Quarantined",
     "QuarantinedMessage",
+    "RB",
     "Recovered",
     "RecoveryFailed",
     "RecoveryFile",
@@ -305,6 +359,9 @@ __all__ = [
     "RemoteCrash",
     "ReplayDiverged",
     "ReplayPaced",
+    "ReplicaFaulty",
+    "ReplicaJoined",
+    "ReplicaLost",
     "ReplyHandle",
     "ResizePartitions",
     "ResizePool",
@@ -312,6 +369,7 @@ __all__ = [
     "RolledBack",
     "Route",
     "Rule",
+    "SEC",
     "SHUTDOWN",
     "SafeState",
     "SafeStateEntered",
@@ -342,6 +400,8 @@ __all__ = [
     "StoreRefused",
     "Supervisor",
     "SupervisorGaveUp",
+    "TMR",
+    "TR",
     "TaskSupervisor",
     "Tasks",
     "TerminateChild",
@@ -363,11 +423,13 @@ __all__ = [
     "WhichChildren",
     "Wrapped",
     "WrongActor",
+    "WrongSuspicion",
     "bounded",
     "calls",
     "check_children",
     "checkpoint_only",
     "child",
+    "compose",
     "dynamic",
     "fresh",
     "held",
@@ -393,3 +455,43 @@ __all__ = [
     "tree_from",
     "wrap",
 ]
+
+# Most programs protect nobody: what they do not use is not imported.
+_LAZY = {
+    "AD": "holdfast.ftm.mechanisms.ad",
+    "CertificationAuthority": "holdfast.ftm.sec.authority",
+    "BackgroundWorkLost": "holdfast.ftm.events",
+    "Detection": "holdfast.ftm.detector",
+    "Diverged": "holdfast.ftm.alarms",
+    "FailedOver": "holdfast.ftm.events",
+    "FrameRefused": "holdfast.ftm.sealed",
+    "LFR": "holdfast.ftm.mechanisms.lfr",
+    "Masked": "holdfast.ftm.alarms",
+    "Mechanism": "holdfast.ftm.mechanism",
+    "MechanismAttached": "holdfast.ftm.events",
+    "MechanismDetached": "holdfast.ftm.events",
+    "CannotAdapt": "holdfast.ftm.adaptation",
+    "MechanismChanged": "holdfast.ftm.events",
+    "AdaptationUndone": "holdfast.system.protection",
+    "MechanismRefused": "holdfast.ftm.mechanism",
+    "NVP": "holdfast.ftm.mechanisms.nvp",
+    "NoMajority": "holdfast.ftm.voters",
+    "PBR": "holdfast.ftm.mechanisms.pbr",
+    "ProtectionLost": "holdfast.ftm.alarms",
+    "RB": "holdfast.ftm.mechanisms.rb",
+    "ReplicaFaulty": "holdfast.ftm.events",
+    "ReplicaJoined": "holdfast.ftm.events",
+    "ReplicaLost": "holdfast.ftm.events",
+    "SEC": "holdfast.ftm.mechanisms.sec",
+    "TMR": "holdfast.ftm.mechanisms.tmr",
+    "TR": "holdfast.ftm.mechanisms.tr",
+    "WrongSuspicion": "holdfast.ftm.events",
+    "compose": "holdfast.ftm.mechanism",
+}
+
+
+def __getattr__(name: str) -> _Any:
+    if name in _LAZY:
+        value = globals()[name] = getattr(_import_module(_LAZY[name]), name)
+        return value
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

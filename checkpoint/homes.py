@@ -93,6 +93,21 @@ class Homes:
         wanted = method.durability or self.journal.durability
         return self._unkept if self.journal.durable and wanted == "memory" else self.journal
 
+    def made(self, cell: Cell, method: Method) -> Switch:
+        """A home for an actor that has none, which nothing reaches before it is adopted."""
+        switch = Switch(self.node, cell.path, method, self._journal_of(method))
+        switch.recoveries, switch.quarantine, switch.cell = self.recoveries, self.quarantine, cell
+        return switch
+
+    def adopt(self, cell: Cell, switch: Switch, method: Method) -> None:
+        """From here on what is sent to the address goes there."""
+        self._switches[cell.path] = switch
+        self.of(cell, method)
+
+    def released(self, path: str) -> None:
+        """The actor at an address, which was not recorded, goes on without a home."""
+        self._switches.pop(path, None)
+
     def vacate(self, path: str, why: str) -> None:
         """What is known here of an address where nobody lives is not true any more; the store is somebody else's."""
         self._stored.add(path)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import struct
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Final
 
 import msgspec
@@ -65,20 +65,13 @@ class Imager:
             UnsavableValue: naming the variable and the type.
         """
         if isinstance(state, dict) and all(type(name) is str for name in state):
-            sections = self._sections(state, where)
+            sections = self.sections(state, where)
         else:
             sections = [Section([], *walked_pieces(state, where), None)]
-        small = [one for one in sections if one.size < LARGE]
-        large = [one for one in sections if one.size >= LARGE]
-        head = msgspec.msgpack.encode(Head(version, form, [(one.names, one.size) for one in (*small, *large)]))
-        first = [HEAD.pack(IMAGE, len(head)), head, *(piece for one in small for piece in one.pieces)]
-        pieces: list[tuple[Key, Any]] = [(("", 0), b"".join(first))]
-        for one in large:
-            name = one.names[0] if one.names else ""
-            pieces += [((name, number), piece) for number, piece in enumerate(joined(one.pieces), 1)]
-        return pieces
+        return pieces_of(version, form, sections)
 
-    def _sections(self, state: dict[str, Any], where: str) -> list[Section]:
+    def sections(self, state: dict[str, Any], where: str) -> list[Section]:
+        """The variables, apart wherever they can be."""
         made: list[Section] = []
         for name, value in state.items():
             known = self._unchanged.get(name)
@@ -99,6 +92,22 @@ class Imager:
 
     def _together(self, names: list[str], state: dict[str, Any], where: str) -> Section:
         return Section(names, *walked_pieces({name: state[name] for name in names}, where), None)
+
+
+def pieces_of(
+    version: int, form: str, sections: list[Section], more: Sequence[tuple[list[str], int]] = ()
+) -> list[tuple[Key, Any]]:
+    """The pieces of an image; those of `more` (names, size) come behind them."""
+    small = [one for one in sections if one.size < LARGE]
+    large = [one for one in sections if one.size >= LARGE]
+    lengths = [(one.names, one.size) for one in (*small, *large)]
+    head = msgspec.msgpack.encode(Head(version, form, [*lengths, *more]))
+    first = [HEAD.pack(IMAGE, len(head)), head, *(piece for one in small for piece in one.pieces)]
+    pieces: list[tuple[Key, Any]] = [(("", 0), b"".join(first))]
+    for one in large:
+        name = one.names[0] if one.names else ""
+        pieces += [((name, number), piece) for number, piece in enumerate(joined(one.pieces), 1)]
+    return pieces
 
 
 def sharing(sections: list[Section]) -> list[list[Section]]:

@@ -91,6 +91,7 @@ class Life:
         self.guard = Guard() if method.strict else None
         self.is_checked = method.check_replay  # whether the state is compared under replay
         self.ignored_why: str | None = None
+        self.saves = True  # whether its state must be one that can be saved
         self._snapshot_turn = -1
         self._state: list[bytes] = []
         self._has_state = False

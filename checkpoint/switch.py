@@ -37,7 +37,6 @@ from .records import (
     LATER,
     MESSAGE,
     NOTHING,
-    PIPE,
     START,
     STASHED,
     TICK,
@@ -382,7 +381,7 @@ class Switch:
                 case Live():
                     self._live(record)
                 case PipeDone():
-                    self._pipe_done(record)
+                    self.outputs.work_done(record)
                 case Unsaved():
                     self.due.failed(record.problem)
                 case Marked():
@@ -475,6 +474,8 @@ class Switch:
         """A turn was handled again: it must have sent just what it sent before."""
         self._take(end.turn, end.id, end.outs, Batch())
         past = self.turns.get(end.turn)
+        if end.status == FAILED and past is not None and past.input.kind == START and past.status != FAILED:
+            return  # It has not become anything else: its start failed, and will be tried again.
         seen = self._replay_k if self._replay_turn == end.turn else 0
         if past is None or seen != len(past.digests) or end.status != past.status:
             raise ReplayDiverged(self.path, end.turn, seen + 1)
@@ -490,10 +491,3 @@ class Switch:
             ask.give(answer, batch)
         else:
             batch.after.append(lambda: answer_ask(self, ask, answer))
-
-    def _pipe_done(self, record: PipeDone) -> None:
-        done = self.pipes_done.setdefault(record.turn, set())
-        if record.k not in done:
-            done.add(record.k)
-            origin = f"{record.turn}.{record.k}"
-            self.forward(self.record(PIPE, record.name, record.body, self.path, origin=origin))

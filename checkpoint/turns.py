@@ -114,7 +114,7 @@ class Fed(Item):
     def end(self, answer: Answer) -> None:
         """The turn is over; a stashed message stays open."""
         life = self.life
-        if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None:
+        if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None and life.saves:
             save_state(life.cell.actor)  # What cannot be saved is refused now, not when it is needed.
         if self.is_stashed:
             life.close_turn(STASHED, Answer())

@@ -48,9 +48,11 @@ LINGER = 1.0
 """Seconds that a client gets to take the reason why its connection ends."""
 LONGEST = 3600.0
 """Seconds that one request may take."""
-OPERATIONS = frozenset({"add", "remove", "move", "reorder", "strategy", "intensity", "isolation"}) | frozenset(
-    {"bind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
-)
+_TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
+_LIVING = {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
+OPERATIONS = frozenset(_TREE | _LIVING | {"attach", "detach", "compose", "transition", "update"})
+NAMED = {"compose": ("outside",), "update": ("mechanism", "role")}
+"""What comes last is named."""
 
 
 class EndpointInUse(HoldfastError):
@@ -233,7 +235,9 @@ class Endpoint:
             for verb, args in operations:
                 if verb not in OPERATIONS:
                     raise BadRequest(f"there is no operation {verb!r}")
-                getattr(change, verb)(*args)
+                named = NAMED.get(verb, ())
+                at = len(args) - len(named)
+                getattr(change, verb)(*args[:at], **dict(zip(named, args[at:], strict=True)))
         steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
         return {"steps": steps, "difference": list(change.difference)}
 

@@ -10,6 +10,7 @@ import socket
 import threading
 import uuid
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from types import TracebackType
 from typing import Any
 
@@ -350,6 +351,39 @@ class RemoteChange:
         """Go on as another class."""
         self._put("replace_code", target, new, migrate)
 
+    def stop(self, target: RemoteTarget) -> None:
+        """Stop a child, and keep its spec."""
+        self._put("stop", target)
+
+    def start(self, supervisor: RemoteTarget, name: str) -> str:
+        """Start a child again that was stopped; returns its address."""
+        self._put("start", supervisor, name)
+        return f"{text_of(supervisor)}/{name}"
+
+    def unbind(self, owner: RemoteTarget, port: str) -> None:
+        """Point a binding nowhere."""
+        self._put("unbind", owner, port)
+
+    def attach(self, target: RemoteTarget, mechanism: Any) -> None:
+        """Protect an actor by a mechanism, or by several, outermost first; a file is one of the running system's."""
+        self._put("attach", target, whole(mechanism))
+
+    def detach(self, target: RemoteTarget, mechanism: str = "") -> None:
+        """Have it live without a mechanism."""
+        self._put("detach", target, mechanism)
+
+    def compose(self, target: RemoteTarget, mechanism: Any, *, outside: bool = False) -> None:
+        """Nest one more mechanism inside of those that it has, or outside."""
+        self._put("compose", target, whole(mechanism), outside)
+
+    def transition(self, target: RemoteTarget, mechanism: Any) -> None:
+        """Put a mechanism in the place of the one of its sort, or several in the place of all."""
+        self._put("transition", target, whole(mechanism))
+
+    def update(self, target: RemoteTarget, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
+        """Give one brick new code."""
+        self._put("update", target, brick, whole(new), mechanism, role)
+
     def _put(self, verb: str, target: RemoteTarget, *args: Any) -> None:
         packed = [pack_arg(arg, f"{verb} {text_of(target)}") for arg in (text_of(target), *args)]
         self._operations.append((verb, packed))
@@ -380,3 +414,14 @@ class RemoteChange:
 def text_of(target: RemoteTarget) -> str:
     """A target's address."""
     return target.path if isinstance(target, RemoteRef) else target
+
+
+def whole(code: Any) -> Any:
+    """Files by their whole path: the running system has another working directory."""
+    if isinstance(code, (tuple, list)):
+        return tuple(map(whole, code))
+    text = os.fspath(code) if isinstance(code, os.PathLike) else code
+    if not isinstance(text, str):
+        return text
+    file, colon, name = text.partition(":")
+    return f"{Path(file).resolve()}{colon}{name}" if file.endswith(".py") else text

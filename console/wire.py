@@ -67,15 +67,15 @@ class Arg(msgspec.Struct, array_like=True, frozen=True, tag_field="kind"):
 
 
 class Plain(Arg, tag="plain", array_like=True, frozen=True):
-    """Text, a number, None, or a list of these."""
+    """Text, a number, a truth, None, or a list of texts."""
 
-    value: str | int | float | list[str] | None
+    value: str | bool | int | float | list[str] | None
 
 
 class Packed(Arg, tag="packed", array_like=True, frozen=True):
-    """What has to be rebuilt: a child spec or recipe, a function, or the recipe of a class."""
+    """What has to be rebuilt: a child spec or recipe, a function, the recipe of a class, or mechanisms."""
 
-    of: Literal["spec", "function", "code"]
+    of: Literal["spec", "function", "code", "mechanism"]
     data: bytes
 
 
@@ -92,6 +92,8 @@ def pack_arg(value: Any, where: str) -> AnyArg:
         return Packed("spec", pack_data(value, where))
     if isinstance(value, type) and issubclass(value, Actor):
         return Packed("code", pack_recipe(Start(value), where))
+    if is_mechanism(value):
+        return Packed("mechanism", encode_value(pack_mechanism(value), where=where))
     if callable(value):
         return Packed("function", encode_value(pack_function(value, where, where)))
     return Plain(list(value) if isinstance(value, (list, tuple)) else value)
@@ -105,7 +107,39 @@ def open_arg(arg: AnyArg) -> Any:
         return unpack_data(arg.data)
     if arg.of == "code":
         return unpack_recipe(arg.data).kind
+    if arg.of == "mechanism":
+        data: Any = decode_value(arg.data)
+        return open_mechanism(data)
     return unpack_function(decode_value(arg.data))
+
+
+def is_mechanism(value: Any) -> bool:
+    """Whether these are mechanisms: one or several, each an instance, or a class of them."""
+    from ..ftm.mechanism import Mechanism
+
+    layers: Any = value if isinstance(value, (tuple, list)) and value else (value,)
+    found = [isinstance(one, Mechanism) or (isinstance(one, type) and issubclass(one, Mechanism)) for one in layers]
+    named = [isinstance(one, str) for one in layers]
+    return any(found) and all(map(max, found, named))
+
+
+def pack_mechanism(value: Any) -> list[Any]:
+    """Mechanisms as plain data: each its name or file, or how it is described; whether they are several."""
+    from ..ftm.mechanism import Mechanism
+
+    layers: Any = value if isinstance(value, (tuple, list)) else (value,)
+    made = [one() if isinstance(one, type) else one for one in layers]
+    said = [msgspec.msgpack.encode(one.describe()) if isinstance(one, Mechanism) else str(one) for one in made]
+    return [isinstance(value, (tuple, list)), *said]
+
+
+def open_mechanism(data: list[Any]) -> Any:
+    """The mechanisms again. Imports the modules, or reads the files, that define them."""
+    from ..ftm.mechanism import Description, revive
+
+    several, *said = data
+    made = [one if isinstance(one, str) else revive(msgspec.msgpack.decode(one, type=Description)) for one in said]
+    return tuple(made) if several else made[0]
 
 
 # -- requests ---------------------------------------------------------------------------------------------------------

@@ -3,11 +3,15 @@
 Failover goes first, then the supervisor, then repair. Failover and repair ask for a *grant* before they touch an actor
 or a subtree, and give it back; a supervisor asks nobody: while it restarts a child, that child is its own. A grant has
 an epoch, which rises with each one; whoever holds an old one has lost the actor, and is told so.
+
+Whoever changes a mechanism asks too (`ADAPTATION`). It goes neither before repair nor behind it: the first one has the
+actor. Failover and supervisor do not take it away; it rests while they are at it, and goes on when they are done.
 """
 
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import dataclasses
 import enum
 import itertools
@@ -27,7 +31,21 @@ class Hand(enum.IntEnum):
 
     FAILOVER = 0
     SUPERVISOR = 1
-    REPAIR = 2
+    ADAPTATION = 2
+    REPAIR = 3
+
+    def goes_before(self, other: Hand) -> bool:
+        """Whether this one takes the actor from the other: of adaptation and repair, the first one has it."""
+        return self < other and self < Hand.ADAPTATION and other is not Hand.ADAPTATION
+
+    def goes_beside(self, other: Hand) -> bool:
+        """Whether both may have the actor: an adaptation rests while failover or its supervisor is at it."""
+        return Hand.ADAPTATION in (self, other) and min(self, other) < Hand.ADAPTATION
+
+
+on_errand: contextvars.ContextVar[object] = contextvars.ContextVar("on_errand", default=None)
+"""What is being done here: a repair step, a transaction. Grants of one errand do not exclude each other, so that repair
+can have a mechanism changed for it."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -37,6 +55,7 @@ class Grant:
     Attributes:
         epoch: rises with each grant; an action carries it, so that it is seen that it comes too late.
         until: seconds on the loop clock; after that nobody holds it any more.
+        errand: what it belongs to.
     """
 
     address: str
@@ -44,6 +63,7 @@ class Grant:
     epoch: int
     reason: str
     until: float = math.inf
+    errand: object = dataclasses.field(default=None, repr=False, compare=False)
 
 
 class InOtherHands(HoldfastError):
@@ -91,6 +111,7 @@ class Arbiter:
         *,
         seconds: float = math.inf,
         lost: Callable[[str], None] | None = None,
+        errand: object = None,
     ) -> Grant:
         """The right to act on an address and on all below it; who goes behind `hand` loses what overlaps.
 
@@ -100,21 +121,33 @@ class Arbiter:
             reason: why; told to who is refused meanwhile.
             seconds: it ends by itself after so many.
             lost: called once, at once, with the reason, if somebody else takes it before it is given back.
+            errand: what this is part of; what `on_errand` says if it is left out.
 
         Raises:
             InOtherHands: somebody who goes first, or as far in front, is at it.
         """
-        if hand > Hand.SUPERVISOR and (busy := self._supervised(address)) is not None:
-            raise InOtherHands(busy, "its supervisor", "it is being restarted")
-        standing = list(self._overlapping(address))
-        for other in standing:
-            if other.hand <= hand:
-                raise InOtherHands(other.address, other.hand.name.lower(), other.reason)
-        for other in standing:
-            self._take_away(other, f"{hand.name.lower()} has it now: {reason}")
-        grant = Grant(address, hand, next(self._epochs), reason, self._clock() + seconds)
+        errand = on_errand.get() if errand is None else errand
+        if (busy := self._in_the_way(address, hand, errand)) is not None:
+            raise busy
+        for other in list(self._overlapping(address)):
+            if hand.goes_before(other.hand) and not _is_one(errand, other):
+                self._take_away(other, f"{hand.name.lower()} has it now: {reason}")
+        grant = Grant(address, hand, next(self._epochs), reason, self._clock() + seconds, errand)
         self._grants[grant.epoch] = grant, lost
         return grant
+
+    def in_the_way(self, address: str, hand: Hand) -> InOtherHands | None:
+        """Who would refuse a claim now; None: nobody."""
+        return self._in_the_way(address, hand, on_errand.get())
+
+    def _in_the_way(self, address: str, hand: Hand, errand: object) -> InOtherHands | None:
+        for other in list(self._overlapping(address)):
+            if not (_is_one(errand, other) or hand.goes_before(other.hand) or hand.goes_beside(other.hand)):
+                return InOtherHands(other.address, other.hand.name.lower(), other.reason)
+        # An adaptation waits by itself until its actor is up.
+        if hand is Hand.REPAIR and (busy := self._supervised(address)) is not None:
+            return InOtherHands(busy, "its supervisor", "it is being restarted")
+        return None
 
     @contextlib.contextmanager
     def held(
@@ -159,7 +192,7 @@ class Arbiter:
         """A supervisor restarts a child: who goes behind it loses the child."""
         if isinstance(event, ChildRestarted):
             for grant in list(self._overlapping(event.address)):
-                if grant.hand > Hand.SUPERVISOR:
+                if Hand.SUPERVISOR.goes_before(grant.hand):
                     self._take_away(grant, f"its supervisor restarts {event.address}: {event.reason}")
 
     def _supervised(self, address: str) -> str | None:
@@ -188,6 +221,10 @@ def arbiter_of(node: Node) -> Arbiter:
         node.arbiter = Arbiter(node.loop.time, node)
     arbiter: Arbiter = node.arbiter
     return arbiter
+
+
+def _is_one(errand: object, grant: Grant) -> bool:
+    return errand is not None and grant.errand is errand
 
 
 def _is_being_restarted(cell: Cell) -> bool:

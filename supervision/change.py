@@ -15,7 +15,7 @@ from .spec import ChildSpec, Flags, Plan, check_spec
 if TYPE_CHECKING:
     from .supervisor import Supervisor
 
-FIXED = ("isolation", "recovery", "mailbox", "limits", "bindings")
+FIXED = ("isolation", "recovery", "mechanism", "mailbox", "limits", "bindings")
 """What belongs to an address and not to a life: it takes a new address to change it."""
 
 
@@ -108,6 +108,8 @@ def check_subtree(where: str, specs: Iterable[ChildSpec]) -> None:
     for spec in everything(specs):
         if spec.isolation == "process":
             raise SpecError(where, "a subtree in a process cannot hold process children: its own is theirs")
+        if spec.mechanism is not None:
+            raise SpecError(where, "a subtree in a process cannot hold protected children: replicas have processes")
 
 
 def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:

@@ -32,6 +32,19 @@ def replace_place(cell: Cell, spec: ChildSpec) -> None:
     _change(cell, spec, lambda known: dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits))
 
 
+def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
+    """The next lives at `cell` are protected as `spec` says, and live where it says."""
+    if cell.spec is not None and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
+        spec = dataclasses.replace(spec, start=cell.spec.start)
+    _change(
+        cell,
+        spec,
+        lambda known: dataclasses.replace(
+            known, isolation=spec.isolation, limits=spec.limits, mechanism=spec.mechanism
+        ),
+    )  # fmt: skip
+
+
 def _change(cell: Cell, spec: ChildSpec | None, change: Change) -> None:
     cell.spec = spec
     _tell_parent(cell)

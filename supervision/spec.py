@@ -78,6 +78,7 @@ class ChildSpec:
     is_supervisor: bool = False
     significant: bool = False
     rules: tuple[Rule, ...] = ()
+    mechanism: Any = None
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"
@@ -120,11 +121,18 @@ class ChildSpec:
                     where, f"recovery must be a method such as hybrid(...) or left out, not {self.recovery!r}"
                 )
             self.recovery.check(where, self.start.kind)
-        if self.isolation == "process":
+        if self.mechanism is not None:
+            check_mechanism(where, self.mechanism, self.start.kind, is_supervisor=self.is_supervisor)
+        if self.isolation == "process" or self.mechanism is not None:
             try:
                 pack_recipe(self.start, where)
             except UnsavableValue as error:
                 raise SpecError(error.where, f"{error.problem} cannot be sent to another process") from error
+
+    @property
+    def has_home(self) -> bool:
+        """Whether what is sent to it waits outside of its lives, so that its starts may take their time."""
+        return self.recovery is not None or self.mechanism is not None
 
     def restarts(self, reason: ExitReason) -> bool:
         """Whether an end by itself for this reason is followed by another life."""
@@ -174,6 +182,7 @@ def child(
     bindings: Mapping[str, str] | None = None,
     significant: bool = False,
     rules: Iterable[Rule] = (),
+    mechanism: Any = None,
 ) -> ChildSpec:
     """A child spec.
 
@@ -191,8 +200,11 @@ def child(
         bindings: port name to address, bound at each start.
         significant: its end by itself can end its supervisor (`auto_shutdown`); not for permanent children.
         rules: from `rule(...)`; the first that fits an end decides, then `restart`.
+        mechanism: a fault-tolerance mechanism such as `PBR()`, or several, outermost first: the actor is lived by
+            replicas in processes of their own.
 
     Raises:
+        MechanismRefused: the class does not have what the mechanism needs.
         SpecError: naming the child, the option, and what it may be.
     """
     is_supervisor = isinstance(start, Start) and bool(getattr(start.kind, "_supervises", False))
@@ -212,6 +224,7 @@ def child(
         is_supervisor,
         significant,
         tuple(rules),
+        mechanism,
     )
 
 
@@ -294,6 +307,23 @@ def check_spec(where: str, spec: object, auto_shutdown: AutoShutdown | None, *, 
         raise SpecError(where, "only children of a dynamic supervisor can go without an id")
     if spec.significant and auto_shutdown == "never":
         raise SpecError(where, f"child {spec.id!r} is significant, but auto_shutdown is 'never'")
+
+
+def check_mechanism(where: str, mechanism: Any, kind: type[Actor], *, is_supervisor: bool) -> None:
+    """Whether an actor of this class can be protected so.
+
+    Raises:
+        SpecError: it is no mechanism, or the child is a supervisor. MechanismRefused: what is missing.
+    """
+    layers = mechanism if isinstance(mechanism, tuple) else (mechanism,)
+    for layer in layers:
+        if isinstance(layer, type) or not hasattr(layer, "check") or not hasattr(layer, "replicas"):
+            raise SpecError(where, f"mechanism must be one such as PBR(), a tuple of them or left out, not {layer!r}")
+        layer.check(kind, where)
+    if not layers:
+        raise SpecError(where, "mechanism must not be empty: leave it out")
+    if is_supervisor:
+        raise SpecError(where, "a supervisor cannot be protected by a mechanism: protect its children")
 
 
 def _of_kind(where: str, name: str, value: object, kind: type, form: str) -> None:

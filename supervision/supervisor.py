@@ -244,7 +244,7 @@ class Supervisor(Inquiries):
         if one.cell is not None:
             lives.retire(one.cell, "it begins afresh")
         one.spec = complete(self.ctx.cell, one.spec)
-        if one.spec.is_supervisor or one.spec.recovery is not None:
+        if one.spec.is_supervisor or one.spec.has_home:
             self.ctx.cell.node.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
 
     async def _restart_group(self, failed: Child, reason: ExitReason) -> None:
@@ -278,7 +278,7 @@ class Supervisor(Inquiries):
                 return
             else:
                 if up is not None:
-                    if one.spec.recovery is not None:
+                    if one.spec.has_home:
                         one.state = RECOVERING
                     one.up = up
                     up.add_done_callback(functools.partial(self._started, one))
@@ -386,7 +386,7 @@ class Supervisor(Inquiries):
             if message.fresh:
                 self._erase(one)
             self._enlist(one)
-            if spec.recovery is not None:
+            if spec.has_home:
                 return self._start_meanwhile(one, lambda: self._unlist(one))
             return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:
@@ -447,7 +447,7 @@ class Supervisor(Inquiries):
         try:
             if message.fresh:
                 self._erase(one)
-            if one.spec.recovery is not None:
+            if one.spec.has_home:
                 return self._start_meanwhile(one, lambda: self._give_up_address(one, "it could not be started"))
             return one.cell.ref if await self._start(one) and one.cell is not None else None
         except HoldfastError as error:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import weakref
-from typing import TYPE_CHECKING, get_args
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, get_args
 
 from ..actors.cell import Cell, Host
 from ..actors.control.calls import order
@@ -23,12 +24,13 @@ from ..actors.process.workers import Workers
 from ..actors.ref import current
 from ..checkpoint.controller import RecordedProcessHost, TaskHost
 from ..checkpoint.moving import RecordedToProcess, RecordedToTask
-from ..supervision.respec import replace_place
+from ..supervision.respec import replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from ..actors.node import Node
+    from ..checkpoint.homes import Homes
 
 
 class Moves:
@@ -91,6 +93,134 @@ class Moves:
             if self._node.watched:
                 self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
 
+    async def protect(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> None:
+        """Have a group of replicas live an actor's life.
+
+        Raises:
+            CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it goes on as it was.
+        """
+        await self._alone(cell, self._protected(cell, homes, mechanism, timeout), f"attach to {cell.path}")
+
+    async def _protected(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> None:
+        from ..ftm.events import MechanismAttached
+        from ..ftm.moving import to_group
+
+        before: ChildSpec = cell.spec
+        wanted = dataclasses.replace(before, mechanism=mechanism)
+        if place_of(cell) == "process":
+            await self._settle_in(cell, "task", before.limits, timeout)
+        try:
+            move = await self._moved(
+                cell,
+                timeout,
+                lambda: to_group(cell, homes, mechanism, timeout),
+                lambda: replace_mechanism(cell, wanted),
+            )
+        except BaseException:
+            if before.isolation == "process":
+                await self._settle_in(cell, "process", before.limits, timeout)
+            raise
+        if self._node.watched:
+            names = tuple(layer.name for layer in move.host.layers)
+            self._node.emit(MechanismAttached(cell.path, names, move.gone_on_at - move.rest_at))
+
+    async def unprotect(self, cell: Cell, timeout: float) -> None:
+        """Have a protected actor live as its spec says without the mechanism.
+
+        Raises:
+            CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it stays protected.
+        """
+        await self._alone(cell, self._unprotected(cell, timeout), f"detach from {cell.path}")
+
+    async def _unprotected(self, cell: Cell, timeout: float) -> None:
+        from ..ftm.events import MechanismDetached
+        from ..ftm.leaving import from_group
+        from ..ftm.mechanism import compose
+
+        before: ChildSpec = cell.spec
+        wanted = dataclasses.replace(before, mechanism=None, isolation="task")
+        move = await self._moved(
+            cell,
+            timeout,
+            lambda: from_group(cell, self._node.host_for(wanted), timeout),
+            lambda: replace_mechanism(cell, wanted),
+        )
+        if self._node.watched:
+            names = tuple(layer.name for layer in compose(before.mechanism))
+            self._node.emit(MechanismDetached(cell.path, names, move.gone_on_at - move.rest_at))
+        if before.isolation == "process":
+            await self._settle_in(cell, "process", before.limits, timeout)
+
+    async def adapt(self, cell: Cell, mechanism: Any, timeout: float) -> None:
+        """Have a protected actor go on with another stack of mechanisms, all of it given.
+
+        Raises:
+            CannotAdapt, ActorStopped, AskTimeout: it stays as it was.
+        """
+        await self._alone(cell, self._adapted(cell, mechanism, timeout), f"adaptation of {cell.path}")
+
+    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float) -> None:
+        from ..ftm.adaptation import CannotAdapt
+        from ..ftm.events import MechanismChanged
+        from ..ftm.host import GroupHost
+
+        before: ChildSpec = cell.spec
+        wanted = dataclasses.replace(before, mechanism=mechanism)
+        end = self._node.loop.time() + timeout
+        while True:
+            if not cell.host.is_up(cell):
+                await order(cell, Ready(), timeout)  # It is being recovered: its next life is changed.
+            host = cell.host
+            if not isinstance(host, GroupHost):
+                raise CannotAdapt(cell.path, "it has no mechanism")
+            old, life = host.layers, cell.life
+            try:
+                change = await host.adapt(cell, mechanism, lambda: replace_mechanism(cell, wanted))
+                break
+            except CannotAdapt:
+                if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
+                    raise
+        if self._node.watched:
+            was, names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
+            seconds = change.gone_on_at - change.rest_at
+            self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
+
+    async def _alone(self, cell: Cell, change: Coroutine[Any, Any, None], name: str) -> None:
+        """Carry out a change of where an actor lives while no other is; it comes to its end in any case."""
+
+        async def in_turn() -> None:
+            async with self._turns.setdefault(cell, asyncio.Lock()):
+                await change
+
+        task = self._node.loop.create_task(in_turn(), name=name, context=self._node.base_context.copy())
+        self._tasks.add(task)
+        task.add_done_callback(self._over)
+        await asyncio.shield(task)
+
+    async def _settle_in(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+        spec = _spec_there(cell, isolation, limits)
+        await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec))
+
+    async def _moved(self, cell: Cell, timeout: float, made: Callable[[], Move], moved: Callable[[], None]) -> Any:
+        """Carry out a move; if the life ends before it is at rest, its next life is moved."""
+        end = self._node.loop.time() + timeout
+        while True:
+            if not cell.host.is_up(cell):
+                await order(cell, Ready(), timeout)
+            move = made()
+            move.moved = moved
+            try:
+                await move.run()
+            except CannotMove:
+                if not move.is_late or cell.is_dead or self._node.loop.time() > end:
+                    raise
+            else:
+                return move
+            finally:
+                ending: asyncio.Future[None] | None = getattr(move, "ending", None)
+                if ending is not None:  # The processes of replicas that are not needed.
+                    await ending
+
     def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
         """The move that brings the actor to where its spec says."""
         old, new = cell.host, self._node.host_for(spec)
@@ -130,6 +260,8 @@ def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> Chil
     spec, kind = cell.spec, cell_kind(cell)
     if kind is not None and issubclass(kind, Supervisor):
         raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
+    if isinstance(spec, ChildSpec) and spec.mechanism is not None:
+        raise CannotMove(cell.path, "it is protected by a mechanism, whose replicas have processes: detach that first")
     if not _is_here(cell):
         raise CannotMove(cell.path, "its supervisor lives in another process, which cannot have processes of its own")
     if not isinstance(spec, ChildSpec):

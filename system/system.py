@@ -39,6 +39,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .protection import Protection
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
@@ -50,6 +51,8 @@ A = TypeVar("A", bound=Actor)
 ENTRY = f"{__package__}.guest_main:main"
 BASE = (f"{__package__}.guest_main",)
 
+REPLICA = f"{__name__.rpartition('.')[0].rpartition('.')[0]}.ftm.replica"
+"""What the processes of replicas import beforehand."""
 ADMIN_TIMEOUT = 60.0
 """Seconds an admin call of the system may take: starting a child can mean restoring a large state."""
 
@@ -151,6 +154,9 @@ class ActorSystem(Recorded, Controls):
         node.keeper = self._homes
         if self._log:
             node.events.add_sink(LogSink(self.name, node.loop.time))
+        self.protection = Protection(self._homes)
+        if self.protection.is_needed:
+            node.complete = self.protection.completing(node.complete)
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
         up = lives.begin(root, Start(Supervisor, (self._flags, ())))
@@ -208,6 +214,8 @@ class ActorSystem(Recorded, Controls):
         problem = "" if spec.recovery is None else self._homes.refuses(spec.recovery)
         if problem:
             raise SpecError(spec.id, problem)
+        if spec.mechanism is not None:
+            return self._group_host(spec)
         if spec.isolation == "process":
             self._workers.want(spec.start.kind.__module__)
             if spec.recovery is not None and spec.recovery.records:
@@ -218,6 +226,24 @@ class ActorSystem(Recorded, Controls):
         if spec.recovery is not None and spec.recovery.records:
             return TaskHost(self._homes, spec.recovery)
         return LOCAL
+
+    def _group_host(self, spec: ChildSpec) -> Host:
+        """Where the lives of a protected child are lived.
+
+        Raises:
+            MechanismRefused: its mechanisms do not go together, or not in this order.
+        """
+        from ..ftm.adaptation_rules import check_stack  # Most systems protect nobody.
+        from ..ftm.host import GroupHost
+        from ..ftm.mechanism import COMMON, compose
+
+        check_stack(compose(spec.mechanism), spec.start.kind, spec.id)
+        self._workers.want(spec.start.kind.__module__)
+        self._workers.want(REPLICA)
+        for name in COMMON:  # A replica that changes over must not import, and perhaps compile, while requests wait.
+            self._workers.want(name)
+        recovery = spec.recovery
+        return GroupHost(self._homes, recovery if recovery is not None and recovery.records else None, spec.mechanism)
 
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""

@@ -34,10 +34,17 @@ LOOK_AGAIN = 0.005
 class Take(Item):
     """A command: come to rest, as soon as no background work is out, with the state packed. Until then all goes on."""
 
-    __slots__ = ("_owe", "_refused", "_taken", "is_done", "is_void", "why")
+    __slots__ = ("_ignored", "_owe", "_refused", "_taken", "is_done", "is_void", "why")
 
-    def __init__(self, owe: Owe, taken: Callable[[Actor, bytes], None], refused: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        owe: Owe,
+        taken: Callable[[Actor, bytes], None],
+        refused: Callable[[str], None],
+        ignored: tuple[str, ...] = (),
+    ) -> None:
         self._owe, self._taken, self._refused = owe, taken, refused
+        self._ignored = ignored  # children that are not the actor's own
         self.is_done = False  # the actor is at rest
         self.is_void = False  # it is not wanted any more
         self.why = "a turn of it has not ended"
@@ -54,8 +61,9 @@ class Take(Item):
             cell.node.loop.call_later(LOOK_AGAIN, take._again, cell, cell.life)
             return None
         try:
-            if cell.children:
-                raise Stays(f"it has children of its own ({', '.join(cell.children)})")
+            children = [name for name in cell.children or () if name not in take._ignored]
+            if children:
+                raise Stays(f"it has children of its own ({', '.join(children)})")
             state = ctx.depart(take._owe)
             take._taken(actor, state)
         except Exception as error:  # The user's own code, such as `get_state`: no reason to end the actor.

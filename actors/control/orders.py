@@ -246,6 +246,8 @@ class Status:
     """Who watches this actor."""
     pid: int
     """The OS process; 0 if there is none now."""
+    bindings: dict[str, str] = dataclasses.field(default_factory=dict)
+    """Who is bound to its ports: port to address."""
 
 
 def status_of(cell: Cell) -> Status:
@@ -267,6 +269,7 @@ def status_of(cell: Cell) -> Status:
         0 if more is None else len(more.links),
         0 if more is None else len(more.monitors),
         os.getpid(),
+        {} if more is None else {port: target.path for port, target in more.bindings.items()},
     )
 
 

@@ -187,8 +187,12 @@ class Guest(Peer):
     def _tell_born(self, path: str) -> None:
         """A life has begun at an address below ours."""
         root, cell = self.node.root, self.node.find(path)
-        if root is not None and cell is not None and cell.actor is not None:
-            self.command(root, "born", {"path": path, "kind": message_name(type(cell.actor)), "life": cell.life})
+        if root is None or cell is None:
+            return
+        start = cell.extra().start
+        kind = type(cell.actor) if cell.actor is not None else None if start is None else start.kind
+        if kind is not None:
+            self.command(root, "born", {"path": path, "kind": message_name(kind), "life": cell.life})
 
     def _on_event(self, event: Event) -> None:
         if type(event) is ActorStarted:

@@ -10,6 +10,7 @@ from datetime import date, time
 from typing import Any, Final, cast
 
 import msgpack
+import msgspec
 from msgpack import ExtType
 
 from ..errors import UnsavableValue, type_name
@@ -34,6 +35,7 @@ from .forms import (
 
 HEAD_ALONE: Final = bytes((FORMAT, 0))
 TUPLE: Final = KNOWN[tuple][0]
+_PLAIN: Final = msgspec.msgpack.Encoder()
 
 
 def pieces(value: object, where: str, *, canonical: bool) -> list[Any]:
@@ -162,6 +164,11 @@ class _Encoder:
         return [mark, name, *class_parts(x, slots)]
 
     def packed(self, tree: object, unicode_errors: str | None) -> Any:
+        if not self.has_marks and unicode_errors is None:
+            try:
+                return _PLAIN.encode(tree)  # The same bytes in half the time; it knows nothing of marks.
+            except (OverflowError, UnicodeEncodeError, TypeError):
+                pass  # A large int, a lone surrogate: msgpack has a way.
         make = cast("Callable[..., Any]", msgpack.Packer)
         packer = make(default=self.default, autoreset=False, buf_size=1024, unicode_errors=unicode_errors)
         try:

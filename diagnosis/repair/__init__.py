@@ -30,8 +30,10 @@ from .messages import (
 )
 from .policy import NORMAL, SAFE, Policy
 from .stock import (
+    attach_mechanism,
     bind_port,
     change_mechanism,
+    compose_mechanism,
     power_up,
     restart_child,
     restart_subtree,
@@ -41,6 +43,7 @@ from .stock import (
     shutdown,
     start_node,
     stop_node,
+    transition_mechanism,
 )
 
 __all__ = [
@@ -78,8 +81,10 @@ __all__ = [
     "SetMode",
     "Touched",
     "action",
+    "attach_mechanism",
     "bind_port",
     "change_mechanism",
+    "compose_mechanism",
     "power_up",
     "repairer",
     "restart_child",
@@ -90,4 +95,5 @@ __all__ = [
     "shutdown",
     "start_node",
     "stop_node",
+    "transition_mechanism",
 ]

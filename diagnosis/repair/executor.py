@@ -14,7 +14,7 @@ import math
 from collections.abc import Callable
 from typing import Final, Protocol
 
-from ...supervision.arbiter import Arbiter, Grant, GrantLost, Hand, InOtherHands
+from ...supervision.arbiter import Arbiter, Grant, GrantLost, Hand, InOtherHands, on_errand
 from ..literals import Literal
 from ..planning import Plan, Problem, Simulator, Step
 from ..planning.language import Atom
@@ -141,7 +141,7 @@ class Executor:
                 work.cancel()
 
         try:
-            grant = self._arbiter.claim(self._address(step), Hand.REPAIR, self._reason, lost=lost)
+            grant = self._arbiter.claim(self._address(step), Hand.REPAIR, self._reason, lost=lost, errand=taken)
         except InOtherHands as error:
             return Result(step, SKIPPED, str(error))
         try:
@@ -159,6 +159,7 @@ class Executor:
         before = {effect: self._world.seen(_observable(effect))[0] for effect in effects}
         await self._world.began(step, grant.epoch)
         started = self._world.now()
+        on_errand.set(grant.errand)  # What the action has done by others, such as a transaction, is ours too.
         act = self._make(step, grant.epoch, self._reason, lambda: self._arbiter.check(grant))
         scope = asyncio.timeout(action.timeout)
         try:

@@ -12,7 +12,8 @@ import inspect
 import os
 import signal
 from collections.abc import Awaitable, Callable, Mapping, Sequence
-from typing import Any, Final
+from contextlib import AbstractAsyncContextManager
+from typing import Any, Final, Protocol
 
 from ...actors.actor import Actor
 from ...actors.errors import HoldfastError
@@ -23,6 +24,8 @@ from .actions import Act, ActionFailed, RepairAction, Run
 
 PATIENCE: Final = 10.0
 """Seconds for a supervisor or a board to answer."""
+CHANGED_WITHIN: Final = 30.0
+"""Seconds in which a mechanism must have been changed."""
 OUTPUT: Final = 500
 """Characters of a failed command's output that are told."""
 
@@ -261,6 +264,85 @@ async def _command(act: Act, *names: str, command: Sequence[str]) -> None:
         raise ActionFailed(str(act.step), f"{argv[0]} ended with {process.returncode}: {text}")
 
 
+# -- fault-tolerance mechanisms -------------------------------------------------------------------------------------
+
+
+class Change(Protocol):
+    """What a transaction collects, as far as these actions need it."""
+
+    def attach(self, target: str, mechanism: Any) -> None:
+        """Protect an actor."""
+
+    def compose(self, target: str, mechanism: Any, *, outside: bool = False) -> None:
+        """Nest one more mechanism."""
+
+    def transition(self, target: str, mechanism: Any) -> None:
+        """Put a mechanism in the place of another."""
+
+
+class Transaction(Protocol):
+    """`system.transaction`: the system gives it, since repair knows nothing of mechanisms."""
+
+    def __call__(self, *, timeout: float) -> AbstractAsyncContextManager[Change]:
+        """Collect what is to be done in the block; at its end it is done, or undone."""
+        ...
+
+
+def attach_mechanism(
+    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], **options: Any
+) -> RepairAction:
+    """`attach_pbr(n)`: protect an actor by a mechanism, while requests flow. The other two take the same.
+
+    Args:
+        transaction: `system.transaction`.
+        mechanism: its name, its file, one with its settings, or several, outermost first.
+        addresses: of each component that can be protected so.
+        options: those of `RepairAction`; `name` of the action, `cost`, and `timeout`: seconds until it is undone.
+    """
+    return _mechanism("attach", transaction, mechanism, addresses, options)
+
+
+def compose_mechanism(
+    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], *, outside: bool = False, **options: Any
+) -> RepairAction:
+    """`compose_tr(n)`: nest one more mechanism inside of those that an actor has, or `outside`."""
+    return _mechanism("compose", transaction, mechanism, addresses, options, outside=outside)
+
+
+def transition_mechanism(
+    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], **options: Any
+) -> RepairAction:
+    """`transition_lfr(n)`: put a mechanism in the place of the one of its sort, or several in the place of all."""
+    return _mechanism("transition", transaction, mechanism, addresses, options)
+
+
+def _mechanism(
+    verb: str,
+    transaction: Transaction,
+    mechanism: Any,
+    addresses: Mapping[str, str],
+    options: Mapping[str, Any],
+    **settings: Any,
+) -> RepairAction:
+    whole: dict[str, Any] = {"timeout": CHANGED_WITHIN, "cost": 5, "name": f"{verb}_{_word(mechanism)}", **options}
+    seconds, cost, name = whole.pop("timeout"), whole.pop("cost"), whole.pop("name")
+
+    async def run(act: Act, node: str) -> None:
+        async with transaction(timeout=seconds) as change:
+            getattr(change, verb)(addresses[node], mechanism, **settings)
+
+    more = {"grace": 1.0, "timeout": seconds + PATIENCE} | whole
+    return _action(name, run, addresses, more, pddl=_mend_text(name, cost, "node"))
+
+
+def _word(mechanism: Any) -> str:
+    """A mechanism in the name of an action."""
+    if isinstance(mechanism, (tuple, list)):
+        return "_".join(map(_word, mechanism))
+    name = mechanism if isinstance(mechanism, str) else getattr(mechanism, "name", "")
+    return name if name.isidentifier() else "mechanism"
+
+
 def change_mechanism(
     change: Callable[[str], Awaitable[None]],
     addresses: Mapping[str, str],
@@ -269,10 +351,11 @@ def change_mechanism(
     cost: int = 5,
     **options: Any,
 ) -> RepairAction:
-    """`change_mechanism(n)`: have the system attach, change or compose a fault-tolerance mechanism.
+    """`change_mechanism(n)`: have mechanisms changed in any other way, such as several at once.
 
     Args:
-        change: `await change(address)` does it; the system gives it, since repair knows nothing of mechanisms.
+        change: `await change(address)` does it, in the context of this call: a transaction in another task would be
+            refused, since the actor is in our hands.
         addresses: of each component that can be protected otherwise.
         name: of the action; give each change its own.
         cost: of the action.

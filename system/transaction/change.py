@@ -11,10 +11,12 @@ from ...actors.control.orders import Migrate
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
+from .mechanisms import Attach, Compose, Detach, DetachLayer, Transition, Update
 from .moving import Move
 from .operation import Operation, Step
+from .running import StartAgain, StopChild
 from .structure import Add, Remove, Reorder, SetFlags, named_spec, text_of
-from .wiring import Bind, Register, Unregister
+from .wiring import Bind, Register, Unbind, Unregister
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -44,6 +46,15 @@ class Change:
         """Stop an actor for good. Its address is free when the transaction is over."""
         self.step(Remove(target))
 
+    def stop(self, target: Target) -> None:
+        """Stop a child, and keep its spec: it can be started again. What was recorded of it stays."""
+        self.step(StopChild(target))
+
+    def start(self, supervisor: Target, name: str) -> str:
+        """Start a child again that was stopped; returns its address."""
+        self.step(StartAgain(supervisor, name))
+        return f"{text_of(supervisor)}/{name}"
+
     def move(self, target: Target, to_supervisor: Target) -> None:
         """Put a child under another supervisor: it lives on, its refs stay good, its address changes."""
         self.step(Move(target, to_supervisor))
@@ -70,6 +81,10 @@ class Change:
         """Point a binding elsewhere, from the owner's next turn on."""
         self.step(Bind(owner, port, target))
 
+    def unbind(self, owner: Target, port: str) -> None:
+        """Point a binding nowhere, from the owner's next turn on."""
+        self.step(Unbind(owner, port))
+
     def register(self, name: str, target: Target) -> None:
         """Give an actor a name beside its address."""
         self.step(Register(name, target))
@@ -95,6 +110,42 @@ class Change:
     def replace_code(self, target: Target, new: type[Actor] | Start[Any], migrate: Migrate | None = None) -> None:
         """Go on as another class; its messages wait until the transaction is over."""
         self.step(living.ReplaceCode(target, new, migrate))
+
+    # -- fault tolerance ----------------------------------------------------------------------------------------------
+
+    def attach(self, target: Target, mechanism: Any) -> None:
+        """Protect an actor by a mechanism, or by several, outermost first; its life goes on.
+
+        A mechanism is one such as `PBR()`, its name, or a file or module that defines one.
+        """
+        self.step(Attach(target, mechanism))
+
+    def detach(self, target: Target, mechanism: str = "") -> None:
+        """Have it live as its spec says without a mechanism; its life goes on. With a name: without that one alone."""
+        self.step(DetachLayer(target, mechanism) if mechanism else Detach(target))
+
+    def compose(self, target: Target, mechanism: Any, *, outside: bool = False) -> None:
+        """Nest one more mechanism inside of those that it has, or outside."""
+        self.step(Compose(target, mechanism, outside=outside))
+
+    def transition(self, target: Target, mechanism: Any) -> None:
+        """Put a mechanism in the place of the one of its sort, or several in the place of all, outermost first.
+
+        Only the bricks that differ are touched.
+        """
+        self.step(Transition(target, mechanism))
+
+    def update(self, target: Target, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
+        """Give one brick new code.
+
+        Args:
+            target: the protected actor.
+            brick: before, proceed or after.
+            new: its new class, or a file that defines one (`file.py`, `file.py:Name`).
+            mechanism: the name of the mechanism, if several of the actor's have such a brick.
+            role: that in which it is another one, if the mechanism has it in several: "primary".
+        """
+        self.step(Update(target, brick, new, mechanism=mechanism, role=role))
 
     # -- all of it ----------------------------------------------------------------------------------------------------
 

@@ -110,11 +110,26 @@ class Place:
             said += [self.spec.restart, self.spec.isolation]
             if self.spec.recovery is not None:
                 said.append(type(self.spec.recovery).__name__.lower())
+            if self.spec.mechanism is not None:
+                said.append(f"protected by {rules().names_of(self.spec.mechanism)}")
         if self.flags is not None:
             said.append(f"{self.flags.strategy} {self.flags.intensity} in {self.flags.period:g} s")
         said += [f"{port} -> {target.path}" for port, target in sorted(self.bindings.items())]
         said += [f"named {name!r}" for name in sorted(self.names)]
         return f"{self.path}: {', '.join(said)}"
+
+    def brick_lines(self) -> list[str]:
+        """The bricks of its mechanism that are its own, a line for each."""
+        if self.spec is None or self.spec.mechanism is None:
+            return []
+        return list(rules().lines_of(self.path, self.spec.mechanism))
+
+
+def rules() -> Any:
+    """`ftm.adaptation_rules`, which most transactions do not need."""
+    from ...ftm import adaptation_rules
+
+    return adaptation_rules
 
 
 class Draft:
@@ -230,7 +245,7 @@ class Draft:
 
     def lines(self) -> list[str]:
         """The tree when all is done, a line for each address."""
-        return [place.line() for place in self.staying()]
+        return [line for place in self.staying() for line in (place.line(), *place.brick_lines())]
 
 
 def check_awake(place: Place) -> None:

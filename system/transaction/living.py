@@ -101,6 +101,7 @@ class Held(OnLiving):
         assert self._place is not None
         if self._place.is_supervisor:
             raise wrong(self.target, "a supervisor is changed by its own operations: add, remove, strategy ...")
+        check_unprotected(self._place)
 
     async def _hold(self, system: ActorSystem) -> Cell:
         cell = self.cell(system)
@@ -185,6 +186,12 @@ class ReplaceCode(Held):
         await self._release(system)
 
 
+def check_unprotected(place: Place) -> None:
+    """Refuse what would change one replica of a protected actor, and not the others. Raises SpecError."""
+    if place.spec is not None and place.spec.mechanism is not None:
+        raise wrong(place.path, "it is protected by a mechanism: detach that first")
+
+
 def _is_actor(kind: object) -> bool:
     return isinstance(kind, type) and issubclass(kind, Actor)
 
@@ -225,6 +232,7 @@ class Isolate(OnLiving):
             raise SpecError(self.target, f"isolation must be one of task, process, not {self._to!r}")
         if place.spec is None:
             raise wrong(self.target, "nobody supervises it: it has no isolation to change")
+        check_unprotected(place)
         place.spec = dataclasses.replace(place.spec, isolation=self._to)
 
     async def do(self, system: ActorSystem) -> None:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.cell import RUNNING, Cell
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
-from .draft import Draft, Place, Target
+from .draft import Draft, Place, Target, is_elsewhere
 from .operation import Operation, wrong
 from .structure import text_of
 
@@ -76,6 +76,47 @@ def bound_to(owner: Cell, port: str) -> Cell | None:
         return None
     soon = more.turn.rebinds if more.turn is not None else None
     return (soon or {}).get(port) or more.bindings.get(port)
+
+
+class Unbind(Operation):
+    """Point a binding nowhere; its owner sees that from its next turn on."""
+
+    verb: ClassVar[str] = "unbind"
+
+    def __init__(self, owner: Target, port: str) -> None:
+        super().__init__(text_of(owner))
+        self._at, self._port = owner, port
+        self._owner: Place | None = None
+        self._before: Cell | None = None
+
+    @property
+    def text(self) -> str:
+        return f"unbind {self._port} of {self.target}"
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        owner = self._owner = draft.find(self._at)
+        self.target = owner.path
+        owner.check_lived_in(system.node)
+        if self._port not in owner.bindings:
+            raise wrong(owner.path, f"its binding {self._port!r} points nowhere already, as far as is known here")
+        if owner.spec is not None and self._port in owner.spec.bindings:
+            raise wrong(owner.path, f"its spec binds {self._port!r}: a restart would bind it again")
+        if owner.cell is not None and is_elsewhere(owner.cell):
+            raise wrong(owner.path, "it lives in another process, which keeps a binding: bind it to somebody else")
+        del owner.bindings[self._port]
+
+    async def do(self, system: ActorSystem) -> None:
+        assert self._owner is not None
+        owner = self._owner.living(system.node)
+        self._before = bound_to(owner, self._port)
+        more = owner.extra()
+        more.bindings.pop(self._port, None)
+        if more.turn is not None and more.turn.rebinds is not None:
+            more.turn.rebinds.pop(self._port, None)
+
+    async def undo(self, system: ActorSystem) -> None:
+        if self._before is not None and self._owner is not None:
+            system.node.bind(self._owner.living(system.node), self._port, self._before)
 
 
 class Register(Operation):

@@ -7,9 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.supervision.arbiter import Arbiter, Grant, GrantLost, Hand, InOtherHands, arbiter_of, covers
+from holdfast.supervision.arbiter import Arbiter, Grant, GrantLost, Hand, InOtherHands, arbiter_of, covers, on_errand
 
-REPAIR, FAILOVER = Hand.REPAIR, Hand.FAILOVER
+REPAIR, FAILOVER, ADAPTATION = Hand.REPAIR, Hand.FAILOVER, Hand.ADAPTATION
 
 
 class Boom(hf.Message):
@@ -57,6 +57,55 @@ def test_failover_goes_before_repair() -> None:
     assert judge.holder("/app/a") == moved
     with pytest.raises(InOtherHands, match="failover"):
         judge.claim("/app/a", REPAIR, "slow")
+
+
+@pytest.mark.parametrize(("first", "second"), [(REPAIR, ADAPTATION), (ADAPTATION, REPAIR), (ADAPTATION, ADAPTATION)])
+def test_of_repair_and_adaptation_the_first_one_has_the_actor(first: Hand, second: Hand) -> None:
+    judge, heard = arbiter(), list[str]()
+    grant = judge.claim("/app/a", first, "it is slow", lost=heard.append)
+    busy = judge.in_the_way("/app/a", second)
+    assert str(busy) == f"/app/a is in the hands of {first.name.lower()}: it is slow"
+    with pytest.raises(InOtherHands):
+        judge.claim("/app/a", second, "me too")
+    judge.check(grant)
+    judge.release(grant)
+    assert judge.in_the_way("/app/a", second) is None
+    judge.claim("/app/a", second, "me too")
+    assert heard == []
+
+
+def test_an_adaptation_rests_while_a_failover_is_at_it_and_repair_does_not_come_between() -> None:
+    judge, heard = arbiter(), list[str]()
+    changed = judge.claim("/app/a", ADAPTATION, "another mechanism", lost=heard.append)
+    moved = judge.claim("/app/a", FAILOVER, "its primary is gone")
+    judge.check(changed)
+    judge.release(moved)
+    with pytest.raises(InOtherHands, match="adaptation"):
+        judge.claim("/app/a", REPAIR, "slow")
+    moved = judge.claim("/app/a", FAILOVER, "again")
+    judge.release(changed)
+    with pytest.raises(InOtherHands, match="failover"):
+        judge.claim("/app/a", REPAIR, "slow")
+    assert judge.claim("/app/a", ADAPTATION, "a third one").epoch > moved.epoch
+    assert heard == []
+
+
+def test_what_is_done_on_one_errand_does_not_exclude_itself() -> None:
+    """A repair step has a mechanism changed: failover takes both from it."""
+    judge, heard, step = arbiter(), list[str](), object()
+    judge.claim("/app/a", REPAIR, "its values are wrong", lost=heard.append, errand=step)
+    token = on_errand.set(step)
+    try:
+        changed = judge.claim("/app/a", ADAPTATION, "another mechanism")
+    finally:
+        on_errand.reset(token)
+    with pytest.raises(InOtherHands, match="repair"):
+        judge.claim("/app/a", ADAPTATION, "another one's", errand=object())
+    with pytest.raises(InOtherHands):
+        judge.claim("/app/a", REPAIR, "nobody's")
+    judge.claim("/app/a", FAILOVER, "its primary is gone")
+    assert heard == ["failover has it now: its primary is gone"]
+    judge.check(changed)  # It rests; who has begun it is told.
 
 
 def test_a_lease_ends_by_itself() -> None:

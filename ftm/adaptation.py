@@ -1,0 +1,404 @@
+"""The adaptation engine: another stack of mechanisms for a protected actor, while requests flow (A5, A76 to A82).
+
+The bricks that are new are started in all replicas beside the old ones (prepare). Then nothing new goes in, what is
+inside comes to its end, and each replica has all that the other has sent to it (rest). Only then the replicas bind
+their bricks anew (commit); the old ones end behind that. Requests that come meanwhile wait at the home.
+
+What is under way stands in the group, outside this actor: it may die at any moment, and its next life goes on. Up to
+the commit a change can be given up; from there on it is carried to its end, for a replica that has changed stays so. A
+replica that has not, though it should have, is killed, and begins again as the recipe then says.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from ..actors.actor import Actor, on
+from ..actors.cell import Cell
+from ..actors.errors import HoldfastError
+from ..actors.message import Message
+from ..supervision.admin import AlreadyPresent, DeleteChild, StartChild, TerminateChild
+from ..supervision.spec import ChildSpec
+from .failover import bury
+from .group import Look
+from .messages import ConfigMismatch, StaleEpoch
+from .orders import Quiesce, Stand
+from .replica import Abort, Commit, Prepare
+
+if TYPE_CHECKING:
+    from .group import Group
+    from .mechanism import Mechanism
+
+PREPARED_WITHIN = 30.0
+"""Seconds that a replica may take to start its new bricks; requests flow meanwhile."""
+REST_WITHIN = 5.0
+"""Seconds within which what is inside has to come to its end; requests wait meanwhile."""
+COMMITTED_WITHIN = 5.0
+"""Seconds after which a replica that has not changed is killed."""
+STARTED_WITHIN = 60.0
+"""Seconds that one more replica may take to come up."""
+LOOK_AGAIN = 0.05
+"""Seconds after which a group that is busy with itself is looked at again."""
+
+PREPARING, RESTING, COMMITTING, TIDYING, UNDOING, OVER = (
+    "preparing",
+    "resting",
+    "committing",
+    "tidying",
+    "undoing",
+    "over",
+)
+STEPS = ("start", "prepare", "rest", "quiesce", "commit", "switch", "tidy")
+"""Where the engine may be struck by a test; undoing has `abort` instead of the last three."""
+
+
+class CannotAdapt(HoldfastError):
+    """The mechanism stays as it was."""
+
+    def __init__(self, actor: str, why: str) -> None:
+        super().__init__(actor, why)
+        self.actor, self.why = actor, why
+
+    def __str__(self) -> str:
+        return f"{self.actor} keeps its mechanism: {self.why}"
+
+
+class Reconfiguration:
+    """One change of a stack of mechanisms, as far as it has come."""
+
+    def __init__(self, group: Group, config: int, layers: tuple[Mechanism, ...], rest_within: float) -> None:
+        self.config, self.layers, self.rest_within = config, layers, rest_within
+        self.descriptions = [layer.describe() for layer in layers]
+        self.names = names_for(group, layers)
+        self.stage = PREPARING
+        self.prepared: dict[str, int] = {}  # name to life, of those that have the new bricks
+        self.epoch = -1  # in which they were prepared
+        self.turn = -1  # the last one of the primary when it had come to rest
+        self.behind: set[str] = set()  # those that have not got all that the primary had
+        self.failed: dict[str, int] = {}  # name to life, of those that have not changed though they should have
+        self.started: list[str] = []  # replicas that are new
+        self.why = ""  # it is given up
+        self.rest_at = self.gone_on_at = 0.0
+        self.outcome: asyncio.Future[None] = group.node.loop.create_future()
+        self._group = group
+
+    @property
+    def is_committed(self) -> bool:
+        """Whether the new stack is the one."""
+        return self.stage in (TIDYING, OVER) and not self.why
+
+    def give_up(self, why: str) -> None:
+        """It is not wanted any more, unless it has gone too far."""
+        if self.stage in (PREPARING, RESTING):
+            self.why = self.why or why
+            self._group.stir()
+            self._group.tell("adapt", Look())
+
+    def close(self, why: str) -> None:
+        """The life at the address is over; the next one begins as its recipe says."""
+        if self.outcome.done():
+            return
+        if self.is_committed:
+            self.outcome.set_result(None)
+        else:
+            self.fail(why)
+
+    def fail(self, why: str) -> None:
+        """Nothing has changed."""
+        if not self.outcome.done():
+            self.outcome.set_exception(CannotAdapt(self._group.path, why))
+            self.outcome.exception()  # Nobody may wait for it any more.
+
+
+def names_for(group: Group, layers: tuple[Mechanism, ...]) -> tuple[str, ...]:
+    """The replicas that there are to be: those that are there, as far as they are needed, the primary first."""
+    wanted = max(layer.replicas for layer in layers)
+    there = sorted(group.names, key=lambda name: (name != group.primary, name not in group.members))
+    kept = there[:wanted]
+    number = 1
+    while len(kept) < wanted:
+        if f"r{number}" not in group.names:
+            kept.append(f"r{number}")
+        number += 1
+    return tuple(kept)
+
+
+class AdaptationEngine(Actor):
+    """Carries out what `group.change` says. `spec` makes the spec of a replica; `switched` makes a change last."""
+
+    deterministic = False
+
+    def __init__(
+        self,
+        group: Group,
+        spec: Callable[[str, int, tuple[Mechanism, ...]], ChildSpec],
+        switched: Callable[[Reconfiguration], None],
+        step: Callable[[str], None],
+    ) -> None:
+        self._group, self._spec, self._switched, self._step = group, spec, switched, step
+
+    def on_start(self, restored: bool) -> None:
+        """The last life may have died in the middle of it."""
+        self._group.tell("adapt", Look())
+
+    @on(Look)
+    async def look(self, message: Look) -> None:
+        """Go on with the change, until it is made or undone."""
+        group = self._group
+        while (change := group.change) is not None and not group.is_over and change.stage is not OVER:
+            if change.why and change.stage in (PREPARING, RESTING):
+                change.stage = UNDOING
+            match change.stage:
+                case "preparing":
+                    await self._prepare(change)
+                case "resting":
+                    await self._rest(change)
+                case "committing":
+                    await self._commit(change)
+                case "tidying":
+                    await self._tidy(change)
+                case _:
+                    await self._undo(change)
+
+    # -- while requests flow ------------------------------------------------------------------------------------------
+
+    async def _prepare(self, change: Reconfiguration) -> None:
+        """Have all replicas start what is new."""
+        group = self._group
+        if not group.is_steady():
+            await self._wait_for_change(LOOK_AGAIN)
+            return
+        self._step("start")
+        try:
+            await self._start_replicas(change)
+        except HoldfastError as error:
+            change.give_up(f"one more replica could not be started: {error}")
+            return
+        members = {name: life for name, life in group.members.items() if group.is_well(name)}
+        epoch = group.epoch
+        self._step("prepare")
+        _, errors = await self._ask_all(members, Prepare(change.config, change.descriptions), PREPARED_WITHIN)
+        if errors:
+            await self._wait_for_change(LOOK_AGAIN)  # If it has died, that is known soon.
+            for name, why in errors.items():
+                if group.members.get(name) == members[name] and group.is_well(name):
+                    change.give_up(f"{name} could not prepare it: {why}")
+            return
+        change.prepared, change.epoch, change.stage = members, epoch, RESTING
+
+    async def _start_replicas(self, change: Reconfiguration) -> None:
+        """Those that only the new stack needs come up beside the others."""
+        above: Any = self._supervisor().ref
+        for name in change.names:
+            if name in self._group.names or self._group.life_of(name):
+                continue
+            if name not in change.started:
+                change.started.append(name)
+            try:
+                await above.ask(StartChild(self._spec(name, change.config, change.layers)), STARTED_WITHIN)
+            except AlreadyPresent:
+                continue
+
+    def _supervisor(self) -> Cell:
+        parent = self.ctx.cell.parent
+        assert parent is not None
+        return parent
+
+    # -- while they wait ----------------------------------------------------------------------------------------------
+
+    async def _rest(self, change: Reconfiguration) -> None:
+        """Nothing new goes in, and all that is inside comes to its end."""
+        group = self._group
+        if not self._is_as_prepared(change):
+            change.stage = PREPARING
+            return
+        self._step("rest")
+        group.is_resting = True
+        change.rest_at = time.monotonic()
+        if await self._is_at_rest(change):
+            change.stage, group.is_changing = COMMITTING, True
+            return
+        self._go_on()
+        if change.stage is RESTING:
+            change.stage = PREPARING
+
+    def _go_on(self) -> None:
+        group = self._group
+        group.is_resting = group.is_changing = False
+        group.poke()
+        group.wake()
+
+    def _is_as_prepared(self, change: Reconfiguration) -> bool:
+        """Whether those that count are those that were prepared, in the parts that they had then."""
+        group = self._group
+        well = {name: life for name, life in group.members.items() if group.is_well(name)}
+        return group.is_steady() and group.epoch == change.epoch and well == change.prepared
+
+    async def _is_at_rest(self, change: Reconfiguration) -> bool:
+        group = self._group
+        end = self._now() + change.rest_within
+        primary = group.primary
+        if primary is None:
+            return False
+        self._step("quiesce")
+        # All at once, and behind the batch that is out: requests wait for one way there and back, not for one each.
+        order, seconds = Quiesce(group.epoch, group.config), change.rest_within + 1.0
+        asked = {name: group.protocol(name).ask(order, seconds) for name in change.prepared}
+        for future in asked.values():
+            future.add_done_callback(_heard)  # If this is given up, nobody looks at it.
+        if not await self._ends(group.quiet(), change, end, "a turn of it has not ended"):
+            return False
+        for name, future in asked.items():
+            if not await self._ends(future, change, end, f"{name} has not come to rest"):
+                return False
+            if (error := future.exception()) is not None:
+                if isinstance(error, (ConfigMismatch, StaleEpoch)):
+                    change.give_up(f"{name} stands elsewhere: {error}")
+                return False
+        self._check_stands(change, {name: future.result() for name, future in asked.items()}, primary)
+        return not change.why and self._is_as_prepared(change)
+
+    def _check_stands(self, change: Reconfiguration, stands: dict[str, Stand], primary: str) -> None:
+        """Exactly one leads, and all have the same configuration."""
+        group = self._group
+        leading = [name for name, stand in stands.items() if stand.leads]
+        if leading != [primary]:
+            change.give_up(f"{', '.join(leading) or 'nobody'} leads, and it should be {primary} alone")
+        configs = {stand.config for stand in stands.values()}
+        if configs != {group.config}:
+            change.give_up(f"the replicas have different configurations: {sorted(configs)}")
+        change.turn = stands[primary].turn
+
+    async def _commit(self, change: Reconfiguration) -> None:
+        """Have all replicas bind their bricks anew. As soon as one has, there is no way back."""
+        group = self._group
+        group.is_resting = group.is_changing = True
+        self._step("commit")
+        turns, found = await self._ask_all(change.prepared, Commit(change.config), COMMITTED_WITHIN)
+        change.behind = {name for name, turn in turns.items() if turn != change.turn}
+        for name, error in found.items():
+            if group.life_of(name) == change.prepared[name]:
+                change.failed[name] = change.prepared[name]
+                group.suspect(name, change.prepared[name], f"it did not change its mechanism: {error}")
+        if not turns:
+            change.stage, change.why = UNDOING, f"no replica could: {'; '.join(str(one) for one in found.values())}"
+            return
+        self._step("switch")
+        change.stage = TIDYING
+        self._switched(change)
+        change.gone_on_at = time.monotonic()
+        for name in change.behind:
+            if name in group.members and name != group.primary:
+                group.lost(name, "it had not got all when the mechanism was changed")
+                group.dropped.add(name)
+        self._go_on()
+
+    # -- while requests flow again ------------------------------------------------------------------------------------
+
+    async def _tidy(self, change: Reconfiguration) -> None:
+        """Take in the replicas that are new, and end those that are not needed any more."""
+        group = self._group
+        self._step("tidy")
+        self._go_on()
+        for name, life in change.failed.items():
+            await bury(group, name, life)
+        left = [name for name in group.names if name not in change.names]
+        if group.primary is None and left:
+            await self._wait_for_change(LOOK_AGAIN)
+            return
+        if left:
+            if group.primary in left:  # It has changed over meanwhile.
+                change.names = names_for(group, change.layers)
+                left = [name for name in group.names if name not in change.names]
+            group.names = change.names
+            for name in left:
+                group.lost(name, "it is not needed any more")
+                group.dropped.add(name)
+            group.wake()
+            await self._end_replicas(left)
+        group.names = change.names
+        group.wake()
+        group.tell("join", Look())
+        self._over(change)
+        if not change.outcome.done():
+            change.outcome.set_result(None)
+
+    async def _end_replicas(self, names: list[str]) -> None:
+        above: Any = self._supervisor().ref
+        for name in names:
+            if self._group.cell_of(name) is None:
+                continue
+            try:
+                await above.ask(TerminateChild(name), STARTED_WITHIN)
+                await above.ask(DeleteChild(name), STARTED_WITHIN)
+            except HoldfastError:
+                continue  # It is gone already.
+
+    async def _undo(self, change: Reconfiguration) -> None:
+        """Everything stays as it was."""
+        group = self._group
+        self._step("abort")
+        self._go_on()
+        members = {name: life for name, life in group.members.items() if group.is_well(name)}
+        await self._ask_all(members, Abort(change.config), PREPARED_WITHIN)
+        await self._end_replicas(change.started)
+        self._over(change)
+        change.fail(change.why)
+
+    def _over(self, change: Reconfiguration) -> None:
+        change.stage = OVER
+        if self._group.change is change:
+            self._group.change = None
+
+    # -- waiting ------------------------------------------------------------------------------------------------------
+
+    def _now(self) -> float:
+        return self._group.node.loop.time()
+
+    async def _wait_for_change(self, seconds: float) -> None:
+        await asyncio.wait((self._group.stirred(),), timeout=seconds)
+
+    async def _ends(self, future: asyncio.Future[Any], change: Reconfiguration, end: float, why: str) -> bool:
+        """Whether it does before the time is over, before a replica dies, and before the change is given up."""
+        while not future.done() and not change.why:
+            left = end - self._now()
+            if left <= 0:
+                change.give_up(f"{why} within {change.rest_within:g} s")
+                return False
+            stirred = self._group.stirred()
+            await asyncio.wait((future, stirred), timeout=left, return_when=asyncio.FIRST_COMPLETED)
+            if stirred.done() and not self._is_as_prepared(change):
+                return False
+        return not change.why
+
+    async def _ask_all(
+        self, names: dict[str, int], message: Message[Any], seconds: float
+    ) -> tuple[dict[str, Any], dict[str, BaseException]]:
+        """Order all of these replicas at once: replies, and the errors of those that have not done so."""
+        group, asked = self._group, dict[str, asyncio.Future[Any]]()
+        replies: dict[str, Any] = {}
+        errors: dict[str, BaseException] = {}
+        for name in names:
+            cell = group.cell_of(name)
+            try:
+                if cell is None:
+                    raise CannotAdapt(group.place(name), "it has ended")
+                asked[name] = cell.ref.ask(message, timeout=seconds)
+            except HoldfastError as error:
+                errors[name] = error
+        if asked:
+            await asyncio.wait(asked.values())
+        for name, future in asked.items():
+            if (failed := future.exception()) is not None:
+                errors[name] = failed
+            else:
+                replies[name] = future.result()
+        return replies, errors
+
+
+def _heard(done: asyncio.Future[Any]) -> None:
+    if not done.cancelled():
+        done.exception()

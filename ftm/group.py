@@ -1,0 +1,499 @@
+"""What is known of a group of replicas, outside of all actors: each of them may die at any moment.
+
+The proxy, the detector and the failover manager act on this; the next life of each goes on where the last one was.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+from ..actors.cell import RUNNING, Cell
+from ..actors.errors import HoldfastError
+from ..actors.message import Message
+from ..checkpoint.inputs import Batch
+from ..checkpoint.records import (
+    DROPPED,
+    FAILED,
+    START,
+    STASHED,
+    Closed,
+    Feed,
+    Go,
+    Live,
+    Outcome,
+    PipeDone,
+    Released,
+    SnapshotNow,
+    ToLife,
+    TurnEnd,
+)  # fmt: skip
+from ..checkpoint.saved import meta_now, put
+from .background import Background
+from .detector import Detection
+from .events import ReplicaLost, WrongSuspicion
+from .hold import Hold
+from .messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
+from .securing import Securing
+from .strays import Strays
+
+if TYPE_CHECKING:
+    from ..actors.node import Node
+    from ..checkpoint.switch import Switch
+    from .adaptation import Reconfiguration
+
+MOST_REQUESTS, MOST_BYTES = 512, 1_000_000
+"""Of one batch."""
+KEPT_TURNS = 256
+"""Ended turns after which those of an actor that keeps none are forgotten."""
+
+
+class Look(Message):
+    """Something has happened to the group: see what is to be done."""
+
+
+class Flush(Message):
+    """There is something to send."""
+
+
+class Group(Securing):
+    """A protected address: its replicas, who of them leads, and what is on its way to it."""
+
+    def __init__(
+        self, cell: Cell, switch: Switch, names: tuple[str, ...], *, epoch: int, config: int, detection: Detection
+    ) -> None:
+        self.node: Node = cell.node
+        self.cell, self.switch, self.names, self.detection = cell, switch, names, detection
+        self.path = cell.path
+        self.config = config
+        self.hold = Hold(self.node, self.path)
+        # Who leads, and who may.
+        self.epoch = epoch
+        self.primary: str | None = None
+        self.leading: str | None = None  # who is to lead in this epoch: `Lead` may or may not have reached it
+        self.why = ""  # why the last one does not any more
+        self.noticed = 0.0  # and since when that is known, on the monotonic clock
+        self.members: dict[str, int] = {}  # name to life, of those that hold all state: the primary and its backups
+        self.condemned: dict[str, int] = {}  # name to life, of those that must be dead before the next one leads
+        self.dropped: set[str] = set()  # backups that the primary still has to forget
+        self.up: dict[str, int] = {}  # name to life, of those heard of
+        self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
+        self.suspects: dict[str, int] = {}
+        self.strays = Strays(self)
+        self.suspected_at = 0.0  # when the primary was, on the loop's clock
+        self.wrong = 0  # suspicions
+        self.failovers = 0
+        self.is_begun = False  # somebody has led
+        self.is_over = False
+        # What is on its way.
+        self.waiting: deque[Feed | Go] = deque()
+        self.inward: list[Outcome | SnapshotNow] = []
+        self.finished: list[Ended] = []  # parts whose outcomes somebody waits to be at home
+        self.ledger: dict[int, Feed] = {}  # what the home has fed and not heard the end of, in that order
+        self.careful: set[int] = set()  # inputs in whose company a replica has died: each is sent alone
+        self.inside: set[int] = set()  # inputs that a replica had that does not lead any more, not ended since
+        self.out: Work | None = None
+        self.number = 0
+        self.is_again = False
+        self.is_live = self.has_gone = False
+        self.is_held = False  # nothing new goes in: nobody could take over yet
+        self.is_suspended = self.is_stopping = False
+        self.change: Reconfiguration | None = None  # that is being made
+        self.is_resting = False  # nothing new goes in: the mechanism is about to be changed
+        self.is_changing = False  # the replicas change it: nobody else may tell them anything
+        self.is_joining = False  # a replica is catching up
+        self.is_poked = False
+        self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
+        self.background = Background(self)
+        self._quiet: list[asyncio.Future[None]] = []
+        self._stirred: list[asyncio.Future[None]] = []
+        # Whom to tell.
+        self.on_live: Callable[[Live], None] = switch.from_life
+        self.on_over: Callable[[str], None] = lambda why: None  # nobody is left who could lead
+        self.on_start_failed: Callable[[TurnEnd], None] = lambda end: None
+        self.on_ended: Callable[[dict[str, Any]], None] = lambda reason: None
+        self.on_joined: Callable[[], None] = lambda: None
+        self.on_joining: Callable[[str], None] = lambda name: None
+
+    # -- replicas ---------------------------------------------------------------------------------------------------
+
+    def cell_of(self, name: str) -> Cell | None:
+        """The cell of an actor of the mechanism, if there is one now."""
+        return self.node.find(self.place(name))
+
+    def bind_proxy(self) -> None:
+        """Show who leads: the proxy is bound to its RequestProtocol."""
+        proxy = self.cell_of("proxy")
+        if proxy is not None and self.primary is not None:
+            self.node.bind(proxy, "protocol", self.node.cell_at(self.place(f"{self.primary}/protocol")))
+
+    def life_of(self, name: str) -> int:
+        """The number of the life that a replica lives now; 0 if none."""
+        cell = self.cell_of(name)
+        return cell.life if cell is not None and cell.state is RUNNING else 0
+
+    def is_well(self, name: str) -> bool:
+        """Whether a member is the one that was taken in, and nobody suspects it."""
+        life = self.members.get(name, 0)
+        return life > 0 and self.life_of(name) == life and self.suspects.get(name) != life
+
+    def is_awaited(self, name: str) -> bool:
+        """Whether a member that is suspected, and may yet be heard of again, is all there is."""
+        life = self.members.get(name, 0)
+        is_alive = life > 0 and self.life_of(name) == life
+        waited = self.node.loop.time() - self.suspected_at
+        return is_alive and not self.backups() and waited < self.detection.hopeless
+
+    def backups(self) -> list[str]:
+        """Those that could lead instead of the primary, in order."""
+        return [name for name in self.names if name not in (self.primary, self.leading) and self.is_well(name)]
+
+    def watched(self) -> Iterator[tuple[str, int]]:
+        """Who is expected to be heard of, and is not suspected already: name and life."""
+        for name, life in list(self.up.items()):
+            if self.life_of(name) == life and self.suspects.get(name) != life:
+                yield name, life
+
+    def heard(self, name: str, life: int) -> None:
+        """A replica has given a sign of life."""
+        if self.suspects.get(name) == life:
+            self.wrong += 1
+            del self.suspects[name]
+            self.node.emit(WrongSuspicion(self.path, name, self.wrong))
+        if self.up.get(name) != life:
+            self.up[name] = life
+            self.watch(name)
+            self.wake()
+
+    def watch(self, name: str) -> None:
+        """Hear of the end of a replica's present life."""
+        cell = self.cell_of(name)
+        if cell is not None and cell.state is RUNNING:
+            cell.ended().add_done_callback(lambda done: self._died(name))
+
+    def _died(self, name: str) -> None:
+        if not self.noticed:
+            self.noticed = time.monotonic()
+        self.wake()
+
+    def suspect(self, name: str, life: int, why: str) -> None:
+        """A replica is silent for too long."""
+        self.suspects[name] = life
+        self.suspected_at = self.node.loop.time()
+        if name in (self.primary, self.leading):
+            self.why, self.noticed = why, time.monotonic()
+        self.wake()
+
+    def lost(self, name: str, why: str) -> None:
+        """A replica does not count any more."""
+        self.stir()
+        if self.members.pop(name, None) is not None:
+            self.node.emit(ReplicaLost(self.path, name, self.epoch, why))
+
+    def joined(self, name: str, life: int) -> None:
+        """A replica has caught up, and could lead."""
+        self.members[name] = life
+        self.strays.joined(name, life)
+        self.stir()
+        self.go_on()
+        self.on_joined()
+
+    def stirred(self) -> asyncio.Future[None]:
+        """A future that ends when a replica begins or ceases to count."""
+        future: asyncio.Future[None] = self.node.loop.create_future()
+        self._stirred.append(future)
+        return future
+
+    def stir(self) -> None:
+        """One has, or whoever waits for that should look again."""
+        waiting, self._stirred = self._stirred, []
+        for future in waiting:
+            if not future.done():
+                future.set_result(None)
+
+    def is_steady(self) -> bool:
+        """Whether one replica leads, and nobody has to be told so, or of a death."""
+        primary = self.primary
+        is_led = primary is not None and self.leading is None and self.is_well(primary)
+        return self.is_live and is_led and not self.condemned and not self.dropped and not self.is_joining
+
+    def go_on(self) -> None:
+        """New inputs may go in."""
+        self.is_held = False
+        self.poke()
+
+    def wake(self) -> None:
+        """Something has happened: have the manager look."""
+        if not self.is_over:
+            self.tell("failover", Look())
+
+    def tell(self, name: str, message: Message[Any]) -> None:
+        """Tell an actor of the mechanism, if it is there."""
+        cell = self.cell_of(name)
+        if cell is None or cell.is_dead:
+            return  # Whoever comes there looks by itself.
+        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, whose words it is not.
+        with contextlib.suppress(HoldfastError):  # The same.
+            cell.admit(cell, message)
+
+    # -- from the home ----------------------------------------------------------------------------------------------
+
+    def to_life(self, record: ToLife) -> None:
+        """Stands as the home's way to its life."""
+        match record:
+            case Feed():
+                self.ledger[record.id] = record
+                self.waiting.append(record)
+            case Go():
+                self.waiting.append(record)
+            case Outcome() | SnapshotNow():
+                self.inward.append(record)
+            case _:
+                return  # The others are for lives that are no group.
+        self.poke()
+
+    def poke(self) -> None:
+        """Have the proxy look."""
+        if not self.is_poked and not self.is_over:
+            self.is_poked = True
+            self.tell("proxy", Flush())
+
+    def next_inward(self) -> Inward | None:
+        """What goes past the bricks; a snapshot is asked for when the home knows all that a replica does."""
+        if not self.inward or self.primary is None:
+            return None
+        records, self.inward = self.inward, []
+        if self.inside:
+            self.inward = [one for one in records if isinstance(one, SnapshotNow)]
+            records = [one for one in records if one not in self.inward]
+        return Inward(self.epoch, records) if records else None
+
+    def next_work(self) -> Work | None:
+        """The next batch, if there is something, and none is out. What was inside once is ended in any case."""
+        if self.out is not None or self.primary is None or not self.waiting or (self.has_gone and self.is_held):
+            return None
+        takes_new = not (self.is_suspended or self.is_stopping or self.is_resting)
+        requests, go, size = list[Request](), None, 0
+        lives: dict[str, int] = {}
+        while self.waiting and len(requests) < MOST_REQUESTS and size < MOST_BYTES:
+            first = self.waiting[0]
+            if not takes_new and (isinstance(first, Go) or first.id not in self.inside):
+                break
+            if isinstance(first, Go):
+                go = first
+                self.has_gone = True
+                self.waiting.popleft()
+                break
+            is_alone = first.id in self.careful
+            if is_alone and requests:
+                break
+            self.waiting.popleft()
+            if self.is_live and first.id not in self.switch.open:
+                self.ledger.pop(first.id, None)  # The home has dropped it meanwhile.
+                self._ended({first.id})
+                continue
+            requests.append(self._request(first, lives))
+            size += len(first.body)
+            if is_alone:
+                break
+        if not requests and go is None:
+            return None
+        self.number += 1
+        self.out = Work(self.epoch, self.config, self.number, requests, go, self.is_again)
+        if not self.waiting:
+            self.is_again = False
+        return self.out
+
+    def _request(self, feed: Feed, lives: dict[str, int]) -> Request:
+        client = feed.sender or ""
+        if client not in lives:
+            cell = self.node.find(client) if client else None
+            lives[client] = 0 if cell is None else cell.life
+        return Request(client, lives[client], feed)
+
+    def send_again(self, *, careful: bool = False) -> None:
+        """All that has no end yet goes to whoever leads now: first what had begun to let something out.
+
+        `careful`: a replica has died with a batch inside; if that was the fault of one of its messages, it will be
+        seen which one.
+        """
+        begun = self.switch.partial_id if self.switch.partial else -1
+        if careful and self.out is not None:
+            self.careful = {one.feed.id for one in self.out.requests if one.feed.id in self.ledger}
+        left = [feed for feed in self.ledger.values() if not self.is_live or feed.id in self.switch.open]
+        self.ledger = {feed.id: feed for feed in left}
+        unsent = {one.id for one in self.waiting if isinstance(one, Feed)} - self.inside
+        self.inside = self.ledger.keys() - unsent
+        left.sort(key=lambda feed: feed.id != begun)
+        gone = [one for one in self.waiting if isinstance(one, Go)]
+        self.waiting = deque(left)
+        if self.out is not None and self.out.go is not None and not self.is_live:
+            gone = [self.out.go]
+        self.waiting.extend(gone)
+        if begun >= 0 and left and left[0].id == begun:
+            self.waiting[0] = self.ledger[begun] = without_deadline(left[0])
+        self.out, self.is_again = None, True
+        self.poke()
+
+    def least_turn(self) -> int:
+        """The turn after which another one that leads goes on, if turns that are lost do not come again; else -1."""
+        return -1 if self.switch.method.replays else self.switch.turn
+
+    def forget_answers(self) -> None:
+        """Another one is to lead: what it asks again is answered again."""
+        self.inward.clear()
+        self.finished.clear()
+        self.switch.arrival.cancel()  # The last one may have died in the middle of a snapshot,
+        self.switch.due.restarted()  # or before it began with it.
+
+    def only_suspect_input(self) -> int:
+        """The input in whose turn a replica must have died, if only one was inside; else -1."""
+        out = self.out
+        if out is None or len(out.requests) != 1 or out.requests[0].feed.id not in self.ledger:
+            return -1
+        return out.requests[0].feed.id
+
+    # -- to the home ------------------------------------------------------------------------------------------------
+
+    def take_done(self, done: Done) -> None:
+        """Outcomes, in turn order; those of an earlier epoch count for nothing."""
+        if not self._is_of_now(done.epoch):
+            return
+        for end in done.ends:
+            self._end(end)
+        if self.is_over:
+            return
+        for record in done.more:
+            if isinstance(record, Closed):
+                self.on_ended(record.reason)
+            elif isinstance(record, Strayed):
+                self.strays.told(record.path)
+            elif isinstance(record, WorkLost):
+                if self.background.is_lost(record.turn):
+                    self._give_up("a turn has failed with background work (pipe_to_self) out")
+                    return
+            else:
+                if isinstance(record, PipeDone):
+                    self.background.back(record)
+                self.switch.from_life(record)
+        if done.live is not None and not self.is_live:
+            self.is_live = True
+            self.on_live(done.live)
+        out = self.out
+        if done.is_last and out is not None and out.number == done.number:
+            self.out = None
+            ended = {one.feed.id for one in out.requests}
+            self.careful -= ended
+            self._ended(ended)
+            self._forget_turns()
+        if done.wait:
+            self.finished.append(Ended(self.epoch, done.part))
+
+    def quiet(self) -> asyncio.Future[None]:
+        """A future that ends when nothing is inside any more; somebody has seen to it that nothing new goes in."""
+        future: asyncio.Future[None] = self.node.loop.create_future()
+        self._quiet.append(future)
+        self._ended(set())
+        return future
+
+    def _ended(self, ids: set[int]) -> None:
+        """These have; whoever waits for that hears when there are no others inside."""
+        if self.inside:
+            self.inside -= ids
+            if not self.inside:
+                self.poke()  # What was held back meanwhile.
+        if self.inside or self.out is not None or self.primary is None:
+            return
+        waiting, self._quiet = self._quiet, []
+        for future in waiting:
+            if not future.done():
+                future.set_result(None)
+
+    def take_outward(self, outward: Outward) -> None:
+        """What left in the middle of a turn, or beside it."""
+        if self._is_of_now(outward.epoch):
+            for record in outward.records:
+                if isinstance(record, Released) and not self._is_front(record):
+                    self._is_behind(record.turn)
+                    return
+                if isinstance(record, Released):
+                    self.background.note(record.turn, record.outs)
+                self.switch.from_life(record)
+
+    def _is_front(self, record: Released) -> bool:
+        """Whether it is of the turn that comes next, or of one that is known."""
+        return not self.is_live or record.turn > self.switch.turn or self._is_known(record.turn, record.id)
+
+    def _is_known(self, turn: int, number: int) -> bool:
+        """Whether this input was handled in this turn, as far as the home knows it."""
+        past = self.switch.turns.get(turn)
+        return past.input.id == number if past is not None else number in self.switch.stashed()
+
+    def _is_behind(self, turn: int) -> None:
+        """Whoever leads has handled something in a turn in which the home knows something else to be handled.
+
+        It must never count: from the snapshot and the journal the life is as it was.
+        """
+        self._give_up(f"{self.primary} has not got the state that was acknowledged at turn {turn}")
+
+    def _give_up(self, why: str) -> None:
+        """The life is over; another one begins as its home has it."""
+        self.out = None  # It is nobody's fault that is inside.
+        self.is_over, self.why = True, why
+        self.on_over(why)
+
+    def _is_of_now(self, epoch: int) -> bool:
+        if epoch == self.epoch and not self.is_over and (self.primary or self.leading) is not None:
+            return True  # Who is to lead may say something before it says that it does.
+        self.stale += 1
+        return False
+
+    def _end(self, end: TurnEnd) -> None:
+        switch = self.switch
+        if end.turn < 0 and end.status == DROPPED:  # It was handled, and nobody knows any more what came of it.
+            self.ledger.pop(end.id, None)
+            if end.id in switch.open:
+                batch = Batch()
+                switch.ends.without_turn(switch.open[end.id], end.answer, batch)
+                batch.commit(switch.journal)
+            return
+        if self.is_live and (end.turn <= switch.turn or end.id not in switch.open):
+            self.doubled += 1
+            if end.id not in switch.open:
+                self.ledger.pop(end.id, None)
+            elif not self._is_known(end.turn, end.id):
+                self._is_behind(end.turn)
+            return
+        source = switch.open.get(end.id)
+        if source is not None and source.kind == START and end.status == FAILED:
+            self.on_start_failed(end)
+            return
+        if end.outs:
+            self.background.note(end.turn, end.outs)
+        switch.from_life(end)
+        if end.status != STASHED:
+            self.ledger.pop(end.id, None)
+
+    def _forget_turns(self) -> None:
+        """An actor that is not recorded keeps nothing of what it has handled."""
+        switch = self.switch
+        if switch.method.replays or switch.method.snapshots or len(switch.turns) < KEPT_TURNS:
+            return
+        forget_ended(switch)
+
+
+def forget_ended(switch: Switch) -> None:
+    """Forget all ended turns of an actor that would begin afresh."""
+    put(switch, meta_now(switch, switch.turn, sorted(switch.stashed() & switch.open.keys())), 1)
+
+
+def without_deadline(feed: Feed) -> Feed:
+    """What has begun is finished, whatever its deadline."""
+    return Feed(
+        feed.id, feed.turn, feed.kind, feed.name, feed.body, feed.time, feed.sender,
+        feed.is_ask, feed.chain, feed.pipes, 0.0, feed.origin,
+    )  # fmt: skip

@@ -1,0 +1,301 @@
+"""Detach: the life of a group of replicas becomes that of a task again.
+
+What is inside comes out, and nothing new goes in; the new life takes up the state, and handles nothing until it is the
+one. If it does not come so far, the group goes on as if nothing had been.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import Any, cast
+
+from ..actors import lives, mailbox
+from ..actors.cell import Cell, Host
+from ..actors.context import ActorContext
+from ..actors.control.moving import (
+    decoded,
+    now,
+    obey_commands,
+    settle,
+    sorted_out,
+    twin,
+)
+from ..actors.errors import CannotMove, StartFailed
+from ..actors.exits import ExitReason, unpack_exit
+from ..actors.links import Down, Exit, Monitor
+from ..actors.lives import LOCAL
+from ..actors.mail import Envelope
+from ..actors.mailbox import Bound, Overflow
+from ..actors.process.mover import Move
+from ..actors.process.moves import await_up
+from ..actors.process.to_task import dispose
+from ..actors.timers import Timer
+from ..checkpoint.controller import LocalLife, TaskHost
+from ..checkpoint.keys import restore_state
+from ..checkpoint.life import Life
+from ..checkpoint.moving import ArrivingHome, Detached, refuse_unsaved
+from ..checkpoint.records import DOWN, EXIT, MESSAGE, PIPE, START, TICK
+from ..checkpoint.switch import Switch
+from .host import GroupHost
+from .orders import Export
+from .unkept import is_unkept
+
+
+class FromGroup(Move):
+    """From a group to a task; what recorded and other actors have in common."""
+
+    to = "task"
+
+    def __init__(self, cell: Cell, host: Host, timeout: float) -> None:
+        super().__init__(cell, host, timeout)
+        old = cell.host
+        if not isinstance(old, GroupHost) or old.group is None or old.switch is None:
+            raise CannotMove(cell.path, "it is being recovered; try again")
+        self._old, self._group, self._switch = old, old.group, old.switch
+        self._home: Detached | None = None
+        self._twin: Cell | None = None
+        self._over = self._group.on_over
+        self._has_fallen = False
+        self.ending: asyncio.Future[None] | None = None  # that of the replicas
+
+    async def take(self) -> None:
+        group = self._group
+        group.is_stopping = True
+        self.rest_at = now()
+        await self.within(self._group.quiet(), self.timeout, lambda: "a turn of it has not ended")
+        if self.given_up.done():
+            raise CannotMove(self.cell.path, self.given_up.result())
+
+    def rested(self) -> None:
+        """Nothing is inside any more; if no replica is left meanwhile, the life ends when it is known where it is."""
+        self.at_rest()
+        self._group.on_over = self._fell
+
+    def _fell(self, why: str) -> None:
+        self._has_fallen = True
+        self.give_up(why)
+
+    def dismantled(self) -> None:
+        """The replicas are not needed any more."""
+        host, cell = self._old, self.cell
+        group = host.group
+        if group is not None:
+            group.is_over = True
+        self.ending = asyncio.ensure_future(host.dismantle(cell))
+
+    def undo(self) -> None:
+        cell = self.cell
+        if self._twin is not None:
+            dispose(self._twin)
+        self._group.is_stopping = False
+        transit = self.transit
+        if transit is not None:
+            if self._home is not None:
+                self._home.attach_again(transit)
+            transit.over(cell, self._old)
+            self._group.on_over = self._over
+            if self._has_fallen:
+                self._over(self._group.why)
+        self._group.poke()
+
+
+class ToRecordedTask(FromGroup):
+    """A recorded actor lives as a task again."""
+
+    host: TaskHost
+
+    async def take(self) -> None:
+        await super().take()
+        switch = self._switch
+        if switch.method.snapshots:
+            await self.within(switch.due.wish(), self.timeout, lambda: "its state was not saved")
+        self.rested()
+        self._home = Detached(switch)
+
+    async def carry(self) -> None:
+        cell, host, start = self.cell, self.host, self.cell.extra().start
+        assert start is not None
+        refuse_unsaved(cell, self._switch)
+        other = self._twin = twin(cell)
+        other.life -= 1  # Counted up by the life that begins; it is no other one.
+        other.extra().bindings = cell.extra().bindings
+        switch, live, _ = host.open(cell)
+        settled: asyncio.Future[None] = self.node.loop.create_future()
+        home = ArrivingHome(host, cell, other, settled)
+        life = Life(other, home, host.method, None)
+        life.begins_suspended = self._group.is_suspended
+        for record in switch.restore_records():
+            life.from_home(record)
+        other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
+        life.begin(start, switch.state_turn, switch.stash)
+        switch.attach(LocalLife(life))
+        live.add_done_callback(lambda done: None if done.cancelled() else home.fail(done.exception()))
+        await self.within(settled, self.timeout, lambda: "its new life was not up")
+        self._switch_over(other, life, home)
+
+    def _switch_over(self, other: Cell, life: Life, home: ArrivingHome) -> None:
+        """From here on the new life is the one."""
+        cell, host, more = self.cell, self.host, self.cell.extra()
+        assert self.transit is not None
+        self.is_done = True
+        tap = more.tap
+        if tap is not None:
+            tap.detach()
+        queue, its = other.queue, other.extra()
+        urgent, suspended = its.urgent, its.suspended
+        settle(other, cell)
+        life.cell = cell
+        cell.queue, more.urgent, more.suspended = deque(queue or ()), urgent, suspended
+        host.life, host.clock = life, None
+        if tap is not None:
+            tap.attach()
+        self.transit.over(cell, host)
+        self.dismantled()
+        lives.up(cell)
+        home.open()  # Now it is live: its home feeds it what waits.
+        self.gone_on_at = now()
+        self.moved()
+
+
+class ToPlainTask(FromGroup):
+    """An actor without recovery lives as a task again, and has no home any more."""
+
+    def __init__(self, cell: Cell, host: Host, timeout: float) -> None:
+        super().__init__(cell, host, timeout)
+        self._data = b""
+        self._stash: list[int] = []
+
+    async def take(self) -> None:
+        await super().take()
+        group, switch = self._group, self._switch
+        if switch.later:
+            raise CannotMove(
+                self.cell.path, f"{len(switch.later)} asks wait for replies that only its handles can give"
+            )
+        primary = group.primary
+        assert primary is not None
+        exported = await self.within(
+            group.protocol(primary).ask(Export(group.epoch), self.timeout),
+            self.timeout,
+            lambda: "its state did not come",
+        )
+        self._data, self._stash = exported.data, list(exported.stash)
+        if group.out is not None:
+            raise CannotMove(self.cell.path, "its primary was replaced meanwhile; try again")
+        self.rested()
+
+    async def carry(self) -> None:
+        cell, start = self.cell, self.cell.extra().start
+        assert start is not None
+        other = self._twin = twin(cell)
+        other.table = start.kind._table
+        other.extra().bindings = cell.extra().bindings
+        lives.build(other, start, ActorContext)
+        actor = other.actor
+        assert actor is not None
+        try:
+            restore_state(actor, self._data)
+        except Exception as error:
+            raise StartFailed(cell.path, f"its state could not be restored: {error}") from error
+        gone, settled = other.ended(), await_up(other, start)
+        gone.add_done_callback(lambda done: self._ended_early(settled, done.result()))
+        await self.within(settled, self.timeout, lambda: "its new life was not up")
+        self._switch_over(other)
+
+    def _switch_over(self, other: Cell) -> None:
+        """From here on the new life is the one."""
+        cell, more, switch = self.cell, self.cell.extra(), self._switch
+        assert self.transit is not None
+        self.is_done = True
+        tap = more.tap
+        if tap is not None:
+            tap.detach()
+        own, commands = sorted_out(other, ticks=True)
+        settle(other, cell)
+        stash, items = self._moved_out(switch)
+        more.outlet = None
+        cell.admit = mailbox.admit_first
+        homed, switch.bound = switch.bound, None
+        self._old.homes.released(cell.path)
+        queue = mailbox.queue_of(cell)
+        if homed is not None and homed.capacity:
+            more.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
+            cell.admit = mailbox.admit_bounded
+        taken = (decoded(cell, item) for item in (*own, *items))
+        queue.extend(item for item in taken if item is not None)
+        if more.bound is not None:
+            more.bound.count = sum(map(mailbox.counts, queue))
+        kept = [one for item in stash if (one := decoded(cell, item)) is not None]
+        more.stash = deque(kept) if kept else None
+        for name, body, left, interval in switch.timers.saved().values():
+            message = cell.node.codec.decode(cell.table.kind_named(name), body)
+            Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
+        switch.timers.replace({})
+        for ask, name, body, sender in getattr(homed, "waiting", ()):
+            del name, body, sender
+            cell.admit(cell, ask)
+        for sender in getattr(homed, "senders", ()):
+            if not sender.done():
+                sender.set_result(None)
+        if self._group.is_suspended:
+            more.suspended = True
+            mailbox.hold(cell)
+        else:
+            more.suspended = False
+        if tap is not None:
+            tap.attach()
+        self.transit.over(cell, LOCAL)
+        self.dismantled()
+        obey_commands(cell, commands)
+        lives.up(cell)
+        self.gone_on_at = now()
+        self.moved()
+
+    def _ended_early(self, settled: asyncio.Future[None], reason: ExitReason) -> None:
+        if not settled.done():
+            settled.set_exception(StartFailed(self.cell.path, str(reason)))
+            settled.exception()
+
+    def _moved_out(self, switch: Switch) -> tuple[list[Any], list[Any]]:
+        """What waits at the home: what the actor has put aside, and its messages, as a mailbox has them."""
+        cell, node = self.cell, self.node
+        stash: list[Any] = []
+        items: list[Any] = []
+        for source in switch.open.values():
+            if source.kind in (MESSAGE, TICK, PIPE):
+                item: Any = source.ask
+                if item is None:
+                    message = node.codec.message_in(cell, source.name, source.body)
+                    sender = node.cell_at(source.sender) if source.sender and source.kind == MESSAGE else None
+                    item = message if sender is None else Envelope(message, sender)
+                else:
+                    item.started = False
+                (stash if source.id in self._stash else items).append(item)
+            elif source.kind in (EXIT, DOWN):
+                items.extend(arrived(cell, source.kind, source.body))
+            else:
+                assert source.kind == START
+        switch.open.clear()
+        return stash, items
+
+
+def arrived(cell: Cell, kind: str, body: bytes) -> list[Any]:
+    """An EXIT or DOWN at a mailbox again."""
+    data = cell.node.codec.decode(dict[str, Any], body)
+    source = cell.node.cell_at(data["source"])
+    if kind == EXIT:
+        return [Exit(source, unpack_exit(data["reason"]))]
+    return [Down(Monitor(cell, source, for_good=False), unpack_exit(data["reason"]), bool(data["recovering"]))]
+
+
+def from_group(cell: Cell, host: Host, timeout: float) -> FromGroup:
+    """The move of a group's life into a task, where `host` lives it.
+
+    Raises:
+        CannotMove: it is being recovered.
+    """
+    old = cell.host
+    if isinstance(old, GroupHost) and is_unkept(old.method):
+        return ToPlainTask(cell, host, timeout)
+    return ToRecordedTask(cell, host, timeout)

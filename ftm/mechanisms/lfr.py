@@ -1,0 +1,258 @@
+"""Semi-active replication (LFR, leader-follower): both compute, one answers.
+
+Fault model  the crash of a replica: its process, its bricks, a hang that the failure detector sees.
+Guarantee    a reply leaves when the follower has the request: no request is lost or doubled. Hidden non-determinism is
+             found by comparing digests of outcomes, and told (`Diverged`), naming the first request.
+Not covered  value faults: a difference is seen, not whose it is. Non-determinism that no outcome shows.
+Needs        determinism; two units. State access only to bring a follower in later, or back after a divergence.
+Cost         little bandwidth: requests and digests. Both units compute.
+Source       Lauer et al. 2018, Tables I and II (A36, A37).
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import zlib
+from collections import deque
+from typing import Any, ClassVar
+
+from ...actors.errors import HoldfastError
+from ...actors.message import Message
+from ...checkpoint.records import Outcome, TurnEnd
+from ..alarms import Diverged, ProtectionLost
+from ..bricks import After, Before, Brick, Proceed
+from ..mechanism import Mechanism, Role
+from ..messages import FORWARDED, Done, Request, Work
+from ..standing import PeerLost
+from ..transfer import GoneAstray
+
+GONE = 1e-9
+"""A deadline that is over, on whatever clock."""
+
+
+class Forward(Message[None]):
+    """A batch, for the follower to compute too (A36)."""
+
+    work: Work
+
+
+class Heard(Message[None]):
+    """The outcome of an ask that the actor has made on the leader."""
+
+    outcome: Outcome
+
+
+class Notify(Message[None]):
+    """What the leader's turns have come to: number of the request, turn, digest."""
+
+    ends: list[tuple[int, int, int]]
+
+
+def digest(end: TurnEnd, released: list[int]) -> int:
+    """A checksum of the outcome of a turn: how it ended, its answer, and all that it has sent."""
+    answer = end.answer
+    head = f"{end.turn}|{end.status}|{answer.kind}|{answer.name}".encode()
+    found = zlib.crc32(answer.body, zlib.crc32(head))
+    for sent in (*released, *(out.digest() for out in end.outs)):
+        found = zlib.crc32(sent.to_bytes(4, "little"), found)
+    return found
+
+
+class Sender(Brick):
+    """A brick that tells its peer things in order, and waits for the answers when it wants."""
+
+    _under_way: set[asyncio.Task[bool]] | None = None
+
+    def send_peer(self, message: Message[Any]) -> asyncio.Task[bool]:
+        """Tell the peer; the result says whether it has it, False if it does not count any more."""
+        under_way = self._under_way = self._under_way or set()
+        task = self.ctx.create_task(self._sent(message))
+        under_way.add(task)
+        task.add_done_callback(under_way.discard)
+        return task
+
+    async def drain(self) -> None:
+        """Wait until the peer has all of it."""
+        for task in list(self._under_way or ()):
+            await asyncio.wait((task,))
+
+    async def _sent(self, message: Message[Any]) -> bool:
+        try:
+            await self.ask_peer(message)
+        except PeerLost:
+            return False
+        return True
+
+
+class Forwarding(Before, Sender):
+    """Before of the leader: the follower has a request before anybody gets its reply."""
+
+    async def before(self, work: Work) -> Work:
+        """Forward a batch; one whose deadline is over is over on both sides."""
+        standing = self._standing
+        if standing.peer is None:
+            return work
+        now = standing.node.loop.time()
+        requests = [decided(one, now) for one in work.requests]
+        work = Work(work.epoch, work.config, work.number, requests, work.go, work.again)
+        if requests or work.go is not None:
+            standing.forwarded.append(self.send_peer(Forward(work)))
+        return work
+
+
+def decided(request: Request, now: float) -> Request:
+    """The same request, with its deadline decided: over, or of no concern any more."""
+    feed = request.feed
+    if not feed.deadline or feed.turn >= 0:
+        return request
+    past = GONE if feed.deadline <= now else 0.0
+    new = type(feed)(
+        feed.id, feed.turn, feed.kind, feed.name, feed.body, feed.time, feed.sender,
+        feed.is_ask, feed.chain, feed.pipes, past, feed.origin,
+    )  # fmt: skip
+    return Request(request.client, request.incarnation, new)
+
+
+class Handling(Before):
+    """Before of the follower: what the leader forwards is computed here too."""
+
+    peer_messages = (Forward,)
+
+    async def from_peer(self, message: Message[Any]) -> None:
+        """Take a batch."""
+        assert isinstance(message, Forward)
+        standing = self._standing
+        await standing.until_ready()
+        log = standing.log
+        work = message.work
+        left = [one for one in work.requests if log.find(one.feed.id) is None and one.feed.id not in standing.inside]
+        standing.inside.update((one.feed.id, one) for one in left)
+        self.next.tell(Work(standing.epoch, work.config, standing.forwarded_as, left, work.go, work.again))
+
+
+class Computing(Proceed, Sender):
+    """Proceed of both: what the actor hears on the leader, it hears on the follower."""
+
+    peer_messages = (Heard,)
+
+    async def heard(self, outcome: Outcome) -> None:
+        """Pass on what the leader's turn has heard."""
+        if self.leads and self._standing.peer is not None:
+            self._standing.forwarded.append(self.send_peer(Heard(outcome)))
+
+    async def from_peer(self, message: Message[Any]) -> None:
+        """The leader's turn has heard this."""
+        assert isinstance(message, Heard)
+        await self._standing.until_ready()
+        self._standing.server.inward(message.outcome)
+
+
+class Notifying(After, Sender):
+    """After of the leader: outcomes leave when the follower has the requests, and it gets their digests."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._was_alone = False
+
+    async def after(self, done: Done) -> Done:
+        """Wait for the follower to have the requests."""
+        standing = self._standing
+        if not done.ends:
+            return done
+        if standing.peer is None:
+            if not self._was_alone:
+                self._was_alone = True
+                standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
+            return done
+        self._was_alone = False
+        if standing.peer_state == "live":
+            for task in list(standing.forwarded):
+                await task
+        standing.forwarded = [task for task in standing.forwarded if not task.done()]
+        released = standing.server.released
+        digests = [(end.id, end.turn, digest(end, released.get(end.turn, []))) for end in done.ends]
+        self.send_peer(Notify(digests))
+        return done
+
+
+class Comparing(After):
+    """After of the follower: what the leader's turns have come to must be what came out here (T8)."""
+
+    peer_messages = (Notify,)
+    answers_later = True  # What has to wait for the leader's state must not hold up our own outcomes.
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._ours: deque[tuple[int, int, int, str]] = deque()  # number, turn, digest, name
+        self._theirs: deque[tuple[int, int, int]] = deque()
+        self._has_diverged = False
+        self._since = 0  # the state that these lead on from
+
+    async def after(self, done: Done) -> Done:
+        """Remember what came out here."""
+        if done.number <= FORWARDED and done.number != self._standing.forwarded_as:
+            return done  # It leads on from a state that is given up.
+        self._begin_anew()
+        inside, released = self._standing.inside, self._standing.server.released
+        for end in done.ends:
+            request = inside.get(end.id)
+            name = "" if request is None else request.feed.name
+            self._ours.append((end.id, end.turn, digest(end, released.get(end.turn, [])), name))
+        self._compare()
+        return done
+
+    async def from_peer(self, message: Message[Any]) -> None:
+        """Remember what came out there."""
+        assert isinstance(message, Notify)
+        await self._standing.until_ready()
+        self._begin_anew()
+        self._theirs.extend(message.ends)
+        self._compare()
+
+    def _begin_anew(self) -> None:
+        """Another state was taken: what came before it is of no concern."""
+        if self._since != self._standing.forwarded_as:
+            self._since = self._standing.forwarded_as
+            self._ours.clear()
+            self._theirs.clear()
+            self._has_diverged = False
+
+    def _compare(self) -> None:
+        while self._ours and self._theirs and not self._has_diverged:
+            if self._theirs[0][1] < self._ours[0][1]:
+                self._theirs.popleft()  # Of before we came.
+            elif self._ours[0][1] < self._theirs[0][1]:
+                self._ours.popleft()  # The leader has died in between, or its notice has.
+            else:
+                ours, theirs = self._ours.popleft(), self._theirs.popleft()
+                if ours[:3] != theirs:
+                    self._diverged(theirs[0], theirs[1], ours[3])
+
+    def _diverged(self, number: int, turn: int, name: str) -> None:
+        """From here on our state is not the leader's: we must not lead, and do not count until we have joined again."""
+        standing = self._standing
+        standing.node.emit(Diverged(standing.address, standing.path, standing.epoch, number, name, turn))
+        if not standing.server.has_access:
+            raise HoldfastError(f"{standing.path} has diverged from its leader at request {number}")
+        self._has_diverged = True
+        standing.unready()
+        self.ctx.cell.node.cell_at(standing.paths["protocol"]).ref.tell(GoneAstray())
+
+
+@dataclasses.dataclass(frozen=True)
+class LFR(Mechanism):
+    """Leader-follower replication."""
+
+    name: ClassVar[str] = "lfr"
+    replicas: ClassVar[int] = 2
+    tolerates: ClassVar[frozenset[str]] = frozenset({"crash"})
+    needs: ClassVar[frozenset[str]] = frozenset({"determinism"})
+    bandwidth: ClassVar[str] = "low"
+    cpu: ClassVar[str] = "high"
+    units: ClassVar[int] = 2
+    layer: ClassVar[str] = "replication"
+    roles: ClassVar[dict[str, Role]] = {
+        "leader": Role(before=Forwarding, proceed=Computing, after=Notifying),
+        "follower": Role(before=Handling, proceed=Computing, after=Comparing),
+    }

@@ -1,0 +1,205 @@
+"""Secured links (SEC): what goes between proxy and replicas, and between replicas, is ciphered, signed and fresh.
+
+Fault model  somebody sits on the links: reads, alters, forges, replays, drops, delays, speaks as another.
+Guarantee    nothing can be read there; what was altered, forged, replayed, is another's or too old is refused, counted
+             by reason and told (`FrameRefused`); what was refused or lost is sent again, and handled once, in order.
+Not covered  who sees or runs the processes; sizes and times; one who drops everything; heartbeats, and the orders with
+             which the stack of mechanisms itself is changed, which are not ciphered.
+Needs        a certification authority (`CertificationAuthority`), and `pip install holdfast[sec]`.
+Cost         a signature each at both ends for a session; then a seal for each batch and each acknowledgement.
+Source       Lauer et al. 2018, figure 6 (A66 to A75); traps T47, T48.
+
+It ends in front of the journal: what is journaled is plain. It stands outermost, around the reply log, which has to be
+read by a replica that leads later. Keys are files of mode 0600 in a directory that only this user can enter.
+"""
+
+from __future__ import annotations
+
+import atexit
+import dataclasses
+import functools
+import importlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from ...actors.actor import Actor, on
+from ...actors.errors import HoldfastError
+from ...actors.mail import ReplyHandle
+from ..bricks import FOREVER, After, Before
+from ..mechanism import Mechanism, MechanismRefused, Role
+from ..messages import Done, Outward, Taken
+from ..sealed import ORDERS, Agree, Back, Call, Greet, LinkLost, Opened, Refused, Sealed, encode_reply
+
+if TYPE_CHECKING:
+    from ...actors.message import Message
+    from ...actors.node import Node
+    from ..sealed import SecuredLink
+
+
+class Opening(Before):
+    """Before of a secured replica: opens and verifies what comes, and hands it to the protocol (A72)."""
+
+    @on(Greet)
+    def greet(self, message: Greet) -> ReplyHandle[bytes]:
+        """Somebody begins a hand-shake."""
+        return self._later(self._link.greet(message.hello))
+
+    @on(Agree)
+    def agree(self, message: Agree) -> ReplyHandle[None]:
+        """Its end."""
+        return self._later(self._link.agree(message.hello, message.finish))
+
+    @on(Sealed)
+    def sealed(self, message: Sealed) -> ReplyHandle[bytes]:
+        """A frame."""
+        return self._later(self._link.take(message.frame, self._do))
+
+    @property
+    def _link(self) -> SecuredLink:
+        link = self._standing.link
+        if link is None:
+            raise Refused(path=self._standing.path, reason="closed")
+        return link
+
+    def _later(self, work: Any) -> ReplyHandle[Any]:
+        handle: ReplyHandle[Any] = self.ctx.reply_handle()
+        self.ctx.create_task(self._reply(handle, work))
+        return handle
+
+    async def _reply(self, handle: ReplyHandle[Any], work: Any) -> None:
+        try:
+            handle.reply(await work)
+        except HoldfastError as no:
+            handle.fail(no)
+
+    async def _do(self, call: Call) -> Back:
+        standing = self._standing
+        codec = standing.node.codec
+        from ..protocol import OPENED
+
+        for part in call.parts:
+            message = codec.decode(OPENED[part.name], part.body)
+            opened = Opened(standing.put_opened(message))
+            if call.stream != ORDERS:
+                self.next.tell(opened)
+                continue
+            try:
+                return encode_reply(codec, await self.next.ask(opened, timeout=FOREVER))
+            except HoldfastError as error:
+                return Back(*codec.encode_error(error))
+        return Back("", "", b"")
+
+
+class Sealing(After):
+    """After of a secured replica: seals what leaves for the proxy (A73)."""
+
+    @on(Done)
+    async def _done(self, done: Done) -> Taken:
+        self._send(done)
+        return Taken()
+
+    @on(Outward)
+    def _outward(self, outward: Outward) -> None:
+        self._send(outward)
+
+    def _send(self, message: Message[Any]) -> None:
+        standing, proxy = self._standing, self.next
+        link, epoch = standing.link, standing.epoch
+        if link is None:
+            return
+        cell = proxy._cell
+        reach = functools.partial(ask, cell)
+        link.tell(cell.path, message, reach, lambda: standing.epoch == epoch and not standing.is_fenced)
+
+
+def ask(cell: Any, message: Message[Any], seconds: float) -> Any:
+    """Ask whoever is there."""
+    return cell.ref.ask(message, timeout=seconds)
+
+
+@functools.cache
+def _folder_of(process: int) -> str:
+    """The directory for keys that end with this process."""
+    folder = tempfile.mkdtemp(prefix="holdfast-sec-")
+
+    def remove() -> None:
+        if os.getpid() == process:  # A forked process ends, too.
+            shutil.rmtree(folder, ignore_errors=True)
+
+    atexit.register(remove)
+    return folder
+
+
+@dataclasses.dataclass(frozen=True)
+class SEC(Mechanism):
+    """Secured links.
+
+    Args:
+        authority: the address of the `CertificationAuthority`.
+        keys: the directory of the participants' keys, which only this user may enter; "": new keys at each start.
+        fingerprint: the beginning of the SHA-256 of the authority's public key, in hex; "": it is believed.
+        rotate_messages, rotate_seconds: after so many frames, or so long, the keys of a session are exchanged.
+        lifetime: seconds after which a session is over, and another one is agreed on.
+        renew_days: a certificate is renewed when so many days are left.
+        suites: ciphers, the best first.
+    """
+
+    name: ClassVar[str] = "sec"
+    replicas: ClassVar[int] = 1
+    tolerates: ClassVar[frozenset[str]] = frozenset({"eavesdropping", "forgery", "replay"})
+    needs: ClassVar[frozenset[str]] = frozenset({"certificates"})
+    bandwidth: ClassVar[str] = "low"
+    cpu: ClassVar[str] = "low"
+    units: ClassVar[int] = 1
+    layer: ClassVar[str] = "link"
+    roles: ClassVar[dict[str, Role]] = {"end": Role(before=Opening, after=Sealing)}
+
+    authority: str
+    keys: str = ""
+    fingerprint: str = ""
+    rotate_messages: int = 1 << 20
+    rotate_seconds: float = 3600.0
+    lifetime: float = 86_400.0
+    renew_days: float = 7.0
+    suites: tuple[str, ...] = ("aes-256-gcm", "chacha20-poly1305")
+    is_per_start: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.keys:
+            object.__setattr__(self, "keys", _folder_of(os.getpid()))
+            object.__setattr__(self, "is_per_start", True)
+        object.__setattr__(self, "suites", tuple(self.suites))
+
+    def check(self, kind: type[Actor], where: str = "") -> None:
+        """Whether the extra is installed, and the directory is safe."""
+        super().check(kind, where)
+        try:
+            importlib.import_module("..sec.link", __package__)
+        except ImportError as error:
+            raise MechanismRefused(self.name, str(error)) from error
+        try:
+            about = os.stat(self.keys)
+        except OSError as error:
+            raise MechanismRefused(self.name, f"the directory of keys {self.keys} cannot be used: {error}") from error
+        if about.st_uid != os.geteuid() or about.st_mode & 0o077:
+            raise MechanismRefused(self.name, f"{self.keys} must belong to this user, with mode 0700")
+
+    def open_link(
+        self,
+        node: Node,
+        address: str,
+        path: str,
+        epoch: Callable[[], int],
+        enrols: Callable[[], list[str]] | None = None,
+    ) -> SecuredLink:
+        """This participant's end of its links."""
+        from ..sec.identity import End
+        from ..sec.link import Link
+
+        return Link(End(node, address, path, self, epoch, enrols))
+
+
+__all__ = ["SEC", "LinkLost", "Opening", "Sealing"]

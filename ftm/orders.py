@@ -1,0 +1,103 @@
+"""What the root tells the replicas of a group besides their work, and what they tell it of themselves.
+
+All orders go to the outermost RequestProtocol of a replica. Each can come twice: the manager that gave it may have died
+before it heard the reply, and the next one gives it again. Twice is once.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+
+from ..actors.message import Message
+from ..checkpoint.records import TurnEnd
+
+
+class Setting(msgspec.Struct, array_like=True, frozen=True):
+    """What a replica is made with, besides its layers and the recipe of the protected actor."""
+
+    address: str
+    """That of the protected actor: the proxy is at `ftm/proxy` below it, the detector at `ftm/detector`."""
+    name: str
+    """This replica's: "r1"."""
+    config: int
+    method: dict[str, Any]
+    """What a life has to know of its recovery method (`Method.data`)."""
+    bindings: dict[str, str]
+    """Of the protected actor: port to address."""
+    beat: float
+    """Seconds between two heartbeats."""
+
+
+class Install(Message[None]):
+    """A piece of the state to begin with; then `Lead` comes. Without it the replica begins afresh."""
+
+    epoch: int
+    turn: int
+    data: bytes
+    stash: list[int]
+    is_last: bool
+    log: list[tuple[str, int, int, TurnEnd]]
+    traps: bool = False  # `ctx.trap_exits` of the life that it comes from
+
+
+class Peer(Message[None]):
+    """Your other replica is the one at this path from now on; None: you are alone, wait for nobody."""
+
+    epoch: int
+    path: str | None
+
+
+class Join(Message[int]):
+    """Have the replica at `peer` catch up, between two batches, and count it in from the next batch on.
+
+    The reply is the turn whose state it has acknowledged; an error if it cannot.
+    """
+
+    epoch: int
+    peer: str
+
+
+class Stand(msgspec.Struct, array_like=True):
+    """How a replica stands when nothing is inside."""
+
+    epoch: int
+    config: int
+    turn: int
+    leads: bool
+
+
+class Quiesce(Message[Stand]):
+    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in."""
+
+    epoch: int
+    config: int
+
+
+class Finish(Message[None]):
+    """End in good order: a last snapshot (if the method takes any), then `on_stop` of the protected actor."""
+
+    epoch: int
+    reason: dict[str, Any]
+
+
+class Beat(Message):
+    """This replica's bricks are running."""
+
+    name: str
+    epoch: int
+
+
+class Exported(msgspec.Struct, array_like=True):
+    """The state of the protected actor after turn `turn`, as a snapshot has it."""
+
+    turn: int
+    data: bytes
+    stash: list[int]
+
+
+class Export(Message[Exported]):
+    """Give out the state between two batches: the actor is to live without a mechanism."""
+
+    epoch: int

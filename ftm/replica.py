@@ -1,0 +1,476 @@
+"""The replica: a supervisor, in a process of its own, of the bricks and the protected actor.
+
+It weaves the layers of a composition into bricks and bindings. When the layers or the role change, new bricks are
+started beside the old ones, everything is bound anew, and the old ones end: only those that differ are touched.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from typing import Any, NamedTuple
+
+from ..actors.actor import Actor, Start, on, start
+from ..actors.bindings import Binding
+from ..actors.cell import Cell
+from ..actors.errors import HoldfastError, type_name
+from ..actors.events import ActorStarted
+from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.message import Message
+from ..checkpoint.method import Method
+from ..supervision.children import Child, new_cell
+from ..supervision.spec import Flags, Plan, child
+from ..supervision.supervisor import Supervisor
+from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
+from .mechanism import Description, Mechanism, MechanismRefused, revive
+from .orders import Beat, Setting
+from .protocol import InnerProtocol, RequestProtocol
+from .server import Server
+from .standing import Standing
+from .state import StateManager
+from .transfer import Assume
+
+SERVER, STATE, BEAT, PROTOCOL = "server", "state", "beat", "protocol"
+
+
+class Prepare(Message[None]):
+    """Start the bricks of another stack of mechanisms beside those of the present one."""
+
+    config: int
+    layers: list[Description]
+
+
+class Commit(Message[int]):
+    """Bind everything as that stack wants it, and end the bricks that are not needed. Nothing may be inside.
+
+    The reply is the last turn whose state is here.
+    """
+
+    config: int
+
+
+class Abort(Message[None]):
+    """End the bricks that were prepared; everything stays as it was."""
+
+    config: int
+
+
+class EndBricks(Message):
+    """From the replica to itself: these are not needed any more."""
+
+    names: list[str]
+
+
+class Tick(Message):
+    """It is time for a heartbeat."""
+
+
+class Heart(Actor):
+    """Tells the failure detector that the bricks of this replica run."""
+
+    detector: Binding[Actor]
+
+    def __init__(self, standing: Standing, name: str, interval: float) -> None:
+        self._standing, self._name, self._interval = standing, name, interval
+
+    def on_start(self, restored: bool) -> None:
+        """Beat at once, then regularly."""
+        if self._interval > 0:
+            self._beat(Tick())
+            self.ctx.every(self._interval, Tick())
+
+    @on(Tick)
+    def _beat(self, message: Tick) -> None:
+        try:
+            self.detector.tell(Beat(self._name, self._standing.epoch))
+        except HoldfastError:
+            return  # It is between two lives.
+
+
+class Place(NamedTuple):
+    """A brick in the graph: its class, and the mechanism whose it is (None: it passes through)."""
+
+    kind: type[Brick]
+    mechanism: Mechanism | None
+    name: str  # that it would like
+
+
+PARTS: dict[str, type[Brick]] = {"before": Before, "proceed": Proceed, "after": After}
+
+
+def nested(layers: tuple[Mechanism, ...]) -> tuple[Mechanism, ...]:
+    """The same layers as they are woven: assertions stand inside replication, so that no state leaves unchecked.
+
+    For whoever reads a composition they stand outside: what they check is what the replicas have come to.
+    """
+    replication = [one for one in layers if one.layer == "replication"]
+    if not replication:
+        return layers
+    moved = [one for one in layers if one.layer == "assertion"]
+    kept = [one for one in layers if one.layer != "assertion"]
+    at = kept.index(replication[-1]) + 1
+    return (*kept[:at], *moved, *kept[at:])
+
+
+def weave(layers: tuple[Mechanism, ...], *, leads: bool) -> dict[str, Place]:
+    """The bricks of a composition, by slot, outermost layer first.
+
+    Raises:
+        MechanismRefused: a mechanism stands in it twice, or two want to compute.
+    """
+    places: dict[str, Place] = {PROTOCOL: Place(RequestProtocol, None, PROTOCOL)}
+    proceed: tuple[type[Proceed], Mechanism | None] = (Proceed, None)
+    for index, one in enumerate(layers):
+        role, prefix = one.role(leads=leads), f"{one.name}." if index else ""
+        if f"{one.name}.before" in places:
+            raise MechanismRefused(one.name, "it stands in the composition twice")
+        if index:
+            places[f"{one.name}.protocol"] = Place(InnerProtocol, None, f"{prefix}protocol")
+            if one.secures:
+                raise MechanismRefused(one.name, "it secures the links: it stands outermost, and once")
+        for part, kind in PARTS.items():
+            check_brick(one, part, getattr(role, part) or kind)
+        before, after = role.before or Before, role.after or After
+        places[f"{one.name}.before"] = Place(before, one if role.before else None, f"{prefix}before")
+        places[f"{one.name}.after"] = Place(after, one if role.after else None, f"{prefix}after")
+        if role.proceed is not None and role.proceed is not Proceed:
+            if proceed[0] is not Proceed:
+                raise MechanismRefused(one.name, f"{proceed[1] and proceed[1].name} wants a Proceed of its own too")
+            proceed = role.proceed, one
+    places["proceed"] = Place(proceed[0], proceed[1], "proceed")
+    return places
+
+
+def check_brick(mechanism: Mechanism, part: str, kind: object) -> None:
+    """Whether a class can stand there.
+
+    Raises:
+        MechanismRefused: it is no brick of that sort, or lacks a binding.
+    """
+    base = PARTS[part]
+    if not isinstance(kind, type) or not issubclass(kind, base):
+        raise MechanismRefused(mechanism.name, f"its {part} must be a {base.__name__}, not {kind!r}")
+    missing = [port for port in base._bindings if port not in kind._bindings]
+    if missing:
+        raise MechanismRefused(mechanism.name, f"{type_name(kind)} has no binding {', '.join(missing)}")
+    more = sorted(set(kind._bindings) - set(base._bindings))
+    if more:
+        raise MechanismRefused(mechanism.name, f"nothing would be bound to {', '.join(more)} of {type_name(kind)}")
+
+
+@dataclasses.dataclass
+class Woven:
+    """A stack of mechanisms as it stands, or is prepared: which child plays which slot."""
+
+    config: int
+    layers: tuple[Mechanism, ...]
+    places: dict[str, Place]
+    names: dict[str, str]  # slot to child
+    new: list[str]
+
+
+class Replica(Supervisor):
+    """One of the lives of a protected actor, with the bricks around it. The crash of any brick is its end."""
+
+    def __init__(self, setting: Setting, start: Start[Any], layers: tuple[Mechanism | Description, ...]) -> None:
+        super().__init__(Flags("one_for_all", intensity=0), ())
+        self._setting, self._recipe = setting, start
+        made = tuple(one if isinstance(one, Mechanism) else revive(one) for one in layers)
+        for one in made:
+            one.check(start.kind, setting.address)
+        self._made = nested(made)
+
+    def init(self) -> Plan:
+        """The protected actor and its state manager; the bricks follow."""
+        setting, cell = self._setting, self.ctx.cell
+        node = cell.node
+        self._standing = standing = Standing(node, setting.address, self.ctx.path, setting.config, self._made)
+        self._server = standing.server = Server(standing, Method.of(setting.method))
+        self._woven = Woven(setting.config, self._made, {}, {}, [])
+        self._prepared: Woven | None = None
+        return Plan(
+            [child(SERVER, self._recipe, shutdown=5.0), child(STATE, start(StateManager, standing))],
+            strategy="one_for_all",
+            intensity=0,
+        )
+
+    async def on_start(self, restored: bool) -> None:
+        """Start the protected actor's address, then the bricks as one that does not lead, then the heartbeat."""
+        await super().on_start(restored)
+        setting, node = self._setting, self.ctx.cell.node
+        self._bind(STATE, "server", self._cell(SERVER))
+        for port, path in setting.bindings.items():
+            node.bind(self._cell(SERVER), port, node.cell_at(path))
+        node.emit(ActorStarted(self._cell(SERVER).path, 1))  # Its lives come and go with the role: the address stays.
+        woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=False)
+        await self._take_up(woven)
+        one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat)))
+        one.cell = cell = new_cell(self.ctx.cell, one)
+        node.bind(cell, "detector", node.cell_at(f"{setting.address}/ftm/detector"))
+        self._enlist(one)
+        await self._start(one)
+
+    def _launch(self, one: Child) -> asyncio.Future[None] | None:
+        if one.spec.id != SERVER:
+            return super()._launch(one)
+        if one.cell is None:
+            one.cell = new_cell(self.ctx.cell, one)
+        one.cell.host = self._server
+        self._server.start(one.cell)
+        return None
+
+    def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Any:
+        """The lives of the protected actor begin and end as the bricks want it; the end of a brick is ours."""
+        if cell.name == SERVER or isinstance(cell.host, Server):
+            return None
+        return super().child_exited(cell, life, reason)
+
+    def _cell(self, name: str) -> Cell:
+        cell = self._children[name].cell
+        assert cell is not None
+        return cell
+
+    def _bind(self, name: str, port: str, target: Cell) -> None:
+        self.ctx.cell.node.bind(self._cell(name), port, target)
+
+    # -- weaving ----------------------------------------------------------------------------------------------------
+
+    async def _start_bricks(self, config: int, layers: tuple[Mechanism, ...], *, leads: bool) -> Woven:
+        """Start what a stack needs that is not there yet."""
+        places, old = weave(layers, leads=leads), self._woven
+        woven = Woven(config, layers, places, {}, [])
+        free = {slot: name for slot, name in old.names.items() if slot not in places}
+        try:
+            for slot, place in places.items():
+                name = self._known(slot, place, free)
+                if name is None:
+                    name = place.name if place.name not in self._children else f"{place.name}@{config}"
+                    while name in self._children:
+                        name += "'"
+                    one = Child(child(name, start(place.kind, self._standing, place.mechanism, slot)))
+                    self._enlist(one)
+                    woven.new.append(name)
+                    woven.names[slot] = name
+                    await self._start(one)
+                woven.names[slot] = name
+        except BaseException:
+            await self._end_bricks(woven.new)
+            raise
+        return woven
+
+    def _known(self, slot: str, place: Place, free: dict[str, str]) -> str | None:
+        """A brick that is there and does just this."""
+        old = self._woven
+        before = old.places.get(slot)
+        if before is not None and before[:2] == place[:2]:
+            return old.names[slot]
+        if place.mechanism is None:
+            for other, name in free.items():
+                if old.places[other][:2] == place[:2]:
+                    del free[other]
+                    return name
+        return None
+
+    async def _end_bricks(self, names: list[str]) -> None:
+        for name in names:
+            one = self._children.get(name)
+            if one is not None:
+                await self._stop(one)
+                self._give_up_address(one, SHUTDOWN)
+                self._forget(one)
+
+    async def _settled(self, name: str) -> None:
+        """Wait until a brick has handled what has come so far.
+
+        Raises:
+            HoldfastError: it has crashed; we hear of that only behind this turn, and then all of us ends.
+        """
+        cell = self._cell(name)
+        asked, ended = cell.ref.ask(Settle(), timeout=FOREVER), cell.ended()
+        await asyncio.wait((asked, ended), return_when=asyncio.FIRST_COMPLETED)
+        if not asked.done():
+            raise HoldfastError(f"{cell.path} has crashed")
+        await asked
+
+    async def _take_up(self, woven: Woven, *, leads: bool | None = None, behind: bool = False) -> None:
+        """Have this stack be the one: bind everything, end what is not needed (`behind`: when we have answered)."""
+        old, self._woven, standing = self._woven, woven, self._standing
+        kept = set(woven.names.values())
+        left = [name for name in old.names.values() if name not in kept and name in self._children]
+        for name in left:  # What is in their mailboxes belongs to the time before.
+            await self._settled(name)
+        standing.config, standing.layers = woven.config, woven.layers
+        if leads is not None:
+            standing.leads = leads
+        roles = [one.role(leads=standing.leads) for one in woven.layers]
+        standing.computes = standing.leads or all(role.computes for role in roles)
+        self._server.is_lazy = not any("state_access" in one.needs for one in woven.layers)
+        server = self._server
+        if not server.is_lazy and server.tail and server.life is not None and server.life.feed is None:
+            server.capture()  # From here on, the last part is what was handled since the last point.
+        standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
+        standing.forget_bricks()
+        self._secure()
+        self._bind_all(woven)
+        if behind:
+            self.ctx.ref.tell(EndBricks(left))
+        else:
+            await self._end_bricks(left)
+        if not standing.computes:
+            await self._keep_state()
+        elif standing.leads or standing.is_ready:
+            await self._server.ensure()
+
+    def _secure(self) -> None:
+        """Have the link that the outermost mechanism wants."""
+        standing = self._standing
+        outermost = standing.layers[0] if standing.layers else None
+        old = standing.link
+        if old is not None and old.mechanism == outermost:
+            return
+        if old is not None:
+            old.close()
+        path, epoch = self.ctx.path, lambda: max(0, standing.epoch)
+        standing.link = None if outermost is None else outermost.open_link(standing.node, standing.address, path, epoch)
+
+    async def _keep_state(self) -> None:
+        """The protected actor does not live here any more: its state stays, as bytes."""
+        server = self._server
+        if server.life is not None and server.life.feed is None and server.has_access:
+            server.capture()
+        await server.drop_life()
+
+    def _bind_all(self, woven: Woven) -> None:
+        node = self.ctx.cell.node
+        for owner, port, target in self._wiring(woven):
+            node.bind(owner, port, target)
+        proceed = self._cell(woven.names["proceed"]).actor
+        assert isinstance(proceed, Proceed)
+        proceed.take_over()
+
+    def _check_wiring(self, woven: Woven) -> None:
+        """Whether all bindings can be made, and nothing that is needed is left unbound.
+
+        Raises:
+            MechanismRefused: which one.
+        """
+        bound: dict[Cell, set[str]] = {}
+        for owner, port, target in self._wiring(woven):
+            kind: Any = owner.extra().start
+            if port not in kind.kind._bindings:
+                raise MechanismRefused(owner.path, f"{type_name(kind.kind)} has no binding {port!r}")
+            if target.is_dead and owner.parent is target.parent:
+                raise MechanismRefused(owner.path, f"its {port!r} would be bound to {target.path}, which has ended")
+            bound.setdefault(owner, {"peer"}).add(port)
+        for slot, name in woven.names.items():
+            cell, kind = self._cell(name), woven.places[slot].kind
+            left = sorted(set(kind._bindings) - bound.get(cell, set()))
+            if left:
+                raise MechanismRefused(cell.path, f"nothing would be bound to its {', '.join(left)}")
+
+    def _wiring(self, woven: Woven) -> list[tuple[Cell, str, Cell]]:
+        """All bindings of a stack: owner, port, target."""
+        node, names, layers = self.ctx.cell.node, woven.names, woven.layers
+        found: list[tuple[Cell, str, Cell]] = []
+        proxy = node.cell_at(f"{self._setting.address}/ftm/proxy")
+        state, server = self._cell(STATE), self._cell(SERVER)
+        cell = {slot: self._cell(name) for slot, name in names.items()}
+        # A mechanism that secures the links stands around the protocol, all others stand behind it.
+        is_secured = bool(layers) and layers[0].secures
+        gate = cell[f"{layers[0].name}.before"]
+        outlet = cell[f"{layers[0].name}.after"] if is_secured else proxy
+        entries = [cell[PROTOCOL if index == 0 else f"{one.name}.protocol"] for index, one in enumerate(layers)]
+        exits = [
+            entries[0] if is_secured and index == 0 else cell[f"{one.name}.after"] for index, one in enumerate(layers)
+        ]
+        found += [(entries[0], "gate", gate)]
+        for index, one in enumerate(layers):
+            protocol, before, after = entries[index], cell[f"{one.name}.before"], cell[f"{one.name}.after"]
+            onward = entries[index + 1] if index + 1 < len(layers) else cell["proceed"]
+            if is_secured and index == 0:
+                found += [
+                    (protocol, "before", onward),
+                    (protocol, "next", after),
+                    (before, "next", protocol),
+                    (after, "next", proxy),
+                ]
+            else:
+                found += [
+                    (protocol, "before", before),
+                    (protocol, "next", proxy if index == 0 else exits[index - 1]),
+                    (before, "next", onward),
+                    (after, "next", protocol),
+                ]
+            found += [(brick, "state", state) for brick in (protocol, before, after)]
+        proceed = cell["proceed"]
+        return [
+            *found,
+            (cell[PROTOCOL], "proceed", proceed),
+            (proceed, "next", exits[-1]),
+            (proceed, "server", server),
+            (proceed, "state", state),
+            (proceed, "out", outlet),
+        ]
+
+    # -- orders -----------------------------------------------------------------------------------------------------
+
+    @on(Assume)
+    async def _assume(self, message: Assume) -> None:
+        old = self._woven
+        places = weave(old.layers, leads=message.leads)
+        left = [name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]]
+        for name in left:  # What is in their mailboxes belongs to the time before.
+            await self._settled(name)
+        await self._end_bricks(left)  # First: the new ones have their names.
+        woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
+        await self._take_up(woven, leads=message.leads)
+
+    @on(Prepare)
+    async def _prepare(self, message: Prepare) -> Any:
+        try:
+            if self._prepared is not None:
+                await self._drop_prepared()
+            layers = nested(tuple(revive(one) for one in message.layers))
+            for one in layers:
+                one.check(self._recipe.kind, self._setting.address)
+            leads = self._standing.leads
+            self._prepared = await self._start_bricks(message.config, layers, leads=leads)
+            self._check_wiring(self._prepared)
+        except HoldfastError as error:
+            await self._drop_prepared()
+            return self._fail(error)
+        return None
+
+    @on(Commit)
+    async def _commit(self, message: Commit) -> Any:
+        woven, self._prepared = self._prepared, None
+        if self._woven.config == message.config:
+            return self._server.turn  # It was done already.
+        if woven is None or woven.config != message.config:
+            self._prepared = woven
+            return self._fail(MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared"))
+        await self._catch_up()
+        await self._take_up(woven, behind=True)
+        self._standing.peer_turn = -2  # What the other one has is not known to the new bricks.
+        return self._server.turn
+
+    async def _catch_up(self) -> None:
+        """Nothing is inside the one that leads, but a follower may be behind it."""
+        names = self._woven.names
+        for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
+            await self._settled(names[slot])
+        await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
+
+    @on(EndBricks)
+    async def _end(self, message: EndBricks) -> None:
+        await self._end_bricks(message.names)
+
+    @on(Abort)
+    async def _abort(self, message: Abort) -> None:
+        if self._prepared is not None and self._prepared.config == message.config:
+            await self._drop_prepared()
+
+    async def _drop_prepared(self) -> None:
+        woven, self._prepared = self._prepared, None
+        if woven is not None:
+            await self._end_bricks(woven.new)

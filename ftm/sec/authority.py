@@ -1,0 +1,128 @@
+"""The certification authority: an actor that issues, serves and revokes the certificates of one system (A68 to A70)."""
+
+from __future__ import annotations
+
+import datetime as dt
+import os
+
+from ...actors.actor import Actor, on
+from ...actors.message import Message
+from .certificates import LIFETIME, SKEW, about, issue, make_list, make_root, public_of, read_request
+from .errors import EnrolmentRefused, NoCertificate, Rejected
+from .keys import SigningKey, raw_public
+
+
+class GetRoot(Message[bytes]):
+    """The authority's own certificate."""
+
+
+class Enrol(Message[bytes]):
+    """Issue a certificate: `request` is from `make_request`. The reply is the certificate."""
+
+    request: bytes
+
+
+class GetCertificate(Message[bytes]):
+    """The newest valid certificate of a participant (A69)."""
+
+    name: str
+
+
+class Revoke(Message[int]):
+    """Revoke all certificates of a participant; the reply is how many that were. Its name is free for another key."""
+
+    name: str
+
+
+class GetRevocations(Message[bytes]):
+    """The list of revoked certificates, newly signed."""
+
+
+class CertificationAuthority(Actor):
+    """Issues certificates for names, each to one key at a time.
+
+    What it has issued and revoked are its key variables; its key is not. With a key of its own start (no `key_file`)
+    what an earlier life has issued is void, and forgotten.
+
+    Args:
+        key_file: where its key is, mode 0600; None: a new one at each start.
+        names: whom it issues certificates for; None: anybody, once.
+        lifetime_days: how long a certificate is valid.
+    """
+
+    deterministic = False  # Serial numbers and keys are random.
+    key_variables = ("root", "issued", "revoked", "list_number")
+
+    def __init__(
+        self,
+        key_file: str | os.PathLike[str] | None = None,
+        names: tuple[str, ...] | None = None,
+        lifetime_days: float = LIFETIME.days,
+    ) -> None:
+        self._key = SigningKey.per_start() if key_file is None else SigningKey.from_file(key_file)
+        self._names = names
+        self._lifetime = dt.timedelta(days=lifetime_days)
+        self.root = b""
+        self.issued: dict[str, list[tuple[int, bytes, bytes]]] = {}  # by name: serial, public key, certificate
+        self.revoked: dict[int, float] = {}
+        self.list_number = 0
+
+    def on_start(self, restored: bool) -> None:
+        if not self.root or public_of(self.root) != raw_public(self._key.public):
+            self.root = make_root(self._key, f"holdfast authority {self._key.fingerprint}", self.ctx.now())
+            self.issued, self.revoked = {}, {}
+
+    @on(GetRoot, readonly=True)
+    def _get_root(self, message: GetRoot) -> bytes:
+        return self.root
+
+    @on(Enrol)
+    def _enrol(self, message: Enrol) -> bytes:
+        try:
+            name, public = read_request(message.request)
+        except Rejected as error:
+            raise EnrolmentRefused("", str(error)) from None
+        if self._names is not None and name not in self._names:
+            raise EnrolmentRefused(name, "it is not among the names that certificates are issued for")
+        if any(key != public for _, key, _ in self._valid(name)):
+            raise EnrolmentRefused(name, "the name belongs to another key; revoke that one first")
+        self._forget_old(name)
+        certificate = issue(self._key, self.root, name, public, self.ctx.now(), self._lifetime)
+        self.issued.setdefault(name, []).append((about(certificate)[0], public, certificate))
+        return certificate
+
+    def _valid(self, name: str) -> list[tuple[int, bytes, bytes]]:
+        now = self.ctx.now()
+        return [
+            (serial, key, certificate)
+            for serial, key, certificate in self.issued.get(name, [])
+            if serial not in self.revoked and about(certificate)[1] > now
+        ]
+
+    def _forget_old(self, name: str) -> None:
+        """Of what nobody would accept any more nothing needs to be known; of what was revoked, that it was."""
+        now = self.ctx.now()
+        kept = [one for one in self.issued.get(name, []) if about(one[2])[1] > now - SKEW.total_seconds()]
+        for serial, _, _ in self.issued.get(name, []):
+            if serial not in [one[0] for one in kept]:
+                self.revoked.pop(serial, None)
+        self.issued[name] = kept
+
+    @on(GetCertificate, readonly=True)
+    def _get_certificate(self, message: GetCertificate) -> bytes:
+        valid = self._valid(message.name)
+        if not valid:
+            raise NoCertificate(message.name)
+        return valid[-1][2]
+
+    @on(Revoke)
+    def _revoke(self, message: Revoke) -> int:
+        valid = self._valid(message.name)
+        for serial, _, _ in valid:
+            self.revoked[serial] = self.ctx.now()
+        return len(valid)
+
+    @on(GetRevocations)
+    def _get_revocations(self, message: GetRevocations) -> bytes:
+        self.list_number += 1
+        return make_list(self._key, self.root, self.revoked, self.list_number, self.ctx.now())

@@ -1,0 +1,362 @@
+"""A secured link of one participant to others: sessions made when they are needed, frames until they are answered.
+
+Whoever sits between may alter, drop, replay and forge: what is refused or lost is sealed anew and sent again, and what
+comes twice is handled once, in order. A session is made for each pair of lives and each epoch, and when one is over.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import hashlib
+from collections import deque
+from typing import Any
+
+import msgspec
+
+from ...actors.errors import AskTimeout, HoldfastError
+from ...actors.message import Message, message_name
+from ..sealed import (
+    ORDERS,
+    TELLS,
+    Agree,
+    Back,
+    Call,
+    Greet,
+    Handle,
+    LinkLost,
+    Part,
+    Reach,
+    Refused,
+    Sealed,
+    Still,
+)
+from .errors import (
+    CLOSED,
+    MALFORMED,
+    REPLAYED,
+    UNTRUSTED,
+    WRONG_PEER,
+    WRONG_SESSION,
+    Rejected,
+)
+from .handshake import Participant, Response
+from .identity import End, Identity, certified, root_file
+from .keys import Secret
+from .session import HEAD, Session
+
+CALL, BACK = b"call", b"back"
+PLAIN, OUT_OF_ORDER = "plain", "out_of_order"
+FIRST_WAIT, LONGEST_WAIT = 0.5, 8.0
+"""Seconds until a frame that is not answered is sent again; doubled each time."""
+FIRST_PAUSE, LONGEST_PAUSE = 0.002, 0.25
+"""Seconds until a frame that was refused is sent again; the same."""
+MOST_BYTES = 1_000_000
+"""Of messages in one frame, if there are several."""
+MOST_REPLICAS = 64
+MOST_RESPONSES = 32
+"""Hand-shakes that others have begun, and not ended: the oldest are forgotten."""
+
+
+class Stream:
+    """Numbered calls of one kind, to or from one partner."""
+
+    __slots__ = ("answers", "floor", "next", "open")
+
+    def __init__(self) -> None:
+        self.next = self.floor = 0
+        self.open: set[int] = set()  # outward: those without an answer
+        self.answers: dict[int, asyncio.Future[Back]] = {}  # inward
+
+
+class Partner(Secret):
+    """Another participant, as this one knows it."""
+
+    __slots__ = ("inward", "life", "lock", "name", "outward", "pump", "queue", "session")
+
+    def __init__(self, path: str) -> None:
+        self.name = certified(path)
+        self.session: Session | None = None
+        self.lock = asyncio.Lock()
+        self.outward: dict[str, Stream] = {}
+        self.inward: dict[str, Stream] = {}
+        self.life = -1  # whose calls those are
+        self.queue: deque[tuple[Part, Reach, Still]] = deque()
+        self.pump: asyncio.Task[None] | None = None
+
+
+class Link(Identity):
+    """One end of secured links."""
+
+    def __init__(self, end: End) -> None:
+        super().__init__(end)
+        self._proxy = certified(f"{end.address}/ftm/proxy")
+        self._replicas = frozenset(certified(f"{end.address}/ftm/r{number}") for number in range(1, MOST_REPLICAS + 1))
+        self._partners: dict[str, Partner] = {}
+        self._sessions: dict[bytes, Session] = {}
+        self._responses: dict[bytes, Response] = {}
+        self._is_closed = False
+
+    # -- hand-shakes ------------------------------------------------------------------------------------------------
+
+    def _partner(self, path: str) -> Partner:
+        name = certified(path)
+        found = self._partners.get(name)
+        if found is None:
+            found = self._partners[name] = Partner(path)
+        return found
+
+    async def _session(self, partner: Partner, path: str, reach: Reach) -> Session:
+        """A session of this epoch and these lives."""
+        epoch = self._epoch()
+        async with partner.lock:
+            session = partner.session
+            if session is not None and session.is_open and session.epoch == epoch:
+                return session
+            if self._enrols is not None and partner.name not in self._enrolled:
+                await self._enrol(path)
+            me = await self._identity()
+            begun = me.begin(partner.name)
+            answer = await reach(Greet(begun.hello), FIRST_WAIT)
+            session, finish = begun.finish(answer)
+            await reach(Agree(digest_of(begun.hello), finish), FIRST_WAIT)
+            self._keep(partner, session)
+            return session
+
+    def _keep(self, partner: Partner, session: Session) -> None:
+        partner.session = session
+        self._sessions = {key: one for key, one in self._sessions.items() if one.is_open}
+        self._sessions[session.number] = session
+
+    async def greet(self, hello: bytes) -> bytes:
+        """Answer a hello. Nothing is believed yet.
+
+        Raises:
+            Refused: it is nobody's whom we know.
+        """
+        self._check_open()
+        try:
+            me = await self._identity()
+            try:
+                response = me.answer(hello)
+                self._check_peer(response.peer.name)
+            except Rejected as error:
+                if error.reason != UNTRUSTED or not self._has_other_root(me):
+                    raise
+                self._me = None  # The authority has begun a new life, with another key.
+                response = (await self._identity()).answer(hello)
+                self._check_peer(response.peer.name)
+        except Rejected as error:
+            raise self._refused(error.reason) from None
+        except (HoldfastError, OSError) as error:
+            raise Refused(path=self.path, reason=f"no certificate: {error}") from None
+        while len(self._responses) >= MOST_RESPONSES:
+            del self._responses[next(iter(self._responses))]
+        self._responses[digest_of(hello)] = response
+        return response.answer
+
+    def _check_peer(self, name: str) -> None:
+        """Who has a certificate may still have no business here."""
+        if name not in self._replicas and (self._enrols is not None or name != self._proxy):
+            self.rejected[WRONG_PEER] += 1
+            raise Rejected(WRONG_PEER, f"a hand-shake of {name!r}")
+
+    def _may(self, name: str, stream: str) -> bool:
+        """Whether this participant may say such things: orders and requests are the proxy's."""
+        if self._enrols is not None:
+            return name in self._replicas and stream == TELLS
+        return name == self._proxy if stream in (TELLS, ORDERS) else name in self._replicas
+
+    def _has_other_root(self, me: Participant) -> bool:
+        file = root_file(self.mechanism.keys, self.mechanism.authority)
+        return self._enrols is None and file.read_bytes() != me.trust.root
+
+    async def agree(self, hello: bytes, finish: bytes) -> None:
+        """Complete a hand-shake that another has begun.
+
+        Raises:
+            Refused: it is not the one it says.
+        """
+        self._check_open()
+        response = self._responses.pop(hello, None)
+        if response is None:
+            raise self._refused(CLOSED, counts=True)
+        try:
+            session = response.complete(finish)
+        except Rejected as error:
+            raise self._refused(error.reason) from None
+        name = session.peer.name
+        partner = self._partners.get(name)
+        if partner is None:
+            partner = self._partners[name] = Partner(name)
+        self._keep(partner, session)
+
+    # -- out --------------------------------------------------------------------------------------------------------
+
+    def tell(self, path: str, message: Message[Any], reach: Reach, still: Still) -> None:
+        """Bring a message there, once, behind those that were told before; `still` says whether it is wanted."""
+        if self._is_closed:
+            return
+        partner = self._partner(path)
+        partner.queue.append((self._part(message), reach, still))
+        if partner.pump is None:
+            partner.pump = self._node.loop.create_task(self._send_all(partner, path), context=contextvars.Context())
+
+    def _part(self, message: Message[Any]) -> Part:
+        return Part(message_name(type(message)), self._node.codec.encode(message, self._address))
+
+    async def _send_all(self, partner: Partner, path: str) -> None:
+        queue = partner.queue
+        try:
+            while queue and not self._is_closed:
+                part, reach, still = queue.popleft()
+                parts, size = [part], len(part.body)
+                while queue and size + len(queue[0][0].body) < MOST_BYTES:
+                    part, reach, still = queue.popleft()
+                    parts.append(part)
+                    size += len(part.body)
+                try:
+                    await self._call(partner, path, TELLS, parts, reach, still)
+                except LinkLost:
+                    continue
+        finally:
+            partner.pump = None
+
+    async def call(
+        self, path: str, stream: str, part: Part, reach: Reach, still: Still, epoch: int = -1, config: int = -1
+    ) -> Back:
+        """Ask something until the answer comes.
+
+        Raises:
+            LinkLost: nobody waits for it any longer.
+        """
+        return await self._call(self._partner(path), path, stream, [part], reach, still, epoch, config)
+
+    async def _call(
+        self,
+        partner: Partner,
+        path: str,
+        name: str,
+        parts: list[Part],
+        reach: Reach,
+        still: Still,
+        epoch: int = -1,
+        config: int = -1,
+    ) -> Back:
+        stream = partner.outward.setdefault(name, Stream())
+        number, stream.next = stream.next, stream.next + 1
+        stream.open.add(number)
+        wait, pause = FIRST_WAIT, FIRST_PAUSE
+        try:
+            while still() and not self._is_closed:
+                session: Session | None = None
+                try:
+                    session = await self._session(partner, path, reach)
+                    text = msgspec.msgpack.encode(Call(name, number, min(stream.open), parts, epoch, config))
+                    reply = await reach(Sealed(session.seal(text, CALL)), wait)
+                    opened = session.open(reply, BACK + number.to_bytes(8, "big"))
+                    return msgspec.msgpack.decode(opened, type=Back)
+                except AskTimeout:
+                    wait = min(2 * wait, LONGEST_WAIT)
+                    continue
+                except Rejected as error:
+                    self._refuse(error.reason)
+                except Refused as no:
+                    if no.reason != OUT_OF_ORDER and session is not None and partner.session is session:
+                        partner.session = None  # The other end may have none.
+                except HoldfastError:
+                    pass  # It is between two lives, or at its end, which whoever asks is told.
+                await asyncio.sleep(pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
+            raise LinkLost(path)
+        finally:
+            stream.open.discard(number)
+
+    # -- in ---------------------------------------------------------------------------------------------------------
+
+    async def take(self, frame: bytes, handle: Handle) -> bytes:
+        """Open a frame, and have what is in it done once; the reply is sealed.
+
+        Raises:
+            Refused: it is not from whom it says, was here before, or its time has not come.
+        """
+        self._check_open()
+        me = self._me
+        if me is not None:
+            me.raise_epoch(self._epoch())
+        session = self._sessions.get(bytes(frame[1:9])) if len(frame) >= HEAD.size else None
+        if session is None:
+            raise self._refused(WRONG_SESSION, counts=True)
+        try:
+            call = msgspec.msgpack.decode(session.open(frame, CALL), type=Call)
+        except Rejected as error:
+            raise self._refused(error.reason) from None
+        except msgspec.MsgspecError:
+            raise self._refused(MALFORMED, counts=True) from None
+        if not self._may(session.peer.name, call.stream):
+            raise self._refused(WRONG_PEER, counts=True)
+        back = await self._once(session, call, handle)
+        try:
+            return session.seal(msgspec.msgpack.encode(back), BACK + call.number.to_bytes(8, "big"))
+        except Rejected as error:  # The epoch has ended meanwhile: it is asked again.
+            raise Refused(path=self.path, reason=error.reason) from None
+
+    async def _once(self, session: Session, call: Call, handle: Handle) -> Back:
+        partner = self._partners[session.peer.name]
+        if session.incarnation != partner.life:
+            partner.life, partner.inward = session.incarnation, {}
+        stream = partner.inward.setdefault(call.stream, Stream())
+        known = stream.answers.get(call.number)
+        if known is not None:
+            return await asyncio.shield(known)
+        if call.number < stream.floor:
+            raise self._refused(REPLAYED, counts=True)
+        if call.floor > stream.floor:
+            stream.floor = call.floor
+            stream.answers = {key: one for key, one in stream.answers.items() if key >= call.floor}
+        stream.next = max(stream.next, stream.floor)
+        if call.stream != ORDERS and call.number > stream.next:
+            raise Refused(path=self.path, reason=OUT_OF_ORDER)  # One before it was lost, and comes again.
+        answer: asyncio.Future[Back] = self._node.loop.create_future()
+        stream.answers[call.number] = answer
+        before, stream.next = stream.next, max(stream.next, call.number + 1)
+        try:
+            back = await handle(call)
+        except BaseException:
+            stream.answers.pop(call.number, None)
+            stream.next = min(stream.next, before) if call.number == before else stream.next
+            answer.cancel()
+            raise
+        answer.set_result(back)
+        return back
+
+    def plain(self) -> None:
+        """Something came that was not sealed."""
+        self.rejected[PLAIN] += 1
+        self._refuse(PLAIN)
+
+    def _refused(self, reason: str, *, counts: bool = False) -> Refused:
+        if counts:
+            self.rejected[reason] += 1
+        self._refuse(reason)
+        return Refused(path=self.path, reason=reason)
+
+    def _check_open(self) -> None:
+        if self._is_closed:
+            raise Refused(path=self.path, reason=CLOSED)
+
+    def close(self) -> None:
+        """End all sessions; nothing is sent or accepted any more."""
+        self._is_closed = True
+        for session in self._sessions.values():
+            session.close()
+        self._sessions.clear()
+        self._responses.clear()
+        for partner in self._partners.values():
+            partner.session = None
+            partner.queue.clear()
+
+
+def digest_of(hello: bytes) -> bytes:
+    """What a hand-shake is known by."""
+    return hashlib.sha256(hello).digest()

@@ -1,0 +1,115 @@
+"""Which mechanisms addresses have instead of those that their specs declare: kept in the store, for the next root.
+
+One note holds all of them, so that a transaction that changes several is there as a whole or not at all: a root that
+dies in the middle of one leaves everything as it was. Another note says what was under way then.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ..actors.errors import SpecError
+from ..actors.events import Event
+
+if TYPE_CHECKING:
+    from ..checkpoint.homes import Homes
+    from ..supervision.spec import ChildSpec
+
+KEPT = "mechanisms"
+"""The note with what there is."""
+UNDER_WAY = "adapting "
+"""How the notes begin that say at which address a change was under way."""
+
+
+class AdaptationUndone(Event, frozen=True, eq=False):
+    """The last root has died while it changed the mechanism of this address: it is as it was before."""
+
+    step: str
+
+
+class Protection:
+    """What the mechanisms of addresses have become; `completing` gives them to the specs of this root."""
+
+    def __init__(self, homes: Homes) -> None:
+        self._homes = homes
+        found = homes.notes(KEPT).get(KEPT)
+        self._kept: dict[str, tuple[Any, Any]] = msgspec.msgpack.decode(found) if found else {}
+        self._loaded = set(self._kept)  # those that no spec has got yet
+        self._is_dirty = False
+        for key, step in homes.notes(UNDER_WAY).items():
+            homes.note(key, None)
+            homes.node.emit(AdaptationUndone(key.removeprefix(UNDER_WAY), step.decode()))
+
+    @property
+    def is_needed(self) -> bool:
+        """Whether any spec of this root has to be completed."""
+        return bool(self._loaded)
+
+    def completing(self, complete: Callable[[Any, str], Any]) -> Callable[[Any, str], Any]:
+        """Have each spec completed by this too."""
+        return lambda spec, address: self._completed(complete(spec, address), address)
+
+    def _completed(self, spec: ChildSpec, address: str) -> ChildSpec:
+        """A spec with the mechanism that the address had when the last root ended.
+
+        Raises:
+            SpecError: that mechanism cannot be had any more.
+        """
+        if address not in self._loaded:
+            return spec
+        from ..ftm.mechanism import Description, MechanismRefused, revive
+
+        self._loaded.discard(address)
+        declared, current = self._kept[address]
+        if _data(spec.mechanism) != declared:  # The program says something else now: that is newer.
+            self.forget(address)
+            return spec
+        try:
+            layers = tuple(map(revive, msgspec.convert(current or [], list[Description])))
+        except MechanismRefused as error:
+            raise SpecError(address, f"the mechanism that it had cannot be had any more: {error}") from error
+        mechanism = None if not layers else layers[0] if len(layers) == 1 else layers
+        return dataclasses.replace(spec, mechanism=mechanism)
+
+    def put(self, address: str, before: Any, after: Any) -> None:
+        """The address has another mechanism from now on; kept with all others by the next `flush`."""
+        declared = self._kept[address][0] if address in self._kept else _data(before)
+        current = _data(after)
+        self._kept.pop(address, None)
+        if current != declared:
+            self._kept[address] = (declared, current)
+        self._is_dirty = True
+
+    def forget(self, address: str) -> None:
+        """Whoever lives there next has what its spec says."""
+        if self._kept.pop(address, None) is not None:
+            self._is_dirty = True
+            self._loaded.discard(address)
+            self.flush()
+
+    def flush(self) -> None:
+        """Keep what there is."""
+        if self._is_dirty:
+            self._is_dirty = False
+            self._homes.note(KEPT, msgspec.msgpack.encode(self._kept) if self._kept else None)
+
+    def begun(self, address: str, step: str) -> None:
+        """A change is under way."""
+        self._homes.note(UNDER_WAY + address, step.encode())
+
+    def over(self, address: str) -> None:
+        """It is over, either way."""
+        if UNDER_WAY + address in self._homes.notes(UNDER_WAY + address):
+            self._homes.note(UNDER_WAY + address, None)
+
+
+def _data(mechanism: Any) -> Any:
+    """Layers as plain data; None if there are none."""
+    if mechanism is None:
+        return None
+    layers = mechanism if isinstance(mechanism, tuple) else (mechanism,)
+    return msgspec.msgpack.decode(msgspec.msgpack.encode([layer.describe() for layer in layers]))

@@ -1,0 +1,138 @@
+"""Soak: mechanisms come, change and go every 200 ms under full load, while replicas are killed."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import os
+import random
+import signal
+from collections import Counter as Tally
+from typing import Any
+
+import holdfast as hf
+from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
+from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.messages import Done
+from tests.ftm.accounts import Counter
+from tests.ftm.campaign import group_of, running, whole
+from tests.ftm.workloads import Bad, Counting
+
+PAUSE = 0.2
+
+
+class Renewed(Checkpointing):
+    """New code for a brick, which does the same."""
+
+    async def after(self, done: Done) -> Done | None:
+        return await super().after(done)
+
+
+@dataclasses.dataclass
+class Found:
+    """What a soak has come to."""
+
+    bad: Bad
+    requests: int
+    failed: int
+    kills: int
+    done: Tally[str]
+    refused: Tally[str]
+
+    def __str__(self) -> str:
+        return (
+            f"{self.requests} requests, {self.kills} kills, {self.done.total()} changes {dict(self.done)}, "
+            f"{self.refused.total()} rolled back {dict(self.refused)}; failed {self.failed}, "
+            f"lost {len(self.bad.lost)}, "
+            f"wrong {len(self.bad.wrong)}, twice {len(self.bad.doubled)}"
+        )
+
+
+class Plain(Counting):
+    """The counter, without a mechanism to begin with."""
+
+    async def start(self, system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
+        self.ref = await system.start(hf.child("c", hf.start(Counter)))
+        return self.ref
+
+
+class Changes:
+    """One random change after the other, that makes sense for what stands there."""
+
+    def __init__(self, system: hf.ActorSystem, ref: hf.ActorRef[Any], rng: random.Random) -> None:
+        self._system, self._ref, self._rng = system, ref, rng
+        self.done, self.refused = Tally[str](), Tally[str]()
+        self.why: list[str] = []
+
+    def _choices(self) -> dict[str, Any]:
+        ref, group = self._ref, group_of(self._ref)
+        if group is None:
+            stack = self._rng.choice(((PBR(),), (LFR(),), (PBR(), TR()), (LFR(), TR())))
+            return {"attach": lambda change: change.attach(ref, stack)}
+        found: Any = ref._cell.host
+        names = [one.name for one in found.layers]
+        choices: dict[str, Any] = {
+            "detach": lambda change: change.detach(ref),
+            "transition": lambda change: change.transition(ref, LFR() if "pbr" in names else PBR()),
+        }
+        if "tr" in names:
+            choices["detach a layer"] = lambda change: change.detach(ref, "tr")
+        else:
+            choices["compose"] = lambda change: change.compose(ref, TR())
+        if "pbr" in names:
+            new = {"mechanism": "pbr", "role": "primary"}
+            choices["update"] = lambda change: change.update(ref, "after", Renewed, **new)
+        return choices
+
+    async def one(self) -> None:
+        choices = self._choices()
+        name = self._rng.choice(sorted(choices))
+        try:
+            async with self._system.transaction(timeout=20) as change:
+                choices[name](change)
+        except hf.HoldfastError as error:
+            self.refused[name] += 1
+            self.why.append(f"{name}: {error!r}"[:300])
+        else:
+            self.done[name] += 1
+
+
+async def run(seconds: float, rng: random.Random) -> Found:
+    """Soak for so long."""
+    async with running() as system:
+        load = Plain(30.0, rng)
+        ref = await load.start(system, None)
+        load.begin()
+        changes, loop = Changes(system, ref, rng), asyncio.get_running_loop()
+        end, kills = loop.time() + seconds, 0
+
+        async def kill() -> None:
+            nonlocal kills
+            while loop.time() < end:
+                await asyncio.sleep(rng.uniform(0.1, 0.8))
+                group = group_of(ref)
+                if group is None or group.primary is None or not all(map(group.is_well, group.names)):
+                    continue  # One at a time: two are more than these mechanisms mask.
+                pid = system._workers.processes().get(f"{ref.path}/ftm/{rng.choice(group.names)}")
+                if pid is not None and len(group.names) > 1:
+                    kills += 1
+                    os.kill(pid, signal.SIGKILL)
+
+        killing = asyncio.create_task(kill())
+        while loop.time() < end:
+            began = loop.time()
+            await changes.one()
+            await asyncio.sleep(max(0.0, PAUSE - (loop.time() - began)))
+        await killing
+        await load.reached(20)
+        if group_of(ref) is not None:
+            await whole(ref)
+        await load.stop()
+        bad = await load.bad()
+        if load.failed:
+            bad.lost.extend(load.failed)
+            changes.why.append(repr(next(iter(load.failed.values()))))
+    for line in changes.why[:10]:
+        print(f"#   {line}")
+    return Found(bad, load.sent, len(load.failed), kills, changes.done, changes.refused)

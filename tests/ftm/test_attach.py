@@ -1,0 +1,277 @@
+"""A mechanism is attached to a live actor and detached from it: its life goes on, under load, with all that it had."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.actors.process.remote import ProcessHost
+from holdfast.ftm.events import MechanismAttached, MechanismDetached
+from holdfast.ftm.host import GroupHost
+from holdfast.ftm.mechanism import MechanismRefused
+from holdfast.ftm.mechanisms.pbr import PBR
+from tests.ftm.accounts import Account, Add, Closed, Counter, Fussy, Later, Load, Pay, Purse, Tags, Total
+from tests.ftm.test_failover import METHODS, group_of, pid_of, two_again
+
+# A refused or failed transaction ends with its block.
+# ruff: noqa: PT012
+
+
+async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any], mechanism: Any = None) -> None:
+    async with system.transaction(timeout=30) as change:
+        change.attach(ref, mechanism or PBR())
+
+
+async def detach(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    async with system.transaction(timeout=30) as change:
+        change.detach(ref)
+
+
+@pytest.fixture(params=METHODS)
+def recovery(request: pytest.FixtureRequest) -> Any:
+    return METHODS[request.param]()
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_attached_and_detached_under_load_nothing_is_lost(
+    system: hf.ActorSystem, recovery: Any, isolation: Any
+) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery, isolation=isolation))
+    load, events = Load(ref), system.events()
+    for _ in range(2):
+        await load.reached(30)
+        await attach(system, ref)
+        assert isinstance(ref._cell.host, GroupHost)
+        await load.reached(30)
+        await detach(system, ref)
+        assert isinstance(ref._cell.host, ProcessHost) is (isolation == "process")
+        assert not [path for path in system.tree() if path.startswith(f"{ref.path}/ftm")] or await gone(system, ref)
+    await load.reached(30)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    seen = [type(event) for event in events.take() if isinstance(event, (MechanismAttached, MechanismDetached))]
+    assert seen == [MechanismAttached, MechanismDetached] * 2
+    assert ref._cell.life == 1
+    events.close()
+
+
+async def gone(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> bool:
+    async with asyncio.timeout(10):
+        while any(path.startswith(f"{ref.path}/ftm") for path in system.tree()):
+            await asyncio.sleep(0.005)
+    return True
+
+
+async def test_an_attached_actor_survives_the_death_of_its_primary(system: hf.ActorSystem, recovery: Any) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery))
+    load = Load(ref)
+    await load.reached(30)
+    await attach(system, ref)
+    primary = group_of(ref).primary
+    assert primary is not None
+    os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    await load.reached(30)
+    await two_again(ref)
+    await detach(system, ref)
+    await load.reached(30)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+
+
+async def test_its_next_lives_are_protected_too_and_not_after_a_detach(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid()))
+    await attach(system, ref)
+    assert await ref.ask(Add(0)) == 1
+    await system.terminate(ref)
+    async with asyncio.timeout(30):
+        while ref._cell.life < 2:
+            await asyncio.sleep(0.005)
+    assert await ref.ask(Add(1), timeout=30) == 2
+    assert isinstance(ref._cell.host, GroupHost)
+    await two_again(ref)
+    await detach(system, ref)
+    await system.terminate(ref)
+    assert await ref.ask(Add(2), timeout=30) == 3
+    assert not isinstance(ref._cell.host, GroupHost)
+
+
+async def test_timers_come_along(system: hf.ActorSystem, recovery: Any) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery))
+    await ref.ask(Later(1.0, 1))
+    await ref.ask(Later(2.5, 2))
+    await attach(system, ref)
+    async with asyncio.timeout(20):
+        while (await ref.ask(Tags()))[:1] != [1]:
+            await asyncio.sleep(0.01)
+    await detach(system, ref)
+    async with asyncio.timeout(20):
+        while await ref.ask(Tags()) != [1, 2]:
+            await asyncio.sleep(0.01)
+
+
+async def test_a_transaction_that_fails_behind_it_detaches_it_again(system: hf.ActorSystem, recovery: Any) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery))
+    load = Load(ref)
+    await load.reached(10)
+    with pytest.raises(hf.TransactionFailed):
+        async with system.transaction(timeout=30) as change:
+            change.attach(ref, PBR())
+            change.add("/app", hf.child("bad", hf.start(Failing)))
+    assert not isinstance(ref._cell.host, GroupHost)
+    assert ref._cell.spec.mechanism is None
+    await load.reached(10)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+
+
+class Failing(hf.Actor):
+    def on_start(self, restored: bool) -> None:
+        raise RuntimeError("no")
+
+
+class Hidden(Counter):
+    """Keeps what no other process could take over."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lock = asyncio.Lock()
+
+
+async def test_an_actor_that_cannot_leave_goes_on_as_it_was(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Hidden)))
+    load = Load(ref)
+    await load.reached(10)
+    with pytest.raises(hf.TransactionFailed, match="lock"):
+        await attach(system, ref)
+    await load.reached(10)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert not isinstance(ref._cell.host, GroupHost)
+
+
+async def test_what_a_mechanism_needs_is_checked_before_anything_is_done(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Closed)))
+    with pytest.raises(hf.TransactionRefused, match="state_access"):
+        await attach(system, ref)
+    with pytest.raises(MechanismRefused, match="state_access"):
+        hf.child("bob", hf.start(Closed), mechanism=PBR())
+    with pytest.raises(hf.SpecError, match="mechanism must be"):
+        hf.child("bob", hf.start(Counter), mechanism="pbr")
+    with pytest.raises(hf.SpecError, match="supervisor"):
+        hf.child("bob", hf.start(hf.Supervisor), mechanism=PBR())
+    with pytest.raises(hf.TransactionRefused, match="no mechanism"):
+        await detach(system, ref)
+
+
+async def test_attached_twice_is_refused_and_a_dry_run_changes_nothing(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter)))
+    async with system.transaction(dry_run=True) as change:
+        change.attach(ref, PBR())
+    assert "attach PBR to /app/alice" in change.describe()
+    assert not isinstance(ref._cell.host, GroupHost)
+    await attach(system, ref)
+    with pytest.raises(hf.TransactionRefused, match="already"):
+        await attach(system, ref)
+    assert await ref.ask(Total()) == 0
+
+
+async def test_if_the_new_life_cannot_begin_the_old_one_goes_on(
+    system: hf.ActorSystem, recovery: Any, tmp_path: Path
+) -> None:
+    veto = tmp_path / "veto"
+    ref = await system.start(hf.child("alice", hf.start(Fussy, str(veto)), recovery=recovery))
+    load = Load(ref)
+    await load.reached(10)
+    veto.touch()
+    with pytest.raises(hf.TransactionFailed):
+        await attach(system, ref)
+    assert not isinstance(ref._cell.host, GroupHost)
+    await load.reached(10)
+    veto.unlink()
+    await attach(system, ref)
+    await load.reached(10)
+    veto.touch()
+    with pytest.raises(hf.TransactionFailed, match="could not begin"):
+        await detach(system, ref)
+    assert isinstance(ref._cell.host, GroupHost)
+    await load.reached(10)
+    veto.unlink()
+    await detach(system, ref)
+    await load.reached(10)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert ref._cell.life == 1
+
+
+async def test_a_protected_actor_is_not_moved_by_anything_else(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
+    with pytest.raises(hf.CannotMove, match="detach"):
+        await system.set_isolation(ref, "process")
+    for step in (lambda change: change.replace_state(ref, dict), lambda change: change.isolation(ref, "process")):
+        with pytest.raises(hf.TransactionRefused, match="detach"):
+            async with system.transaction() as change:
+                step(change)
+    assert await ref.ask(Add(0)) == 1
+
+
+async def test_a_binding_is_that_of_every_replica_from_now_on(system: hf.ActorSystem) -> None:
+    one = await system.start(hf.child("one", hf.start(Account, 0)))
+    two = await system.start(hf.child("two", hf.start(Account, 1000)))
+    ref = await system.start(hf.child("alice", hf.start(Purse), mechanism=PBR(), bindings={"account": one.path}))
+    assert await ref.ask(Pay(1)) == 1
+    system.bind(ref, "account", two)
+    assert await ref.ask(Pay(1)) == 1001
+    for total in (1002, 1003):
+        primary = group_of(ref).primary
+        assert primary is not None
+        os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+        assert await ref.ask(Pay(1), timeout=30) == total
+        await two_again(ref)
+
+
+class Hold(hf.Message[bool]):
+    seconds: float
+
+
+class Busy(Counter):
+    """Takes its time, and traps exits once it has been told to."""
+
+    @hf.on(Hold)
+    async def hold(self, message: Hold) -> bool:
+        await asyncio.sleep(message.seconds)
+        had, self.ctx.trap_exits = self.ctx.trap_exits, True
+        return had
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("method", ["without recovery", "hybrid"])
+async def test_whether_it_traps_exits_comes_along(system: hf.ActorSystem, method: str) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Busy), recovery=METHODS[method]()))
+    assert await ref.ask(Hold(0.0)) is False
+    await attach(system, ref)
+    assert await ref.ask(Hold(0.0)) is True
+    primary = group_of(ref).primary
+    assert primary is not None
+    os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    assert await ref.ask(Hold(0.0), timeout=30) is True
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("method", ["without recovery", "hybrid"])
+async def test_those_that_wait_for_room_come_along(system: hf.ActorSystem, method: str) -> None:
+    spec = hf.child("alice", hf.start(Busy), mailbox=hf.bounded(2), recovery=METHODS[method]())
+    ref = await system.start(spec)
+    held = asyncio.ensure_future(ref.ask(Hold(0.3)))
+    asks = [asyncio.ensure_future(ref.ask(Add(tag), timeout=30)) for tag in range(8)]
+    await asyncio.sleep(0.05)
+    await attach(system, ref)
+    assert isinstance(ref._cell.host, GroupHost)
+    await held
+    assert sorted(await asyncio.gather(*asks)) == list(range(1, 9))
+    assert sorted(await ref.ask(Tags())) == list(range(8))

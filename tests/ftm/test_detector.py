@@ -1,0 +1,169 @@
+"""The failure detector: silence is judged by what heartbeats did before, and the observer's own lag is taken out."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import holdfast as hf
+from holdfast.actors.actor import Start
+from holdfast.ftm.detector import HIGHEST, Accrual, Detection, Detector, OwnClock
+from holdfast.ftm.orders import Beat
+
+DETECTION = Detection(interval=0.05, threshold=8.0, pause=0.2, spread=0.01)
+
+
+def silence(accrual: Accrual, since: float) -> float:
+    """Seconds of silence after which it is suspected."""
+    late = 0.0
+    while not accrual.is_suspect(since + late):
+        late += 0.001
+    return late
+
+
+def after(gaps: list[float]) -> tuple[Accrual, float]:
+    now = 0.0
+    accrual = Accrual(DETECTION, now)
+    for gap in gaps:
+        now += gap
+        accrual.heard(now)
+    return accrual, now
+
+
+def test_a_silent_replica_is_suspected_soon_and_a_beating_one_never() -> None:
+    accrual, now = after([0.05] * 100)
+    assert not any(accrual.is_suspect(now + late / 1000) for late in range(250))
+    assert 0.25 < silence(accrual, now) < 0.35
+
+
+def test_more_is_put_up_with_from_a_replica_whose_heartbeats_vary() -> None:
+    rng = random.Random(7)
+    even, at = after([0.05] * 200)
+    uneven, when = after([rng.uniform(0.01, 0.25) for _ in range(200)])
+    assert silence(uneven, when) > silence(even, at) + 0.2
+
+
+def test_old_heartbeats_are_forgotten() -> None:
+    calm, now = after([0.4] * 300 + [0.05] * 300)
+    assert silence(calm, now) < 0.35
+
+
+def test_phi_has_an_end() -> None:
+    accrual, now = after([0.05] * 10)
+    assert accrual.phi(now + 1e6) == HIGHEST
+
+
+@given(st.lists(st.floats(0.0, 5.0), min_size=1, max_size=300), st.floats(0.0, 3.0), st.floats(0.0, 3.0))
+def test_phi_only_grows_with_silence(gaps: list[float], first: float, more: float) -> None:
+    accrual, now = after(gaps)
+    assert accrual.phi(now + first) <= accrual.phi(now + first + more)
+
+
+@given(st.lists(st.floats(0.0, 10.0), max_size=50))
+def test_the_own_clock_takes_out_just_what_the_observer_was_late(waits: list[float]) -> None:
+    period, now = 0.025, 0.0
+    clock = OwnClock(now, period)
+    for wait in waits:
+        now += wait
+        own = clock.tick(now)
+        assert own + clock.lag == pytest.approx(now)
+    assert clock.at(now) <= clock.at(now + 100.0) <= clock.at(now) + period
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"interval": 0.0}, {"threshold": -1.0}, {"pause": float("nan")}, {"spread": True}, {"interval": "1"}]
+)
+def test_settings_that_cannot_be_are_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(hf.SpecError, match=next(iter(wrong))):
+        Detection(**wrong)  # type: ignore[arg-type]
+
+
+class Watched:
+    """What a detector knows of two replicas: stands in for a group, which needs processes."""
+
+    def __init__(self) -> None:
+        self.detection = DETECTION
+        self.up: dict[str, int] = {}
+        self.lives = {"r1": 1, "r2": 1}
+        self.suspects: list[tuple[str, int, float]] = []
+        self.loop = asyncio.get_running_loop()
+
+    def life_of(self, name: str) -> int:
+        return self.lives[name]
+
+    def heard(self, name: str, life: int) -> None:
+        self.up[name] = life
+
+    def watched(self) -> list[tuple[str, int]]:
+        known = {(name, life) for name, life, _ in self.suspects}
+        return [one for one in self.up.items() if one not in known]
+
+    def suspect(self, name: str, life: int, why: str) -> None:
+        self.suspects.append((name, life, self.loop.time()))
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_who_falls_silent_is_suspected_and_the_other_is_not() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        detector = system.spawn(Start(Detector, (watched,)))
+        for beat in range(100):
+            detector.tell(Beat("r1", 1))
+            if beat < 50:
+                detector.tell(Beat("r2", 1))
+            await asyncio.sleep(DETECTION.interval)
+        assert [name for name, _, _ in watched.suspects] == ["r2"]
+        assert watched.suspects[0][2] - 0.0 > 2.4
+        await system.stop(detector)
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_new_life_of_a_suspect_is_judged_anew() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        detector = system.spawn(Start(Detector, (watched,)))
+        detector.tell(Beat("r1", 1))
+        await asyncio.sleep(2.0)
+        assert [one[:2] for one in watched.suspects] == [("r1", 1)]
+        watched.lives["r1"] = 2
+        detector.tell(Beat("r1", 1))
+        await asyncio.sleep(0.1)
+        assert len(watched.suspects) == 1
+        await asyncio.sleep(2.0)
+        assert [one[:2] for one in watched.suspects] == [("r1", 1), ("r1", 2)]
+        await system.stop(detector)
+
+
+async def test_an_observer_that_was_held_up_suspects_nobody() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        detector = system.spawn(Start(Detector, (watched,)))
+        loop = asyncio.get_running_loop()
+        for _ in range(10):
+            detector.tell(Beat("r1", 1))
+            await asyncio.sleep(DETECTION.interval)
+        end = loop.time() + 1.0
+        while loop.time() < end:  # Nothing else runs in this process meanwhile: no beat can be heard.
+            pass
+        detector.tell(Beat("r1", 1))
+        for _ in range(4):
+            await asyncio.sleep(DETECTION.interval)
+            detector.tell(Beat("r1", 1))
+        assert watched.suspects == []
+        await system.stop(detector)
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_killed_detector_suspects_nobody_any_more() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        detector = system.spawn(Start(Detector, (watched,)))
+        detector.tell(Beat("r1", 1))
+        await asyncio.sleep(0.1)
+        detector._cell.kill()
+        await asyncio.sleep(10.0)
+        assert watched.suspects == []

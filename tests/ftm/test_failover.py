@@ -1,0 +1,496 @@
+"""Failover with real processes: whatever dies, and at whatever step, nothing is lost, wrong or done twice."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm.events import FailedOver, ReplicaJoined, WrongSuspicion
+from holdfast.ftm.group import Group
+from holdfast.ftm.host import GroupHost
+from holdfast.ftm.mechanisms.pbr import PBR
+from tests.ftm.accounts import (
+    Account,
+    Add,
+    Bank,
+    Boom,
+    Counter,
+    Die,
+    Leave,
+    Load,
+    Put,
+    Tags,
+    Total,
+    Transfer,
+)
+
+SEED = int(os.environ.get("HOLDFAST_SEED", "20261121"))
+METHODS = {
+    "without recovery": lambda: None,
+    "hybrid": lambda: hf.hybrid(interval=0.05),
+    "replay_only": hf.replay_only,
+    "checkpoint_only": lambda: hf.checkpoint_only(interval=0.05),
+}
+PARTS = ("proxy", "detector", "failover", "join")
+
+
+def group_of(ref: hf.ActorRef[Any]) -> Group:
+    host = ref._cell.host
+    assert isinstance(host, GroupHost)
+    assert host.group is not None
+    return host.group
+
+
+def pid_of(system: hf.ActorSystem, ref: hf.ActorRef[Any], name: str) -> int:
+    """The process of one replica."""
+    return system._workers.processes()[f"{ref.path}/ftm/{name}"]
+
+
+def other(group: Group) -> str:
+    """The replica that does not lead."""
+    return next(name for name in group.names if name != group.primary)
+
+
+async def started(system: hf.ActorSystem, recipe: Any = None, **options: Any) -> hf.ActorRef[Any]:
+    spec = hf.child("alice", recipe or hf.start(Counter), mechanism=PBR(), **options)
+    return await system.start(spec)
+
+
+async def two_again(ref: hf.ActorRef[Any]) -> None:
+    """Wait until the group is complete."""
+    async with asyncio.timeout(30):
+        while not is_complete(ref):
+            await asyncio.sleep(0.005)
+
+
+def is_complete(ref: hf.ActorRef[Any]) -> bool:
+    host = ref._cell.host
+    group = host.group if isinstance(host, GroupHost) else None
+    return group is not None and group.primary is not None and all(map(group.is_well, group.names))
+
+
+def stopped(pid: int) -> bool:
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "T"
+
+
+async def stop_process(pid: int) -> None:
+    os.kill(pid, signal.SIGSTOP)
+    async with asyncio.timeout(5):
+        while not stopped(pid):
+            await asyncio.sleep(0.001)
+
+
+@pytest.mark.parametrize("method", METHODS)
+async def test_a_protected_actor_answers_as_an_ordinary_one(system: hf.ActorSystem, method: str) -> None:
+    ref = await started(system, hf.start(Counter, 10), recovery=METHODS[method]())
+    assert [await ref.ask(Add(tag)) for tag in range(5)] == [11, 12, 13, 14, 15]
+    assert await ref.ask(Tags()) == [0, 1, 2, 3, 4]
+    with pytest.raises(hf.RemoteCrash, match="boom"):
+        await ref.ask(Boom())
+    assert await ref.ask(Total()) == 15
+    assert len(group_of(ref).members) == 2
+
+
+async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    seen = {path.removeprefix(f"{ref.path}/ftm/") for path in system.tree() if path.startswith(f"{ref.path}/ftm/")}
+    bricks = {
+        f"{name}/{brick}"
+        for name in ("r1", "r2")
+        for brick in ("protocol", "before", "proceed", "state", "server", "beat")
+    }
+    assert {*PARTS, "r1", "r2"} | bricks <= seen
+    backup = other(group_of(ref))
+    os.kill(pid_of(system, ref, backup), signal.SIGKILL)
+    async with asyncio.timeout(10):
+        while is_complete(ref):
+            await asyncio.sleep(0.001)
+    await two_again(ref)
+    assert f"{ref.path}/ftm/{backup}/server" in system.tree()
+
+
+async def test_the_bindings_of_the_bricks_are_seen_from_outside(system: hf.ActorSystem) -> None:
+    """A44 to A51: from the proxy to the protected actor, and back."""
+    ref = await started(system)
+    group = group_of(ref)
+    first, second = group.primary, other(group)
+
+    async def bound(brick: str) -> dict[str, str]:
+        status = await system.get_status(system.ref(f"{ref.path}/ftm/{brick}", hf.Actor))
+        return {port: path.removeprefix(f"{ref.path}/ftm/") for port, path in status.bindings.items()}
+
+    assert await ref.ask(Add(0)) == 1
+    assert await bound("proxy") == {"protocol": f"{first}/protocol"}
+    assert (await bound(f"{first}/protocol")).items() >= {"before": f"{first}/before", "next": "proxy"}.items()
+    assert (await bound(f"{first}/before"))["next"] == f"{first}/proceed"
+    found = await bound(f"{first}/proceed")
+    assert (found["next"], found["server"]) == (f"{first}/after", f"{first}/server")
+    found = await bound(f"{first}/after")
+    assert (found["next"], found["peer"], found["state"]) == (
+        f"{first}/protocol", f"{second}/after", f"{first}/state")  # fmt: skip
+    assert await bound(f"{first}/state") == {"server": f"{first}/server"}
+    status = await system.get_status(system.ref(f"{ref.path}/ftm/{first}/server", hf.Actor))
+    assert status.kind.endswith("Counter")
+    assert status.state == "running"
+    assert first is not None
+    os.kill(pid_of(system, ref, first), signal.SIGKILL)
+    assert await ref.ask(Add(1)) == 2
+    assert await bound("proxy") == {"protocol": f"{second}/protocol"}
+
+
+@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("who", ["primary", "backup"])
+async def test_killing_a_replica_under_load_loses_nothing(system: hf.ActorSystem, method: str, who: str) -> None:
+    ref = await started(system, recovery=METHODS[method]())
+    load, rng = Load(ref), random.Random(f"{SEED} {method} {who}")
+    events = system.events()
+    for _ in range(4):
+        await load.reached(rng.randrange(1, 60))
+        group = group_of(ref)
+        name = group.primary if who == "primary" else other(group)
+        assert name is not None
+        os.kill(pid_of(system, ref, name), signal.SIGKILL)
+        await load.reached(20)
+        await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    seen = events.take()
+    assert sum(isinstance(event, FailedOver) for event in seen) == (4 if who == "primary" else 0)
+    assert sum(isinstance(event, ReplicaJoined) for event in seen) >= 4
+    events.close()
+
+
+@pytest.mark.parametrize("method", ["hybrid", "replay_only"])
+async def test_killing_all_replicas_of_a_recorded_actor_loses_nothing(system: hf.ActorSystem, method: str) -> None:
+    ref = await started(system, recovery=METHODS[method]())
+    load = Load(ref)
+    for _ in range(2):
+        await load.reached(40)
+        for pid in (pid_of(system, ref, "r1"), pid_of(system, ref, "r2")):
+            os.kill(pid, signal.SIGKILL)
+        await load.reached(40)
+        await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+
+
+async def test_an_actor_without_recovery_begins_afresh_when_no_replica_is_left(system: hf.ActorSystem) -> None:
+    ref = await started(system, hf.start(Counter, 10))
+    assert await ref.ask(Add(0)) == 11
+    for pid in (pid_of(system, ref, "r1"), pid_of(system, ref, "r2")):
+        os.kill(pid, signal.SIGKILL)
+    async with asyncio.timeout(30):
+        while ref._cell.life < 2:
+            await asyncio.sleep(0.005)
+    assert await ref.ask(Add(1), timeout=30) == 11
+    assert await ref.ask(Tags()) == [1]
+
+
+@pytest.mark.parametrize("part", PARTS)
+async def test_the_parts_at_the_root_may_die_at_any_moment(system: hf.ActorSystem, part: str) -> None:
+    ref = await started(system)
+    load, rng = Load(ref), random.Random(f"{SEED} {part}")
+    for turn in range(6):
+        await load.reached(rng.randrange(1, 60))
+        group = group_of(ref)
+        if turn % 2:
+            assert group.primary is not None
+            os.kill(pid_of(system, ref, group.primary), signal.SIGKILL)
+            await asyncio.sleep(rng.random() * 0.03)
+        cell = group.cell_of(part)
+        assert cell is not None
+        cell.kill()
+        await load.reached(20)
+        await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+
+
+@pytest.mark.parametrize("method", ["hybrid", "replay_only"])
+async def test_the_supervisor_of_the_mechanism_may_die(system: hf.ActorSystem, method: str) -> None:
+    ref = await started(system, recovery=METHODS[method]())
+    load = Load(ref)
+    await load.reached(40)
+    ftm = group_of(ref).node.find(f"{ref.path}/ftm")
+    assert ftm is not None
+    ftm.kill()
+    await load.reached(40)
+    await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert ref._cell.life == 2
+
+
+STEPS = ("depose", "epoch", "kill", "lead", "bind", "peer")
+
+
+@pytest.mark.parametrize("step", STEPS)
+async def test_the_failover_manager_may_die_at_each_step(system: hf.ActorSystem, step: str) -> None:
+    ref = await started(system)
+    load, hit = Load(ref), list[str]()
+
+    def strike(name: str) -> None:
+        if name == step and hit.count(name) < 2:
+            hit.append(name)
+            raise RuntimeError(f"struck at {name}")
+
+    host = ref._cell.host
+    assert isinstance(host, GroupHost)
+    host.on_step = strike
+    await load.reached(30)
+    group = group_of(ref)
+    name = other(group) if step == "peer" else group.primary
+    assert name is not None
+    os.kill(pid_of(system, ref, name), signal.SIGKILL)
+    await load.reached(50)
+    await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert hit == [step, step]
+
+
+async def test_a_stopped_primary_that_wakes_up_changes_nothing(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    load = Load(ref)
+    events = system.events()
+    await load.reached(30)
+    primary = group_of(ref).primary
+    assert primary is not None
+    pid = pid_of(system, ref, primary)
+    await stop_process(pid)
+    await load.reached(30)
+    with pytest.raises(ProcessLookupError):  # It was killed and reaped before another one led.
+        os.kill(pid, signal.SIGCONT)
+    await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    over = [event for event in events.take() if isinstance(event, FailedOver)]
+    assert [event.epoch for event in over] == [2]
+    assert "no heartbeat" in over[0].why
+    events.close()
+
+
+async def test_a_silent_primary_that_nobody_could_replace_is_waited_for(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    group = group_of(ref)
+    assert await ref.ask(Add(0)) == 1
+    events = system.events()
+    leads = group.primary
+    assert leads is not None
+    pid = pid_of(system, ref, leads)
+    os.kill(pid_of(system, ref, other(group)), signal.SIGKILL)
+    await stop_process(pid)
+    async with asyncio.timeout(10):
+        while group.suspects.get(leads) is None:
+            await asyncio.sleep(0.005)
+    await asyncio.sleep(0.2)  # The manager has looked several times by now.
+    os.kill(pid, signal.SIGCONT)
+    assert await ref.ask(Add(1), timeout=30) == 2
+    seen = events.take()
+    assert not any(isinstance(event, FailedOver) for event in seen)
+    assert any(isinstance(event, WrongSuspicion) for event in seen)
+    await two_again(ref)
+    assert await ref.ask(Tags()) == [0, 1]
+    events.close()
+
+
+async def test_a_stopped_backup_holds_nobody_up_for_long(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    load = Load(ref)
+    await load.reached(30)
+    group = group_of(ref)
+    leads = group.primary
+    await stop_process(pid_of(system, ref, other(group)))
+    await load.reached(100)
+    await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert group_of(ref).primary == leads
+    assert load.longest < 5.0
+
+
+async def test_a_primary_that_wakes_up_before_it_is_killed_was_suspected_wrongly(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    events = system.events()
+    group = group_of(ref)
+    backup = other(group)
+    group.suspects[backup] = group.members[backup]  # As the detector does it, but nobody was told yet.
+    async with asyncio.timeout(10):
+        while not any(isinstance(event, WrongSuspicion) for event in events.take()):
+            await asyncio.sleep(0.005)
+    assert group.wrong == 1
+    assert await ref.ask(Add(0)) == 1
+    events.close()
+
+
+async def test_what_asks_in_the_middle_of_its_turns_moves_no_money_twice(system: hf.ActorSystem) -> None:
+    one = await system.start(hf.child("one", hf.start(Account, 1000)))
+    two = await system.start(hf.child("two", hf.start(Account, 1000)))
+    ref = await started(system, hf.start(Bank), bindings={"one": one.path, "other": two.path})
+    load, rng = Load(ref, clients=3, make=Transfer), random.Random(SEED)
+    for _ in range(4):
+        await load.reached(rng.randrange(1, 40))
+        group = group_of(ref)
+        name = rng.choice([group.primary, other(group)])
+        assert name is not None
+        os.kill(pid_of(system, ref, name), signal.SIGKILL)
+        await load.reached(10)
+        await two_again(ref)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    moved = len(load.answered)
+    assert await one.ask(Put(0)) == 1000 - moved
+    assert await two.ask(Put(0)) == 1000 + moved
+
+
+async def test_a_message_that_kills_every_replica_is_quarantined(system: hf.ActorSystem) -> None:
+    ref = await started(system, recovery=hf.hybrid(max_deliveries=3))
+    assert await ref.ask(Add(0)) == 1
+    with pytest.raises(hf.Quarantined):
+        await ref.ask(Die(), timeout=60)
+    assert await ref.ask(Add(1), timeout=30) == 2
+    assert [one.address for one in system.quarantined(ref)] == [ref.path]
+
+
+async def test_an_actor_that_stops_itself_ends_for_good_if_its_spec_says_so(system: hf.ActorSystem) -> None:
+    ref = await started(system, restart="transient")
+    await ref.ask(Leave())
+    async with asyncio.timeout(30):
+        while ref._cell.state == "running":
+            await asyncio.sleep(0.005)
+    assert [path for path in system.tree() if path.startswith(f"{ref.path}/")] == []
+
+
+async def test_stopping_ends_all_processes(system: hf.ActorSystem) -> None:
+    ref = await started(system, recovery=hf.hybrid())
+    assert await ref.ask(Add(0)) == 1
+    pids = [pid_of(system, ref, name) for name in ("r1", "r2")]
+    await system.stop(ref)
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    again = await started(system, recovery=hf.hybrid())
+    assert await again.ask(Tags()) == [0]
+
+
+async def test_control_reaches_the_replica_that_leads(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    await ref.ask(Add(7))
+    assert await system.get_state(ref) == {"total": 1, "tags": [7]}
+    with pytest.raises(hf.ControlFailed, match="detach"):
+        await system.replace_state(ref, dict)
+    await system.suspend(ref)
+    asked = asyncio.ensure_future(ref.ask(Add(8)))
+    assert (await system.get_status(ref)).state == "suspended"
+    assert not asked.done()
+    await system.resume(ref)
+    assert await asked == 2
+
+
+async def test_with_a_store_a_protected_actor_comes_back_after_a_restart_of_the_root(tmp_path: Path) -> None:
+    store = f"sqlite:{tmp_path / 'store.db'}"
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        ref = await started(system, recovery=hf.hybrid(interval=0.05))
+        for tag in range(20):
+            await ref.ask(Add(tag))
+        os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
+        assert await ref.ask(Add(20), timeout=30) == 21
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        ref = await started(system, recovery=hf.hybrid(interval=0.05))
+        assert await ref.ask(Tags()) == list(range(21))
+        assert await ref.ask(Add(21)) == 22
+
+
+class Wait(hf.Message[None]):
+    path: str
+    tag: int
+
+
+class Waiter(Counter):
+    """Has something done in the background, until a file is there."""
+
+    @hf.on(Wait)
+    def wait(self, message: Wait) -> None:
+        self.ctx.pipe_to_self(until_there(Path(message.path)), lambda _: Add(message.tag))
+
+
+async def until_there(path: Path) -> None:
+    while not path.exists():
+        await asyncio.sleep(0.005)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("recovery", [hf.hybrid(interval=0.05), None])
+@pytest.mark.parametrize("how", ["kill", "fail"])
+async def test_background_work_is_begun_again_or_said_to_be_lost(
+    system: hf.ActorSystem, recovery: Any, how: str, tmp_path: Path
+) -> None:
+    """The one that leads dies, or a turn of it fails, while the work of an earlier turn is out."""
+    ref = await started(system, hf.start(Waiter), recovery=recovery)
+    events, there = system.events(), tmp_path / "there"
+    await ref.ask(Add(0))
+    await ref.ask(Wait(str(there), 1))
+    assert await ref.ask(Add(2)) == 2
+    primary = group_of(ref).primary
+    assert primary is not None
+    if how == "kill":
+        os.kill(pid_of(system, ref, primary), signal.SIGKILL)
+    else:
+        with pytest.raises(hf.RemoteCrash):
+            await ref.ask(Boom())
+    assert await ref.ask(Add(3), timeout=30) == 3
+    there.touch()
+    lost = [one for one in events.take() if isinstance(one, hf.BackgroundWorkLost)]
+    if recovery is None:
+        assert [one.count for one in lost] == [1]
+        assert await ref.ask(Tags()) == [0, 2, 3]
+    else:
+        async with asyncio.timeout(10):
+            while await ref.ask(Tags(), timeout=10) != [0, 2, 3, 1]:
+                await asyncio.sleep(0.005)
+        assert lost == []
+    events.close()
+
+
+class Ring(hf.Message[str]): ...
+
+
+class Caller(Counter):
+    """Asks somebody who asks it in turn."""
+
+    friend: hf.Binding[Friend]
+
+    @hf.on(Ring)
+    async def ring(self, message: Ring) -> str:
+        return await self.friend.ask(Ring())
+
+
+class Friend(hf.Actor):
+    """Asks back."""
+
+    @hf.on(Ring)
+    async def ring(self, message: Ring) -> str:
+        try:
+            await self.ctx.find("/app/alice", Counter).ask(Total())
+        except hf.AskDeadlock:
+            return "deadlock"
+        return "answered"
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("recovery", [hf.hybrid(), None])
+@pytest.mark.parametrize("recorded", [False, True])
+async def test_an_ask_that_comes_back_inside_a_turn_fails_at_once(
+    system: hf.ActorSystem, recovery: Any, recorded: bool
+) -> None:
+    friend = await system.start(hf.child("friend", hf.start(Friend), recovery=hf.hybrid() if recorded else None))
+    ref = await started(system, hf.start(Caller), recovery=recovery, bindings={"friend": friend.path})
+    assert await ref.ask(Ring(), timeout=3.0) == "deadlock"
+    assert await ref.ask(Add(0)) == 1

@@ -1,0 +1,126 @@
+"""Time redundancy: transient value faults in answers, outputs and state are masked, or said to be there."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm.alarms import Masked
+from holdfast.ftm.mechanism import MechanismRefused
+from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.voters import NoMajority
+from tests.ftm.replicated import Add, Closed, Fail, Fetch, Large, Other, Read, Say, Total, pair
+
+STRIKES: list[Any] = []
+"""What goes wrong in the next runs of `Struck.add`, one entry for each run."""
+
+
+class Struck(Total):
+    """Is hit by radiation, now and then."""
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.seen.append(message.n)
+        strike = STRIKES.pop(0) if STRIKES else None
+        match strike:
+            case "answer":
+                return 666
+            case "state":
+                self.seen[-1] += 1
+                return sum(self.seen) - 1
+            case "output":
+                self.other.tell(Add(666))
+            case "crash":
+                raise MemoryError("a bit has flipped")
+            case int():
+                return strike
+        return sum(self.seen)
+
+    @property
+    def other(self) -> hf.ActorRef[Any]:
+        return self.ctx.find("/app/other", Other)
+
+
+@pytest.fixture(autouse=True)
+def no_strikes() -> None:
+    STRIKES.clear()
+
+
+async def test_all_goes_through_as_before(system: hf.ActorSystem) -> None:
+    driver = await pair(system, Total, TR(), others=())
+    keys = driver.send(Add(1), Fetch(2), Say(3), Fail(4), Add(5))
+    with pytest.raises(hf.RemoteCrash, match="no 4"):
+        await driver.reply(keys[3])
+    assert await driver.reply(keys[4]) == 11
+    assert await driver.ask(Read()) == [1, -2, 4, 3, 5]
+    assert sorted(out.verb for out in driver.released.values()) == ["ask", "tell"]
+
+
+@pytest.mark.parametrize("kind", ["answer", "state", "output", "crash"])
+@pytest.mark.parametrize("run", [0, 1, 2])
+async def test_one_fault_is_masked_in_whatever_run(system: hf.ActorSystem, kind: str, run: int) -> None:
+    """T43, T44: two of three."""
+    driver = await pair(system, Struck, TR(), others=())
+    assert await driver.ask(Add(1)) == 1
+    with system.events() as events:
+        STRIKES.extend([None] * run + [kind])
+        assert await driver.ask(Add(2)) == 3
+        STRIKES.clear()
+        masked = [one for one in events.take() if isinstance(one, Masked)]
+    assert [one.turns for one in masked] == ([] if run == 2 else ["2"])
+    assert await driver.ask(Add(3)) == 6
+    assert await driver.ask(Read()) == [1, 2, 3]
+    assert driver.released == {}
+
+
+async def test_without_a_majority_the_ask_fails_and_nothing_is_changed(system: hf.ActorSystem) -> None:
+    driver = await pair(system, Struck, TR(), others=())
+    assert await driver.ask(Add(1)) == 1
+    STRIKES.extend([7, 8, 9])
+    with pytest.raises(NoMajority):
+        await driver.ask(Add(2))
+    assert await driver.ask(Add(3)) == 4
+    assert await driver.ask(Read()) == [1, 3]
+
+
+async def test_one_with_deltas(system: hf.ActorSystem) -> None:
+    driver = await pair(system, Large, PBR(), TR())
+    keys = driver.send(Add(1), Add(1), Fail(2), Add(3))
+    assert await driver.reply(keys[3]) == 1
+    assert await driver.ask(Read()) == [1, 1, 3]
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Read()) == [1, 1, 3]
+
+
+async def test_below_passive_replication_the_backup_gets_what_was_agreed_on(system: hf.ActorSystem) -> None:
+    """A65: composed, both faults are masked: a wrong value, and the crash of the replica."""
+    driver = await pair(system, Struck, PBR(), TR())
+    STRIKES.extend(["state"])
+    assert await driver.ask(Add(2)) == 2
+    STRIKES.extend([None, "answer"])
+    keys = driver.send(Add(3))
+    assert await driver.reply(keys[0]) == 5
+    STRIKES.extend([1, 2, 3])
+    with pytest.raises(NoMajority):
+        await driver.ask(Add(9))
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Add(4)) == 9
+    assert await driver.ask(Read()) == [2, 3, 4]
+    names = {cell.name for cell in (system.node.cell_at(driver.path("r2")).children or {}).values()}
+    assert names >= {"protocol", "before", "tr.protocol", "tr.before", "proceed", "tr.after", "server", "state"}
+
+
+def test_it_is_refused_without_state_access_or_determinism() -> None:
+    class Random(Total):
+        deterministic = False
+
+    with pytest.raises(MechanismRefused, match="state_access = False"):
+        TR().check(Closed)
+    with pytest.raises(MechanismRefused, match="deterministic = False"):
+        TR().check(Random)
+    TR().check(Total)
