@@ -249,8 +249,7 @@ class Line(msgspec.Struct):
     what: Any
 
 
-class GetLines(hf.Message[list[Line]]):
-    """What has happened?"""
+class GetLines(hf.Message[list[Line]]): ...
 
 
 class Recorder(hf.Actor):
@@ -309,6 +308,8 @@ class Recorder(hf.Actor):
             case repair.GaveUp():
                 self._repairs += 1
                 self._add("gave up", [*message.components, message.why])
+            case _:
+                raise AssertionError(message)
 
     @hf.on(Until)
     def _until(self, message: Until) -> hf.ReplyHandle[None]:
