@@ -179,10 +179,13 @@ async def test_rules_over_published_values(system: hf.ActorSystem) -> None:
         Check(ok("filtered"), lambda message: message.x, Limits(high=40.0), lambda: Median(3)),
     ]
     seen = await watch(system, DiagnosticObserver, "/t", checks, manner=QUICK)
-    for x in (20.0, 41.0, 38.0, 34.0):
+    for x in (20.0, 41.0, 38.0):
         await seen.publish("/t", Value(x))
         await advance(0.0)
-    assert seen.changes() == ["ok(temperature)", "ok(filtered)", "not ok(temperature)", "ok(temperature)"]
+    assert seen.changes() == ["ok(temperature)", "ok(filtered)", "not ok(temperature)"]
+    await seen.publish("/t", Value(34.0))
+    await advance(0.0)
+    assert seen.changes() == ["ok(temperature)"]
     await advance(10.0)
     assert sorted(set(seen.changes())) == ["unknown ok(filtered)", "unknown ok(temperature)"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.diagnosis.literals import ok
+from holdfast.diagnosis.literals import ok, on
 from holdfast.diagnosis.messages import MODEL, OBSERVATIONS, ModelChanged
 from holdfast.diagnosis.observations import Observation
 from holdfast.diagnosis.planning import find_plan
@@ -252,6 +252,34 @@ async def test_blind_is_not_healthy(system: hf.ActorSystem) -> None:
     assert over.why == "the observations are blind for 5 s"
     assert here.all(Repaired) == []
     assert here.done() == ["power_up(hu)"]
+
+
+async def test_a_diagnosis_is_no_newer_than_what_was_observed(system: hf.ActorSystem) -> None:
+    # T50: who diagnoses has ended, and so have the observers; the last diagnosis is no reason to act for ever.
+    here = await scene(system, Policy(unknown=5.0, **QUICK))
+    await here.change(off("hu", dead=True))
+    await here.hear(ActionBegan)
+    await system.ref("/t/diagnosis", hf.Supervisor).ask(hf.TerminateChild("diagnoser"))
+    await here.blind()
+    over = await here.hear(GaveUp)
+    assert over.why == "nobody observes any more what was diagnosed for 5 s"
+    assert here.all(Repaired) == []
+
+
+async def test_a_contradiction_in_the_middle_of_a_case_is_waited_for_and_no_repair(system: hf.ActorSystem) -> None:
+    # T49
+    here = await scene(system, Policy(unknown=5.0, **QUICK))
+    await here.change(off("hu", dead=True))
+    await here.hear(ActionBegan)
+    await system.publish(OBSERVATIONS, Observation(on("hu"), now(), "liar", 1000.0))
+    held = await here.hear(Held)
+    over = await here.hear(GaveUp)
+    assert (held.why, over.why) == (
+        "the observations are contradictory",
+        "the observations are contradictory for 5 s",
+    )
+    assert here.done() == ["power_up(hu)"]
+    assert here.all(Repaired) == []
 
 
 async def test_a_symptom_that_nobody_looks_at_any_more_is_not_repaired(system: hf.ActorSystem) -> None:
