@@ -358,7 +358,9 @@ class Server(Points):
         live = state.live or (self.life is not None and self.life.is_live)
         self._is_work_lost = self.standing.leads  # What the turns that lead there have begun, they began elsewhere.
         await self.drop_life()
+        confirmed = self.confirmed
         self.install(msgspec.structs.replace(state, live=live))
+        self.confirmed = confirmed  # The part that has led there is not at home yet: nothing may overtake it.
         await self.ensure()
 
     async def back(self) -> State:

@@ -19,7 +19,7 @@ from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.orders import Peer
 from tests.ftm import versions
-from tests.ftm.accounts import Counter, Load, Tags
+from tests.ftm.accounts import Account, Bank, Counter, Load, Put, Tags, Transfer
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Say, Total, pair
 from tests.ftm.test_failover import group_of, pid_of, two_again
 from tests.ftm.versions import FAULTY
@@ -153,3 +153,23 @@ def test_what_cannot_work_is_refused_with_the_reason() -> None:
         AD()
     assert revive(AD(CHECKS).describe()) == AD(CHECKS)
     assert find("ad") is AD
+
+
+async def test_an_ask_in_a_turn_does_not_overtake_the_outcome_that_the_other_replica_computes(
+    system: hf.ActorSystem,
+) -> None:
+    """The turn behind it waits until the home has it, also when the actor went on from the other one's state."""
+    accounts = [await system.start(hf.child(name, hf.start(Account, 1000))) for name in ("one", "two")]
+    layers = hf.compose(AD((versions.is_positive,)), PBR(), FAULTY(what="answer", always=True, skip=5))
+    bindings = dict(zip(("one", "other"), (one.path for one in accounts), strict=True))
+    with system.events() as events:
+        bank = await system.start(hf.child("bank", hf.start(Bank), mechanism=layers, bindings=bindings))
+        load = Load(bank, clients=6, make=Transfer)
+        await load.reached(30)
+        await load.stop()
+        seen = events.take()
+    tags = await bank.ask(Tags())
+    load.check(tags)
+    assert [await one.ask(Put(0)) for one in accounts] == [1000 - len(tags), 1000 + len(tags)]
+    assert len([one for one in seen if isinstance(one, Objected)]) >= 10
+    assert not [one for one in seen if type(one).__name__ == "RecoveryFailed"]
