@@ -1,0 +1,133 @@
+"""Checks that keep old, doubled and foreign words out, each by itself: what comes at the wrong time changes nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+from typing import Any
+
+import msgspec
+import pytest
+
+import holdfast as hf
+from holdfast.checkpoint.records import DROPPED, OK, REPLY, Answer, TurnEnd
+from holdfast.ftm.letters import Letter
+from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
+from holdfast.ftm.messages import Done, NotFollowing, ReplyEvicted, Request, State, Work
+from holdfast.ftm.replylog import ReplyLog
+from holdfast.ftm.state import Apply
+from tests.ftm import accounts
+from tests.ftm.replicated import Add, Read, Total, pair
+from tests.ftm.test_failover import group_of, pid_of, stop_process, two_again
+
+CHECKPOINT = "holdfast.ftm.mechanisms.pbr:Checkpoint"
+
+
+async def said(driver: Any, state: State, *, epoch: int) -> int:
+    """What the backup answers to this state."""
+    body = driver.system.node.codec.encoder.encode(Checkpoint(state, []))
+    after = driver.system.node.cell_at(driver.path("r2") + "/after").ref
+    return msgspec.msgpack.decode(await after.ask(Letter(epoch, 0, CHECKPOINT, body)))  # type: ignore[no-any-return]
+
+
+async def test_who_was_not_told_that_it_follows_takes_nothing(system: hf.ActorSystem) -> None:
+    """It was meant for the life before, which had another state."""
+    driver = await pair(system)
+    assert await driver.ask(Add(1)) == 1
+    state = driver.standing("r2").server.point
+    with pytest.raises(NotFollowing):
+        await said(driver, msgspec.structs.replace(state, turn=9), epoch=driver.epoch + 1)
+    assert driver.standing("r2").server.turn == 1
+    assert driver.standing("r2").epoch == driver.epoch
+
+
+async def test_a_state_that_was_overtaken_does_not_come_back(system: hf.ActorSystem) -> None:
+    driver = await pair(system)
+    assert await driver.ask(Add(1)) == 1
+    old = driver.standing("r2").server.point
+    assert await driver.ask(Add(2)) == 3
+    assert await said(driver, old, epoch=driver.epoch) == 2
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Read()) == [1, 2]
+
+
+async def test_what_has_changed_since_a_state_that_is_not_here_is_not_taken(system: hf.ActorSystem) -> None:
+    """The replica ends: its next life is given a whole state."""
+    driver = await pair(system)
+    assert await driver.ask(Add(1)) == 1
+    cell = system.node.cell_at(driver.path("r2"))
+    gone = cell.ended()
+    state = State(7, b"", [b"\x80"], [], [], True, 5)
+    with pytest.raises(hf.HoldfastError):
+        await system.node.cell_at(driver.path("r2") + "/state").ref.ask(Apply(state))
+    async with asyncio.timeout(10):
+        await gone
+
+
+async def test_a_request_whose_outcome_was_evicted_is_not_handled_again(system: hf.ActorSystem) -> None:
+    """T6: who asks for it is told so."""
+    driver = await pair(system)
+    driver.standing("r1").log = ReplyLog(capacity=2)
+    keys = driver.send(Add(1), Add(2), Add(3))
+    assert [await driver.reply(key) for key in keys] == [1, 3, 6]
+    again = [Request("/app/client", 1, driver.feeds[keys[0]])]
+    del driver.ends[keys[0]]
+    taken: list[TurnEnd] = []
+    real = driver.take
+
+    def take(done: Done) -> None:
+        taken.extend(done.ends)
+        real(Done(done.epoch, done.config, done.number, [], done.is_last))
+
+    driver.take = take  # type: ignore[method-assign]
+    driver.queue.append(Work(driver.epoch, 0, driver._batch(), again, None, True))
+    driver._send()
+    async with asyncio.timeout(10):
+        while not taken:
+            await asyncio.sleep(0.001)
+    driver.take = real  # type: ignore[method-assign]
+    assert [(end.status, end.answer.name) for end in taken] == [
+        (DROPPED, f"{ReplyEvicted.__module__}:{ReplyEvicted.__name__}")
+    ]
+    assert await driver.ask(Read()) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("mechanism", [PBR(), LFR()], ids=lambda one: one.name)
+async def test_a_batch_that_comes_to_proceed_twice_is_computed_once(system: hf.ActorSystem, mechanism: Any) -> None:
+    driver = await pair(system, Total, mechanism)
+    proceed = system.node.cell_at(driver.path("r1") + "/proceed").ref
+    await system.suspend(proceed)
+    (key,) = driver.send(Add(1))
+    proceed.tell(Work(driver.epoch, 0, driver.number, [Request("/app/client", 1, driver.feeds[key])]))
+    await system.resume(proceed)
+    assert await driver.reply(key) == 1
+    assert await driver.ask(Read()) == [1]
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_what_an_earlier_epoch_says_and_what_is_said_twice_is_nobodys_answer(system: hf.ActorSystem) -> None:
+    """At the proxy, where whoever led before may still be heard."""
+    ref = await system.start(hf.child("alice", hf.start(accounts.Counter), mechanism=PBR()))
+    await two_again(ref)
+    assert await ref.ask(accounts.Add(0)) == 1
+    group = group_of(ref)
+    assert group.primary is not None
+    pid = pid_of(system, ref, group.primary)
+    await stop_process(pid)
+    asked = ref.ask(accounts.Add(1), timeout=30)
+    async with asyncio.timeout(10):
+        while group.out is None:
+            await asyncio.sleep(0.001)
+    wrong, key, turn = Answer(REPLY, "", b"\x63"), group.out.requests[0].feed.id, group.switch.turn
+    known = next(key for key in range(key) if key not in group.switch.open)
+    end = TurnEnd(turn + 1, key, OK, [], wrong)
+    group.take_done(Done(group.epoch - 1, group.config, group.out.number, [end], True))
+    assert group.stale == 1
+    group.take_done(Done(group.epoch, group.config, 0, [TurnEnd(turn, known, OK, [], wrong)], False))
+    assert group.doubled == 1
+    os.kill(pid, signal.SIGCONT)
+    assert await asked == 2
+    assert await ref.ask(accounts.Tags()) == [0, 1]
