@@ -11,7 +11,7 @@ from ..actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ..actors.mail import Envelope
 from .asks import SwitchAsk, answer_ask, origin_of
 from .inputs import Batch
-from .records import MESSAGE, Answer, Out
+from .records import MESSAGE, PIPE, Answer, Out, PipeDone
 from .recovery.held import Inlet, inlet
 from .ties import connect
 
@@ -72,6 +72,15 @@ class Outputs:
                 pass
             case verb:
                 raise HoldfastError(f"{home.path}: unknown output {verb!r}")
+
+    def work_done(self, record: PipeDone) -> None:
+        """Background work has an outcome: an input, once."""
+        home = self._home
+        done = home.pipes_done.setdefault(record.turn, set())
+        if record.k not in done:
+            done.add(record.k)
+            origin = f"{record.turn}.{record.k}"
+            home.forward(home.record(PIPE, record.name, record.body, home.path, origin=origin))
 
     def _operate(self, out: Out) -> None:
         if self._stands(out):

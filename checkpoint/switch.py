@@ -37,7 +37,6 @@ from .records import (
     LATER,
     MESSAGE,
     NOTHING,
-    PIPE,
     START,
     STASHED,
     TICK,
@@ -382,7 +381,7 @@ class Switch:
                 case Live():
                     self._live(record)
                 case PipeDone():
-                    self._pipe_done(record)
+                    self.outputs.work_done(record)
                 case Unsaved():
                     self.due.failed(record.problem)
                 case Marked():
@@ -492,10 +491,3 @@ class Switch:
             ask.give(answer, batch)
         else:
             batch.after.append(lambda: answer_ask(self, ask, answer))
-
-    def _pipe_done(self, record: PipeDone) -> None:
-        done = self.pipes_done.setdefault(record.turn, set())
-        if record.k not in done:
-            done.add(record.k)
-            origin = f"{record.turn}.{record.k}"
-            self.forward(self.record(PIPE, record.name, record.body, self.path, origin=origin))

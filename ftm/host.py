@@ -14,14 +14,10 @@ from typing import TYPE_CHECKING, Any
 from ..actors import lives
 from ..actors.actor import Start
 from ..actors.cell import DOWN, GONE, RUNNING, Cell
-from ..actors.control.calls import Call, send_call
-from ..actors.control.orders import Ready, ReplaceCode, ReplaceState, Resume, Suspend
-from ..actors.errors import ControlFailed, HoldfastError, StartFailed
+from ..actors.errors import HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
-from ..actors.process import frames
-from ..actors.process.remote import ProcessHost
-from ..checkpoint.homes import HomeHost, Homes, parent_ended, seen
+from ..checkpoint.homes import Homes, parent_ended, seen
 from ..checkpoint.method import Method
 from ..checkpoint.records import Restore
 from ..supervision.backoff import Backoff
@@ -32,34 +28,32 @@ from .adaptation import REST_WITHIN, AdaptationEngine, CannotAdapt, Reconfigurat
 from .detector import Detection, Detector
 from .events import ReplicaLost
 from .failover import FailoverManager
-from .group import Group, Look, forget_ended
+from .group import Group, Look
 from .join import Joiner
 from .mechanism import compose
 from .messages import Lead
 from .orders import Finish, Install, Setting
 from .proxy import Proxy, Settle
+from .steering import Steered
+from .unkept import UNKEPT, begin_afresh, forget_later, is_unkept
 
 if TYPE_CHECKING:
     from ..checkpoint.records import TurnEnd
     from ..checkpoint.switch import Switch
     from .mechanism import Mechanism
 
-UNKEPT = Method("protected", durability="memory")
-"""Of a child without recovery, as long as it is protected."""
 LED_WITHIN = 60.0
 """Seconds that the first replica may take to take up its state."""
 JOINED_WITHIN = 10.0
 """Seconds that a start waits for another replica to catch up; after that the first one goes on alone."""
 FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
-AGAIN_AFTER = 0.01
-"""Seconds after which an order is given again that nobody could take."""
 BRICKS_INTENSITY = 100
 """Ends of parts and replicas within `BRICKS_PERIOD` seconds after which the whole group is given up."""
 BRICKS_PERIOD = 5.0
 
 
-class GroupHost(HomeHost):
+class GroupHost(Steered):
     """Lives that are lived by replicas, each in a process of its own."""
 
     def __init__(self, homes: Homes, method: Method | None, mechanism: Any) -> None:
@@ -453,53 +447,6 @@ class GroupHost(HomeHost):
     def is_up(self, cell: Cell) -> bool:
         return super().is_up(cell) and self.group is not None and not self.group.is_over
 
-    def control(self, cell: Cell, call: Call) -> None:
-        """Orders go to the actor of the replica that leads; what would change one replica alone is refused."""
-        group, ask = self.group, call.ask
-        if isinstance(call.order, (ReplaceState, ReplaceCode)):
-            why = "it is protected: detach its mechanism first, for all replicas have to have the same"
-            ask.fail(ControlFailed(cell.path, call.order.verb, why))
-            return
-        if group is None or group.is_over or group.primary is None or not self.is_up(cell):
-            cell.node.loop.call_later(AGAIN_AFTER, give_again, cell, call)
-            return
-        if isinstance(call.order, Ready):
-            call.give(None)
-            return
-        if isinstance(call.order, (Suspend, Resume)):
-            self._hold(cell, group, is_suspended=isinstance(call.order, Suspend))
-            call.give(None)
-            return
-        leads = group.cell_of(group.primary)
-        worker = leads.host.worker_of(leads) if leads is not None and isinstance(leads.host, ProcessHost) else None
-        if worker is None:
-            ask.fail(ControlFailed(cell.path, call.order.verb, "the replica that leads has just ended; try again"))
-            return
-        send_call(worker, group.place(f"{group.primary}/server"), call)
-
-    def _hold(self, cell: Cell, group: Group, *, is_suspended: bool) -> None:
-        group.is_suspended = cell.extra().suspended = is_suspended
-        group.poke()
-
-    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        """Links and monitors are the home's; a binding is that of the actor in each replica."""
-        group = self.group
-        if verb == "bind" and group is not None:
-            for name in group.names:
-                self._bind(group, name, data)
-
-    def _bind(self, group: Group, name: str, data: dict[str, Any]) -> None:
-        cell = group.cell_of(name)
-        worker = cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None
-        if worker is not None and group.life_of(name):
-            to = worker.connection.name_out(group.place(f"{name}/server"))
-            worker.connection.send(frames.Command(to, "bind", data))
-
-    def _bind_all(self, cell: Cell, group: Group, name: str) -> None:
-        """A replica that was started again: what was bound since the first start."""
-        for port, target in cell.extra().bindings.items():
-            self._bind(group, name, {"port": port, "target": target.path})
-
     def running(self, cell: Cell) -> int:
         return -1 if self.group is None else self.group.only_suspect_input()
 
@@ -509,42 +456,3 @@ def replica(setting: Setting, start: Start[Any], layers: tuple[Any, ...]) -> Sta
     from .replica import Replica
 
     return Start(Replica, (setting, start, layers))
-
-
-def give_again(cell: Cell, call: Call) -> None:
-    """An order had to wait until somebody leads: give it to whoever lives there now, if it is still waited for."""
-    if call.ask.is_done:
-        return
-    if cell.is_dead:
-        call.ask.undelivered(cell, "it has ended")
-    else:
-        cell.host.control(cell, call)
-
-
-def is_unkept(method: Method) -> bool:
-    """Whether the actor has a home for as long as it is protected, and begins afresh."""
-    return method.name == UNKEPT.name
-
-
-def begin_afresh(switch: Switch) -> None:
-    """Between two lives of an actor that is not recorded: timers, subscriptions and the stash end with a life."""
-    if switch.newest is None and not switch.turns:
-        return
-    forget_ended(switch)
-    assert switch.newest is not None
-    newest = switch.newest
-    switch.newest = type(newest)(
-        newest.format, switch.turn, newest.next_id, [], {}, [], newest.epoch, b"", switch.turn
-    )  # fmt: skip
-    switch.stash = []
-    switch.timers.replace({})
-    switch.topics.clear()
-
-
-def forget_later(switch: Switch, why: str) -> None:
-    """Replies that the ended life owed will not come."""
-    from ..actors.errors import AskFailed
-
-    for ask in switch.later.values():
-        ask.fail(AskFailed(switch.path, why))
-    switch.later.clear()

@@ -37,8 +37,9 @@ from ..checkpoint.life import Life
 from ..checkpoint.moving import ArrivingHome, Detached, refuse_unsaved
 from ..checkpoint.records import DOWN, EXIT, MESSAGE, PIPE, START, TICK
 from ..checkpoint.switch import Switch
-from .host import GroupHost, is_unkept
+from .host import GroupHost
 from .orders import Export
+from .unkept import is_unkept
 
 
 class FromGroup(Move):

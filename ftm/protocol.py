@@ -18,59 +18,31 @@ from ..actors.bindings import Binding
 from ..actors.errors import ActorStopped, HoldfastError
 from ..actors.exits import unpack_exit
 from ..actors.mail import ReplyHandle
-from ..actors.message import Message, message_name
+from ..actors.message import message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
-from .bricks import FOREVER, Abandon, Brick, Flush, Where
-from .gate import Gate
+from .bricks import FOREVER, Brick, Flush, Where
 from .messages import (
-    CannotJoin,
     ConfigMismatch,
     Done,
     Ended,
     Follow,
     Inward,
     Lead,
-    Logged,
     ReplyEvicted,
     Request,
-    StaleEpoch,
     State,
     Taken,
     Work,
 )
 from .orders import Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
 from .sealed import Refused
-from .standing import PeerLost
+from .transfer import Assume, Transfer
 
 if TYPE_CHECKING:
     from ..actors.actor import Actor
     from .mechanism import Mechanism
     from .standing import Standing
-
-
-class Take(Message[int]):
-    """The state and reply log of the replica that leads, for one that joins; the reply is its turn."""
-
-    leader: str
-    state: State | None
-    log: list[Logged]
-
-
-class Assume(Message[None]):
-    """To the replica: have its bricks play the part of one that leads, or not."""
-
-    leads: bool
-
-
-class Resync(Message[None]):
-    """To the RequestProtocol of the leader: this follower does not have your state any more; bring it there again."""
-
-    path: str
-
-
-class ResyncPeer(Message[None]):
-    """To the RequestProtocol of a follower: have the leader bring us to its state again; answered when we are there."""
 
 
 class InnerProtocol(Brick):
@@ -88,14 +60,10 @@ class InnerProtocol(Brick):
         return await self.next.ask(done, timeout=FOREVER)
 
 
-class RequestProtocol(Gate):
+class RequestProtocol(Transfer):
     """The entry and exit of a replica; `next` is the Proxy."""
 
-    peer_messages = (Take, Resync)
-    answers_later = True
-
     before: Binding[Actor]
-    proceed: Binding[Actor]
 
     def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
         super().__init__(standing, mechanism, slot)
@@ -309,113 +277,6 @@ class RequestProtocol(Gate):
         parent = self.ctx.cell.parent
         assert parent is not None
         return parent.ref
-
-    # -- the other replica ------------------------------------------------------------------------------------------
-
-    @on(Peer)
-    def _peer(self, message: Peer) -> None:
-        self._check(message.epoch)
-        standing = self._standing
-        if message.path != standing.peer:
-            standing.set_peer(message.path, "live")
-
-    @on(Join)
-    def _join(self, message: Join) -> Any:
-        self._check(message.epoch)
-        return self._answer(self._bring(message.peer))
-
-    async def _bring(self, path: str) -> int:
-        """Bring another replica to our state; requests wait only while that is captured."""
-        standing, server = self._standing, self._standing.server
-        if not standing.leads:
-            raise CannotJoin(path=path, why=f"{standing.path} does not lead")
-        if standing.peer == path:  # It follows anew, or has lived anew: whatever it had, it does not count on that.
-            standing.set_peer(path, "joining")
-        self._holds += 1
-        try:
-            await self._quiet()
-            await server.ensure()
-            state = None
-            if server.has_access:
-                state = server.capture() if server.point is not None or server.turn >= 0 else None
-            elif server.turn >= 0:
-                why = "the state of the protected actor cannot be read, and it has handled requests already"
-                raise CannotJoin(path=path, why=why)
-            log = standing.log.entries()
-            standing.set_peer(path, "joining", -2 if state is None else state.turn)
-            asked = self.ctx.create_task(self._offer(Take(standing.path, state, log)))
-        finally:
-            self._holds -= 1
-            self._go_on()
-        turn = await asked
-        if isinstance(turn, HoldfastError):
-            if standing.peer == path:
-                standing.set_peer(None, "none")
-            raise CannotJoin(path=path, why=str(turn))
-        if standing.peer == path:
-            standing.peer_state = "live"
-            await self._drain_bricks()  # What left while it joined may have gone home ahead of the state behind it.
-        if standing.peer != path:
-            raise CannotJoin(path=path, why="another one has taken its place, or it was given up meanwhile")
-        return turn
-
-    async def _drain_bricks(self) -> None:
-        for path in list(self._standing.paths.values()):
-            cell = self._standing.node.find(path)
-            if cell is not None and isinstance(cell.actor, Brick):
-                await cell.actor.drain()  # No ask: one of them may be waiting for us.
-
-    async def _offer(self, take: Take) -> int | HoldfastError:
-        try:
-            return await self.ask_peer(take)
-        except (PeerLost, ConfigMismatch, StaleEpoch, HoldfastError) as error:
-            return error
-
-    async def from_peer(self, message: Message[Any]) -> Any:
-        """We join, or a follower has to join again."""
-        if isinstance(message, Resync):
-            self.ctx.create_task(self._again(message.path))
-            return None
-        assert isinstance(message, Take)
-        return await self._taken(message)
-
-    async def _again(self, path: str) -> None:
-        async with self._lock:
-            try:
-                await self._bring(path)
-            except HoldfastError:
-                return  # The manager will see that it does not count, and why.
-
-    @on(ResyncPeer)
-    def _resync(self, message: ResyncPeer) -> Any:
-        handle = self.ctx.reply_handle()
-        self._standing.unready()
-        self.ctx.create_task(self._resynced(handle))
-        return handle
-
-    async def _resynced(self, handle: ReplyHandle[Any]) -> None:
-        try:
-            await self.ask_peer(Resync(self._standing.path))
-        except (PeerLost, HoldfastError) as error:
-            handle.fail(error)
-            return
-        await self._standing.until_ready()
-        handle.reply(None)
-
-    async def _taken(self, take: Take) -> int:
-        standing, server = self._standing, self._standing.server
-        standing.set_peer(take.leader, "live")
-        if take.state is not None and standing.kept > (standing.epoch, take.state.turn):
-            standing.ready()  # It has computed with the leader meanwhile, and is further than that.
-            return server.turn
-        await self.proceed.ask(Abandon(), timeout=FOREVER)
-        await server.drop_life()
-        server.install(take.state)
-        standing.log.replace(take.log)
-        if standing.computes:
-            await server.ensure()
-        standing.ready()
-        return server.turn
 
     @on(Where)
     def _where(self, message: Where) -> str:

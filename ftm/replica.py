@@ -24,10 +24,11 @@ from ..supervision.supervisor import Supervisor
 from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
 from .mechanism import Description, Mechanism, MechanismRefused, revive
 from .orders import Beat, Setting
-from .protocol import Assume, InnerProtocol, RequestProtocol
+from .protocol import InnerProtocol, RequestProtocol
 from .server import Server
 from .standing import Standing
 from .state import StateManager
+from .transfer import Assume
 
 SERVER, STATE, BEAT, PROTOCOL = "server", "state", "beat", "protocol"
 

@@ -24,8 +24,8 @@ from ..alarms import Diverged, ProtectionLost
 from ..bricks import FOREVER, After, Before, Brick, Proceed
 from ..mechanism import Mechanism, Role
 from ..messages import Done, Request, Work
-from ..protocol import ResyncPeer
 from ..standing import PeerLost
+from ..transfer import ResyncPeer
 
 FORWARDED = -1
 """In place of a batch's number: it came from the leader, and home knows nothing of it here."""

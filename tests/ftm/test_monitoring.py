@@ -1,14 +1,11 @@
 """The monitoring engine, as an actor: what it sees, what it has done, and what a person says to it (A6, T45, T46)."""
 
 import asyncio
-from collections.abc import Awaitable, Callable
-from typing import Any
 
 import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.actors.events import Event
 from holdfast.ftm.adaptations import (
     AdaptationDecided,
     AdaptationDone,
@@ -19,7 +16,7 @@ from holdfast.ftm.adaptations import (
     NothingValid,
 )
 from holdfast.ftm.application import Application
-from holdfast.ftm.judge import Judge, Readings, Settings
+from holdfast.ftm.judge import Readings
 from holdfast.ftm.model import Faults, Resources
 from holdfast.ftm.monitoring import (
     Adapt,
@@ -28,31 +25,13 @@ from holdfast.ftm.monitoring import (
     Forbid,
     Measured,
     MechanismIs,
-    Monitored,
-    MonitoringEngine,
     Object,
     Observe,
-    Report,
-    Watch,
-    read_machine,
 )
 from holdfast.testing import advance
-from tests.ftm.declarations import EIGHT
+from tests.ftm.monitored import APP, NARROW, SETTINGS, WIDE, World, in_world
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
-
-APP = Application("Account", state_bytes=10_000, request_bytes=100, rate=100)
-WIDE, NARROW = Readings(bandwidth=1e9, units=2), Readings(bandwidth=1e5, units=2)
-SETTINGS = Settings(required=Faults.of("crash"), smoothing=1, confirm=3, dwell=60, urgent_dwell=10)
-OURS = (
-    AdaptationDecided,
-    AdaptationDone,
-    AdaptationFailed,
-    AdaptationHeld,
-    AdaptationWithdrawn,
-    MonitoringBlind,
-    NothingValid,
-)
 
 
 class Boom(hf.Message): ...
@@ -73,60 +52,6 @@ class Engine(hf.Actor):
     @hf.on(Adapt)
     def adapt(self, message: Adapt) -> None:
         self.told.append(message)
-
-
-class World:
-    """One monitored address in a running system."""
-
-    def __init__(self, system: hf.ActorSystem, watch: Watch, orders: list[Adapt]) -> None:
-        self.system, self.watch, self.orders = system, watch, orders
-        self.events = system.events()
-        self.ref: hf.ActorRef[MonitoringEngine]
-
-    def told(self) -> list[Event]:
-        return [event for event in self.events.take() if isinstance(event, OURS)]
-
-    def names(self) -> list[str]:
-        return [type(event).__name__ for event in self.told()]
-
-    async def begin(self) -> None:
-        self.ref = await self.system.start(hf.child("monitor", hf.start(MonitoringEngine, self.watch)))
-
-    async def kill(self) -> None:
-        """It dies, and its supervisor starts it again."""
-        life = (await self.system.get_status(self.ref)).life
-        await self.system.terminate(self.ref, hf.Crash("ValueError", "boom"))
-        while (await self.system.get_status(self.ref)).life == life:
-            await asyncio.sleep(0)
-
-    async def report(self) -> Monitored:
-        return await self.ref.ask(Report())
-
-
-Play = Callable[[World], Awaitable[None]]
-
-
-async def in_world(
-    play: Play,
-    settings: Settings = SETTINGS,
-    current: tuple[str, ...] = ("pbr",),
-    resources: Resources | None = None,
-    application: Application = APP,
-    **options: Any,
-) -> None:
-    orders: list[Adapt] = []
-    options.setdefault("trigger", orders.append)
-    options.setdefault("probe", None)
-    judged = Judge(settings, application, current, EIGHT, resources or Resources(units=2))
-    async with hf.ActorSystem("app", log=False, intensity=100) as system:
-        watch = Watch("/app/alice", judged, **options)
-        world = World(system, watch, orders)
-        await world.begin()
-        try:
-            await play(world)
-        finally:
-            world.events.close()
-            watch.close()
 
 
 async def test_a_drop_in_bandwidth_is_decided_told_and_done() -> None:
@@ -425,77 +350,3 @@ async def test_a_change_that_somebody_else_made_counts() -> None:
         assert [order.current for order in world.orders] == [("tmr",)]
 
     await in_world(play, resources=Resources(units=3))
-
-
-# -- its own lives --------------------------------------------------------------------------------------------------
-
-
-async def test_what_it_knows_survives_its_death() -> None:
-    async def play(world: World) -> None:
-        world.ref.tell(Observe("mismatch", 3))
-        await advance(1.5)
-        await world.kill()
-        assert (await world.report()).faults == Faults.of("crash", "transient_value")
-        await advance(10)
-        assert [order.target for order in world.orders] == [("pbr", "tr")]
-
-    await in_world(play, application=Application("Account"))
-
-
-async def test_a_decision_in_the_middle_of_which_it_died_is_told_to_have_failed() -> None:
-    started: list[Adapt] = []
-
-    async def trigger(order: Adapt) -> None:
-        started.append(order)
-        if len(started) == 1:
-            await asyncio.Event().wait()
-
-    async def play(world: World) -> None:
-        world.ref.tell(Measured(NARROW))
-        await advance(6)
-        await world.kill()
-        assert "AdaptationFailed" in world.names()
-        await advance(20)
-        assert len(started) == 2
-        assert (await world.report()).current == ("lfr",)
-
-    await in_world(play, trigger=trigger)
-
-
-async def test_an_announcement_does_not_outlive_the_one_who_made_it() -> None:
-    settings = msgspec.structs.replace(SETTINGS, notice=10)
-
-    async def play(world: World) -> None:
-        world.ref.tell(Measured(NARROW))
-        await advance(5)
-        await world.kill()
-        events = world.told()
-        assert [event.reason for event in events if isinstance(event, AdaptationWithdrawn)] == [
-            "the monitoring engine was restarted"
-        ]
-        await advance(20)
-        assert len(world.orders) == 1  # it was decided again
-
-    await in_world(play, settings)
-
-
-async def test_its_own_load_is_no_reason_to_change() -> None:
-    """What the present mechanism computes makes the CPU busy; another one could have that time, too."""
-    app = Application("Account", rate=100, turn_seconds=0.004)  # 40 % of a unit for each run
-    settings = msgspec.structs.replace(SETTINGS, required=Faults.of("transient_value"))
-
-    async def play(world: World) -> None:
-        await advance(200)
-        assert world.orders == []
-        assert (await world.report()).resources.cpu == pytest.approx(0.95)
-
-    await in_world(play, settings, ("tr",), application=app, probe=lambda: Readings(units=1, cpu=0.15))
-
-
-async def test_this_machine_can_be_measured() -> None:
-    readings = read_machine()
-    assert readings.units is not None
-    assert readings.units >= 1
-    assert readings.cpu is not None
-    assert 0 <= readings.cpu <= 1
-    assert readings.energy is None or 0 <= readings.energy <= 1
