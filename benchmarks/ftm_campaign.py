@@ -77,4 +77,4 @@ async def soaking(run: Run) -> None:
     seconds = float(os.environ.get("HOLDFAST_SOAK", "5" if run.quick else "60"))
     found = await soak.run(seconds, random.Random(run.seed))
     print(f"# soak: {found}")
-    run.bound("soak: lost, wrong or doubled", len(found.bad.all()), unit="requests", target=0)
+    run.bound("soak: lost, wrong or doubled", len(found.bad.all()) + bool(found.stuck), unit="requests", target=0)

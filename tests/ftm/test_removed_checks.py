@@ -13,6 +13,7 @@ import pytest
 
 from tests.removing import Check, copied, is_true, missed, without
 
+JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
@@ -118,7 +119,7 @@ CHECKS = {
         "ftm/mechanisms/pbr.py",
         "            standing.log.add(message.log)  # Else",
         "            pass  # Else",
-        PBR,
+        JOINING,
         "test_an_outcome_whose_checkpoint_is_overtaken",
     ),
     "a state that was overtaken is not taken": Check(
@@ -136,17 +137,17 @@ CHECKS = {
         "test_what_has_changed_since",
     ),
     "T8c: who joins counts when it has all that has left": Check(
-        "ftm/protocol.py",
+        "ftm/transfer.py",
         "            await self._drain_bricks()  # What left while",
         "            pass  # What left while",
-        PBR,
+        JOINING,
         "test_a_backup_counts_only_when",
     ),
     "a life at an address that is known is brought to the state": Check(
-        "ftm/protocol.py",
+        "ftm/transfer.py",
         "        if standing.peer == path:  # It follows anew",
         "        if standing.peer == path:\n            return server.turn\n        if False:  # It follows anew",
-        PBR,
+        JOINING,
         "test_a_backup_that_lives_anew or test_a_backup_that_follows_anew",
     ),
     "a batch is computed once, however often it comes": Check(
