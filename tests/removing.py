@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -43,7 +43,7 @@ def copied(folder: Path) -> Path:
 
 
 @contextmanager
-def without(copy: Path, check: Check) -> Iterator[None]:
+def without(copy: Path, check: Check) -> Generator[None]:
     """In this block the check is not there."""
     file = copy / check.file
     whole = file.read_text()

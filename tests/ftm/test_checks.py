@@ -29,7 +29,7 @@ async def said(driver: Any, state: State, *, epoch: int) -> int:
     """What the backup answers to this state."""
     body = driver.system.node.codec.encoder.encode(Checkpoint(state, []))
     after = driver.system.node.cell_at(driver.path("r2") + "/after").ref
-    return msgspec.msgpack.decode(await after.ask(Letter(epoch, 0, CHECKPOINT, body)))  # type: ignore[no-any-return]
+    return msgspec.msgpack.decode(await after.ask(Letter(epoch, 0, CHECKPOINT, body)))
 
 
 async def test_who_was_not_told_that_it_follows_takes_nothing(system: hf.ActorSystem) -> None:
