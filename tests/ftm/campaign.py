@@ -272,7 +272,9 @@ class Campaign:
         """What was told, and whether a fault of this kind explains it."""
         told = self.events.take()
         trial.alarms = [type(one).__name__ for one in told if isinstance(one, TOLD)]
-        false: tuple[type[Any], ...] = () if self.kind in VALUES else OF_VALUES
+        # A follower that gets something twice, late or in another order has really come to something else.
+        is_out_of_order = self.kind in LATE and trial.fault.leads is False
+        false: tuple[type[Any], ...] = () if self.kind in VALUES or is_out_of_order else OF_VALUES
         if self.kind in LATE | FRAMES:
             false += OF_CRASHES
         wrong = [one for one in told if isinstance(one, false)]

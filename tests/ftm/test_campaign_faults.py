@@ -21,14 +21,12 @@ REQUESTS = int(os.environ.get("HOLDFAST_REQUESTS", "60"))
 IS_LONG = "HOLDFAST_REQUESTS" in os.environ
 FAULTS = 40 if IS_LONG else 2
 SHORT = {
-    ("PBR", "crash of a replica"), ("PBR", "crash while joining"), ("PBR", "crash of a root part"), ("PBR", "SIGSTOP"),
-    ("PBR", "message doubled"), ("LFR", "crash of a brick"), ("LFR", "message reordered"), ("TR", "state, transient"),
-    ("AD+PBR", "answer, permanent"), ("RB", "bug of the class"), ("NVP", "answer, transient"),
-    ("TMR", "crash of a replica"), ("TMR", "state, permanent"), ("SEC+PBR+TR", "frame altered"),
-    ("SEC+PBR+TR", "frame forged"), ("SEC+PBR+TR", "crash of a replica"), ("LFR+TR", "crash of a replica"),
+    ("PBR", "crash of a root part"), ("PBR", "message doubled"), ("LFR", "crash of a brick"),
+    ("TR", "state, transient"), ("AD+PBR", "answer, permanent"), ("RB", "bug of the class"), ("NVP", "answer, transient"),
+    ("TMR", "state, permanent"), ("SEC+PBR+TR", "frame altered"), ("LFR+TR", "crash of a replica"),
     ("PBR+own", "state, transient"),
 }  # fmt: skip
-"""Each mechanism and composition once, and more of those that all others stand on."""
+"""Each mechanism once. Crashes, stops and forged frames are struck by other tests too."""
 ROWS = [
     (name, kind)
     for name, make in STACKS.items()
@@ -54,8 +52,7 @@ async def test_a_claimed_fault_is_masked(name: str, kind: str) -> None:
     await kept(name, kind)
 
 
-@pytest.mark.parametrize("workload", ["bank", "store"])
-@pytest.mark.parametrize("name", ["PBR", "LFR"])
+@pytest.mark.parametrize(("name", "workload"), [("PBR", "bank"), ("LFR", "store")])
 async def test_crashes_of_replicas_are_masked_for_other_workloads(name: str, workload: str) -> None:
     """Transfers between two accounts by asks in the middle of a turn; a store whose history is linearizable."""
     await kept(name, "crash of a replica", workload)
