@@ -22,9 +22,9 @@ IS_LONG = "HOLDFAST_REQUESTS" in os.environ
 FAULTS = 40 if IS_LONG else 2
 SHORT = {
     ("PBR", "crash of a root part"), ("PBR", "message doubled"), ("LFR", "crash of a brick"),
-    ("TR", "state, transient"), ("AD+PBR", "answer, permanent"), ("RB", "bug of the class"), ("NVP", "answer, transient"),
-    ("TMR", "state, permanent"), ("SEC+PBR+TR", "frame altered"), ("LFR+TR", "crash of a replica"),
-    ("PBR+own", "state, transient"),
+    ("TR", "state, transient"), ("AD+PBR", "answer, permanent"), ("RB", "bug of the class"),
+    ("NVP", "answer, transient"), ("TMR", "state, permanent"), ("SEC+PBR+TR", "frame altered"),
+    ("LFR+TR", "crash of a replica"), ("PBR+own", "state, transient"),
 }  # fmt: skip
 """Each mechanism once. Crashes, stops and forged frames are struck by other tests too."""
 ROWS = [
