@@ -55,6 +55,7 @@ class Node(RunLoop):
         self.wall: Callable[[], float] = time.time
         self.outside: Callable[[str], Cell | None] | None = None  # finds cells of other processes
         self.root: Cell | None = None
+        self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
         self.here: Host = LOCAL  # lives in this very process
         self.awaited: dict[str, list[Callable[[], None]]] = {}  # what is done when somebody comes to live at a path

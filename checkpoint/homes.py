@@ -7,8 +7,8 @@ import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..actors.cell import GONE, RUNNING, Cell
-from ..actors.errors import HoldfastError, StartFailed, StartIgnored
+from ..actors.cell import DOWN, GONE, RUNNING, Cell
+from ..actors.errors import ControlFailed, HoldfastError, StartFailed, StartIgnored
 from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
 from ..actors.keeper import child_key
@@ -26,7 +26,7 @@ from .quarantine import PLACE, Quarantine
 from .recovery.held import hold, inlet, let_go
 from .recovery.register import Recoveries, Recovery
 from .rejoin import Rejoin
-from .rollback import roll_back
+from .rollback import older_snapshot, roll_back
 from .switch import Switch
 
 if TYPE_CHECKING:
@@ -129,6 +129,22 @@ class Homes:
         """The cell of a recorded address that waits for its next life, even if the tree above it is down."""
         switch = self._switches.get(path)
         return None if switch is None or switch.cell is None or switch.cell.state is GONE else switch.cell
+
+    def roll_back(self, path: str, why: str) -> None:
+        """Have the next life at an address, where nobody lives now, begin with the snapshot before the newest.
+
+        Raises:
+            ControlFailed: nothing is recorded there, somebody lives there, or there is no older snapshot.
+            HoldfastError: the store refused.
+        """
+        switch = self._switches.get(path)
+        if switch is None:
+            raise ControlFailed(path, "roll_back", "nothing was recorded of it in this run")
+        if switch.cell is not None and switch.cell.state not in (DOWN, GONE):
+            raise ControlFailed(path, "roll_back", "it runs: stop it first")
+        if older_snapshot(switch) is None:
+            raise ControlFailed(path, "roll_back", "there is no older snapshot")
+        roll_back(switch, "older_snapshot", why)
 
     def __iter__(self) -> Iterator[Switch]:
         return iter(self._switches.values())

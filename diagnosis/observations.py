@@ -112,6 +112,10 @@ class ObservationSet:
         for atom in tuple(self._seen):
             self._drop(atom, source)
 
+    def words(self, atom: Literal) -> tuple[Observation, ...]:
+        """The last word of each source on an atom, also if it has outlived its time to live."""
+        return tuple(self._seen.get(atom.atom, {}).values())
+
     def expire(self, now: float) -> tuple[Observation, ...]:
         """Drop, and return, what has outlived its time to live."""
         dead = [seen for words in self._seen.values() for seen in words.values() if not seen.is_current(now)]

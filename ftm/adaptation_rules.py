@@ -56,18 +56,18 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
     from .replica import weave
 
     above: Mechanism | None = None
-    replicating: Mechanism | None = None
     for one in layers:
         if one.layer not in ORDER:
             raise MechanismRefused(one.name, f"its layer is {one.layer!r}; there are {', '.join(ORDER)}")
         if above is not None and ORDER.index(one.layer) < ORDER.index(above.layer):
             why = f"({one.layer}) must stand outside of {above.name} ({above.layer}), not inside"
             raise MechanismRefused(one.name, f"it {why}")
-        if one.replicas > 1:
-            if replicating is not None:
-                why = f"it wants {one.replicas} replicas, and {replicating.name} outside of it keeps replicas already"
-                raise MechanismRefused(one.name, why)
-            replicating = one
+        if above is not None and one.layer == above.layer:
+            raise MechanismRefused(one.name, _both(one, above))
+        others = [other for other in layers[: layers.index(one)] if 1 < other.replicas != one.replicas > 1]
+        if others:
+            why = f"it wants {one.replicas} replicas, and {others[0].name} outside of it {others[0].replicas}"
+            raise MechanismRefused(one.name, why)
         above = one
         inside: frozenset[str] = getattr(one, "over", frozenset())
         here = {other.layer for other in layers[layers.index(one) + 1 :]}
@@ -77,6 +77,14 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
             one.check(kind, where)
     for leads in (True, False):
         weave(layers, leads=leads)
+
+
+def _both(one: Mechanism, above: Mechanism) -> str:
+    if one.name == above.name:
+        return "it stands in the composition twice"
+    if one.replicas > 1 and above.replicas > 1:
+        return f"it wants {one.replicas} replicas, and {above.name} outside of it keeps replicas already"
+    return f"it and {above.name} are both of {one.layer}: two of them would work against each other"
 
 
 def describe(layers: Any) -> list[Description] | None:

@@ -16,33 +16,19 @@ from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.mail import ReplyHandle
-from ..actors.message import Message, Refusal, message_name
-from ..actors.ref import ActorRef, current
-from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd, pieces
-from .letters import LETTER_BYTES, SEALED, Letter, Letters, Sheet
-from .messages import ConfigMismatch, Done, Ended, Inward, NotFollowing, Outward, StaleEpoch, Taken, Work
-from .sealed import Part, Refused
+from ..actors.message import Message
+from ..actors.ref import current
+from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd
+from .letters import FOREVER as FOREVER
+from .messages import FORWARDED, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
+from .post import Inbox, Posting
 from .sealing import sealed
-from .standing import PeerLost
 
 if TYPE_CHECKING:
     from .mechanism import Mechanism
-    from .sealed import SecuredLink
     from .standing import Standing
 
 R = TypeVar("R")
-
-FOREVER = 10.0 * 86400.0
-"""Seconds: the bricks of one replica wait for each other as long as it takes; a death is told otherwise."""
-AGAIN = 0.02
-"""Seconds after which the other replica is asked again, if it could not be reached and still counts."""
-
-
-class Where(Message[str]):
-    """The address of a brick of this replica, in this configuration."""
-
-    config: int
-    slot: str
 
 
 class Settle(Message[None]):
@@ -57,7 +43,7 @@ class Abandon(Message[None]):
     """Drop what is being computed, and what waits to be; answered when nothing is."""
 
 
-class Brick(Letters):
+class Brick(Posting):
     """What all bricks have in common."""
 
     deterministic = False
@@ -69,6 +55,7 @@ class Brick(Letters):
     def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
         self._standing, self.mechanism, self.slot = standing, mechanism, slot
         self._sheets: dict[int, list[bytes]] = {}
+        self._inboxes: dict[int, Inbox] = {}
         self._numbers = itertools.count(1)
         self._sending = asyncio.Lock()
         self._handle: ReplyHandle[Any] | None = None
@@ -98,145 +85,6 @@ class Brick(Letters):
     async def from_peer(self, message: Message[Any]) -> Any:
         """Take what the same brick of the other replica says; its epoch and configuration are ours."""
         raise TypeError(f"{type(self).__name__} takes nothing from its peer, and got {type(message).__name__}")
-
-    async def ask_peer(self, message: Message[R]) -> R:
-        """Ask the same brick of the other replica, again and again until it answers or does not count any more.
-
-        Raises:
-            PeerLost: nobody waits for it any longer. StaleEpoch: it is we that do not count.
-        """
-        standing = self._standing
-        codec = standing.node.codec
-        body = codec.encoder.encode(message)
-        peer = standing.peer
-        if standing.link is not None:
-            if peer is None:
-                raise PeerLost("there is none")
-            return codec.decode_reply(type(message), await self._ask_peer_sealed(standing.link, peer, message, body))  # type: ignore[no-any-return]
-        while True:
-            if peer is None or standing.peer != peer:
-                raise PeerLost("there is none")
-            try:
-                async with self._sending:  # In order: finding the peer takes the first one longer than the others.
-                    if standing.peer != peer:
-                        continue
-                    ref = await self._find_peer(peer)
-                    asked = ref.ask(self._letter(ref, message, body), timeout=FOREVER)
-                reply = await standing.wait_for(asked)
-            except (PeerLost, ConfigMismatch):
-                raise
-            except StaleEpoch:
-                standing.fence()
-                raise
-            except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
-                standing.lost(self.slot)
-                await standing.changes(AGAIN)
-                continue
-            return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
-
-    async def _ask_peer_sealed(self, link: SecuredLink, peer: str, message: Message[Any], body: bytes) -> bytes:
-        standing, part = self._standing, Part(message_name(type(message)), body)
-        while True:
-            try:
-                return await self._ask_sealed(
-                    link, peer, self.slot, part,
-                    lambda: self._find_peer(peer), lambda error: standing.lost(self.slot),
-                    lambda: standing.peer == peer,
-                )  # fmt: skip
-            except NotFollowing:  # It is told soon that it follows.
-                await standing.changes(AGAIN)
-
-    async def ask_at(self, path: str, slot: str, message: Message[R]) -> R:
-        """Ask a brick of a certain replica, once.
-
-        Raises:
-            HoldfastError: it cannot be reached, or has died. PeerLost: who is our peer has changed meanwhile.
-        """
-        standing, key = self._standing, f"{path}#{slot}"
-        codec = standing.node.codec
-        body = codec.encoder.encode(message)
-        if standing.link is not None:
-            errors: list[HoldfastError] = []
-            part = Part(message_name(type(message)), body)
-            try:
-                back = await self._ask_sealed(
-                    standing.link, path, slot, part, lambda: self._find(path, slot), errors.append, lambda: not errors
-                )
-            except PeerLost as lost:
-                standing.lost(key)
-                raise (errors or [lost])[0] from None
-            return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
-        try:
-            ref = await self._find(path, slot)
-            reply = await standing.wait_for(ref.ask(self._letter(ref, message, body), timeout=FOREVER))
-        except StaleEpoch:
-            standing.fence()
-            raise
-        except HoldfastError:
-            standing.lost(key)
-            raise
-        return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
-
-    async def _find(self, path: str, slot: str) -> ActorRef[Any]:
-        standing, key = self._standing, f"{path}#{slot}"
-        ref = standing.brick(key)
-        if ref is None:
-            where = Where(standing.config, slot)
-            asked = standing.node.cell_at(f"{path}/protocol").ref.ask(where, timeout=FOREVER)
-            ref = standing.node.cell_at(await standing.wait_for(asked)).ref
-            standing.found(key, ref)
-        return ref
-
-    def _letter(self, ref: ActorRef[Any], message: Message[Any], body: bytes) -> Letter:
-        standing, number = self._standing, 0
-        if len(body) > LETTER_BYTES:
-            number = next(self._numbers)
-            for part in pieces(body):
-                ref.tell(Sheet(number, part))
-            body = b""
-        return Letter(standing.epoch, standing.config, message_name(type(message)), body, number)
-
-    async def _find_peer(self, path: str) -> ActorRef[Any]:
-        standing = self._standing
-        ref = standing.brick(self.slot)
-        if ref is None:
-            node = standing.node
-            asked = node.cell_at(f"{path}/protocol").ref.ask(Where(standing.config, self.slot), timeout=FOREVER)
-            cell = node.cell_at(await standing.wait_for(asked))
-            ref = cell.ref
-            standing.found(self.slot, ref)
-            node.bind(self.ctx.cell, "peer", cell)
-        return ref
-
-    @on(Sheet)
-    def _sheet(self, message: Sheet) -> None:
-        self._sheets.setdefault(message.sheets, []).append(message.data)
-
-    @on(Letter)
-    async def _take_letter(self, letter: Letter) -> bytes | ReplyHandle[bytes]:
-        sheets = self._sheets.pop(letter.sheets, []) if letter.sheets else []
-        standing = self._standing
-        if standing.link is not None:
-            return await self._take_sealed(standing.link, b"".join(sheets) if sheets else letter.body)
-        if letter.name == SEALED:
-            raise Refused(path=standing.path, reason="closed")
-        self._check_sender(letter.epoch, letter.config)
-        kind = next((one for one in self.peer_messages if message_name(one) == letter.name), None)
-        if kind is None:
-            raise TypeError(f"{type(self).__name__} takes no {letter.name} from its peer")
-        codec = standing.node.codec
-        message = codec.decode(kind, b"".join(sheets) if sheets else letter.body)
-        if not self.answers_later:
-            return codec.encode(await self.from_peer(message), self.ctx.path)
-        handle: ReplyHandle[bytes] = self.ctx.reply_handle()
-        self.ctx.create_task(self._answer_letter(handle, message))
-        return handle
-
-    async def _answer_letter(self, handle: ReplyHandle[bytes], message: Message[Any]) -> None:
-        try:
-            handle.reply(self._standing.node.codec.encode(await self.from_peer(message), self.ctx.path))
-        except Refusal as no:
-            handle.fail(no)
 
     @on(Settle)
     def _settle(self, message: Settle) -> None:
@@ -339,8 +187,13 @@ class Proceed(Brick):
         self._go_on()
 
     def _knows(self, work: Work) -> bool:
-        """Whether this is a batch that came before (a duplicate on its way here): to run it again is to do it twice."""
-        if work.number < 0:  # Forwarded by a leader, or a marker.
+        """Whether this came before (a duplicate on its way here), or was meant for a state that is not here any more.
+
+        To run it again is to do it twice.
+        """
+        if work.number <= FORWARDED:
+            return work.number != self._standing.forwarded_as
+        if work.number < 0:  # A marker.
             return False
         is_known = work.number <= self._last and work.epoch == self._last_epoch
         if is_known:

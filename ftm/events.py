@@ -54,6 +54,14 @@ class ReplicaLost(Event, frozen=True, eq=False):
     why: str
 
 
+class ReplicaFaulty(Event, frozen=True, eq=False):
+    """A follower has diverged `times` times in a row, right after it had the leader's state: its process is ended."""
+
+    replica: str
+    epoch: int
+    times: int
+
+
 class WrongSuspicion(Event, frozen=True, eq=False):
     """A replica that was suspected has been heard of again; `wrong` counts these at its address."""
 
@@ -62,7 +70,8 @@ class WrongSuspicion(Event, frozen=True, eq=False):
 
 
 class BackgroundWorkLost(Event, frozen=True, eq=False):
-    """Whoever led has died with background work (`pipe_to_self`) out, and no journal leads to its being begun again."""
+    """Whoever led has died, or its life was begun again because a turn failed, with background work (`pipe_to_self`)
+    out, and no journal leads to its being begun anew."""
 
     epoch: int
     count: int

@@ -7,6 +7,7 @@ only then the proxy sends to it.
 
 from __future__ import annotations
 
+import asyncio
 import time
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,6 @@ from .messages import Lead
 from .orders import Peer
 
 if TYPE_CHECKING:
-    import asyncio
     from collections.abc import Callable
 
     from .group import Group
@@ -61,6 +61,9 @@ class FailoverManager(Actor):
                 if group.is_awaited(group.primary):  # To end it would lose what only it has.
                     self._later()
                     return
+                if not group.hold.take(f"{group.primary} does not lead any more"):
+                    self._later()
+                    return
                 self._depose(group.primary)
             elif group.primary is None:
                 if not await self._replaced():
@@ -90,7 +93,7 @@ class FailoverManager(Actor):
                 group.lost(leading, group.why)
                 group.leading = None
             left = group.backups()
-            if left and group.work_is_lost():  # From the journal it is begun again.
+            if left and group.background.is_lost():  # From the journal it is begun again.
                 group.why, left = f"{group.why}, with background work (pipe_to_self) out", []
             if not left:
                 group.is_over = True
@@ -127,6 +130,7 @@ class FailoverManager(Actor):
         for other in [one for one in group.members if one != name]:
             group.lost(other, "it has to catch up with the new primary")
         group.failovers += 1
+        group.hold.give_back()
         seconds = time.monotonic() - group.noticed if group.noticed else 0.0
         group.noticed = 0.0
         group.send_again(careful=True)
@@ -139,6 +143,11 @@ class FailoverManager(Actor):
             if group.life_of(name) != life:  # Its next life has to be told first that it follows.
                 del group.joining[name]
                 group.dropped.add(name)
+        for name, life in list(group.strays.faulty.items()):
+            self._step("kill")
+            await bury(group, name, life)
+            group.strays.faulty.pop(name, None)
+            found = True
         for name in group.names:
             life = group.members.get(name, 0) or group.up.get(name, 0)
             if name == group.primary or not life:
@@ -183,6 +192,15 @@ class FailoverManager(Actor):
 
 async def bury(group: Group, name: str, life: int) -> None:
     """Kill a replica's process, if it is that life, and wait until it has been reaped."""
+    while not group.is_over:
+        with group.hold.of(group.place(name), "it does not count any more") as is_ours:
+            if is_ours:
+                await _killed(group, name, life)
+                return
+        await asyncio.sleep(AGAIN_AFTER)
+
+
+async def _killed(group: Group, name: str, life: int) -> None:
     cell = group.cell_of(name)
     if cell is None or cell.life != life or cell.state is not RUNNING:
         return

@@ -25,7 +25,6 @@ from ..checkpoint.records import (
     Feed,
     Go,
     Live,
-    Out,
     Outcome,
     PipeDone,
     Released,
@@ -34,10 +33,13 @@ from ..checkpoint.records import (
     TurnEnd,
 )  # fmt: skip
 from ..checkpoint.saved import meta_now, put
+from .background import Background
 from .detector import Detection
-from .events import BackgroundWorkLost, ReplicaLost, WrongSuspicion
-from .messages import Done, Ended, Inward, Outward, Request, Work
+from .events import ReplicaLost, WrongSuspicion
+from .hold import Hold
+from .messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
 from .securing import Securing
+from .strays import Strays
 
 if TYPE_CHECKING:
     from ..actors.node import Node
@@ -68,6 +70,7 @@ class Group(Securing):
         self.cell, self.switch, self.names, self.detection = cell, switch, names, detection
         self.path = cell.path
         self.config = config
+        self.hold = Hold(self.node, self.path)
         # Who leads, and who may.
         self.epoch = epoch
         self.primary: str | None = None
@@ -80,6 +83,7 @@ class Group(Securing):
         self.up: dict[str, int] = {}  # name to life, of those heard of
         self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}
+        self.strays = Strays(self)
         self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
         self.failovers = 0
@@ -91,6 +95,7 @@ class Group(Securing):
         self.finished: list[Ended] = []  # parts whose outcomes somebody waits to be at home
         self.ledger: dict[int, Feed] = {}  # what the home has fed and not heard the end of, in that order
         self.careful: set[int] = set()  # inputs in whose company a replica has died: each is sent alone
+        self.inside: set[int] = set()  # inputs that a replica had that does not lead any more, not ended since
         self.out: Work | None = None
         self.number = 0
         self.is_again = False
@@ -103,7 +108,7 @@ class Group(Securing):
         self.is_joining = False  # a replica is catching up
         self.is_poked = False
         self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
-        self.piped: set[tuple[int, int]] = set()  # background work that is out, by turn and output
+        self.background = Background(self)
         self._quiet: list[asyncio.Future[None]] = []
         self._stirred: list[asyncio.Future[None]] = []
         # Whom to tell.
@@ -192,6 +197,7 @@ class Group(Securing):
     def joined(self, name: str, life: int) -> None:
         """A replica has caught up, and could lead."""
         self.members[name] = life
+        self.strays.joined(name, life)
         self.stir()
         self.go_on()
         self.on_joined()
@@ -257,24 +263,26 @@ class Group(Securing):
             self.tell("proxy", Flush())
 
     def next_inward(self) -> Inward | None:
-        """What goes past the bricks."""
+        """What goes past the bricks; a snapshot is asked for when the home knows all that a replica does."""
         if not self.inward or self.primary is None:
             return None
         records, self.inward = self.inward, []
-        return Inward(self.epoch, records)
+        if self.inside:
+            self.inward = [one for one in records if isinstance(one, SnapshotNow)]
+            records = [one for one in records if not isinstance(one, SnapshotNow)]
+        return Inward(self.epoch, records) if records else None
 
     def next_work(self) -> Work | None:
-        """The next batch, if there is something, and none is out."""
-        if self.out is not None or self.primary is None or not self.waiting or self.is_suspended or self.is_stopping:
+        """The next batch, if there is something, and none is out. What was inside once is ended in any case."""
+        if self.out is not None or self.primary is None or not self.waiting or (self.has_gone and self.is_held):
             return None
-        if self.is_resting:
-            return None
-        if self.has_gone and self.is_held:
-            return None
+        takes_new = not (self.is_suspended or self.is_stopping or self.is_resting)
         requests, go, size = list[Request](), None, 0
         lives: dict[str, int] = {}
         while self.waiting and len(requests) < MOST_REQUESTS and size < MOST_BYTES:
             first = self.waiting[0]
+            if not takes_new and (isinstance(first, Go) or first.id not in self.inside):
+                break
             if isinstance(first, Go):
                 go = first
                 self.has_gone = True
@@ -286,6 +294,7 @@ class Group(Securing):
             self.waiting.popleft()
             if self.is_live and first.id not in self.switch.open:
                 self.ledger.pop(first.id, None)  # The home has dropped it meanwhile.
+                self._ended({first.id})
                 continue
             requests.append(self._request(first, lives))
             size += len(first.body)
@@ -317,6 +326,8 @@ class Group(Securing):
             self.careful = {one.feed.id for one in self.out.requests if one.feed.id in self.ledger}
         left = [feed for feed in self.ledger.values() if not self.is_live or feed.id in self.switch.open]
         self.ledger = {feed.id: feed for feed in left}
+        unsent = {one.id for one in self.waiting if isinstance(one, Feed)} - self.inside
+        self.inside = self.ledger.keys() - unsent
         left.sort(key=lambda feed: feed.id != begun)
         gone = [one for one in self.waiting if isinstance(one, Go)]
         self.waiting = deque(left)
@@ -359,9 +370,15 @@ class Group(Securing):
         for record in done.more:
             if isinstance(record, Closed):
                 self.on_ended(record.reason)
+            elif isinstance(record, Strayed):
+                self.strays.told(record.path)
+            elif isinstance(record, WorkLost):
+                if self.background.is_lost(record.turn):
+                    self._give_up("a turn has failed with background work (pipe_to_self) out")
+                    return
             else:
                 if isinstance(record, PipeDone):
-                    self.piped.discard((record.turn, record.k))
+                    self.background.back(record)
                 self.switch.from_life(record)
         if done.live is not None and not self.is_live:
             self.is_live = True
@@ -369,8 +386,9 @@ class Group(Securing):
         out = self.out
         if done.is_last and out is not None and out.number == done.number:
             self.out = None
-            self._told_quiet()
-            self.careful.difference_update(one.feed.id for one in out.requests)
+            ended = {one.feed.id for one in out.requests}
+            self.careful -= ended
+            self._ended(ended)
             self._forget_turns()
         if done.wait:
             self.finished.append(Ended(self.epoch, done.part))
@@ -379,11 +397,17 @@ class Group(Securing):
         """A future that ends when nothing is inside any more; somebody has seen to it that nothing new goes in."""
         future: asyncio.Future[None] = self.node.loop.create_future()
         self._quiet.append(future)
-        if self.out is None and self.primary is not None:
-            self._told_quiet()
+        self._ended(set())
         return future
 
-    def _told_quiet(self) -> None:
+    def _ended(self, ids: set[int]) -> None:
+        """These have; whoever waits for that hears when there are no others inside."""
+        if self.inside:
+            self.inside -= ids
+            if not self.inside:
+                self.poke()  # What was held back meanwhile.
+        if self.inside or self.out is not None or self.primary is None:
+            return
         waiting, self._quiet = self._quiet, []
         for future in waiting:
             if not future.done():
@@ -397,21 +421,8 @@ class Group(Securing):
                     self._is_behind(record.turn)
                     return
                 if isinstance(record, Released):
-                    self._note_work(record.turn, record.outs)
+                    self.background.note(record.turn, record.outs)
                 self.switch.from_life(record)
-
-    def _note_work(self, turn: int, outs: list[Out]) -> None:
-        """Background work runs in the process of the replica that leads, and is part of no state."""
-        done = self.switch.pipes_done.get(turn, ())
-        self.piped.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
-
-    def work_is_lost(self) -> bool:
-        """Whoever led has died: is its background work only begun again if all is replayed? Tells of what is not."""
-        out, self.piped = self.piped, set()
-        if not out or self.switch.method.replays:
-            return bool(out)
-        self.node.emit(BackgroundWorkLost(self.path, self.epoch, len(out)))
-        return False
 
     def _is_front(self, record: Released) -> bool:
         """Whether it is of the turn that comes next, or of one that is known."""
@@ -427,9 +438,13 @@ class Group(Securing):
 
         It must never count: from the snapshot and the journal the life is as it was.
         """
+        self._give_up(f"{self.primary} has not got the state that was acknowledged at turn {turn}")
+
+    def _give_up(self, why: str) -> None:
+        """The life is over; another one begins as its home has it."""
         self.out = None  # It is nobody's fault that is inside.
-        self.is_over, self.why = True, f"{self.primary} has not got the state that was acknowledged at turn {turn}"
-        self.on_over(self.why)
+        self.is_over, self.why = True, why
+        self.on_over(why)
 
     def _is_of_now(self, epoch: int) -> bool:
         if epoch == self.epoch and not self.is_over and (self.primary or self.leading) is not None:
@@ -458,7 +473,7 @@ class Group(Securing):
             self.on_start_failed(end)
             return
         if end.outs:
-            self._note_work(end.turn, end.outs)
+            self.background.note(end.turn, end.outs)
         switch.from_life(end)
         if end.status != STASHED:
             self.ledger.pop(end.id, None)

@@ -347,8 +347,8 @@ class GroupHost(Steered):
         ended: ExitReason = KILLED
         while group.primary is not None or group.leading is not None:
             primary, epoch = group.primary, group.epoch
-            if primary is None:
-                await asyncio.sleep(0.005)  # Another one is being told to lead.
+            if primary is None or group.inside:
+                await asyncio.sleep(0.005)  # Another one is being told to lead, or knows more than the home.
                 continue
             try:
                 await group.protocol(primary).ask(Finish(epoch, dict(pack_exit(reason))), FINISHED_WITHIN)
@@ -412,6 +412,7 @@ class GroupHost(Steered):
         group, self.group = self.group, None
         if group is not None:
             group.is_over = True
+            group.hold.give_back()
             if group.link is not None:
                 group.link.close()
             if group.change is not None:
@@ -432,6 +433,7 @@ class GroupHost(Steered):
         if ftm is not None and ftm.state is not GONE:
             if self.group is not None:
                 self.group.is_over = True
+                self.group.hold.give_back()
                 if self.group.change is not None:
                     self.group.change.close("it has stopped")
             ftm.kill()

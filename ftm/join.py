@@ -58,6 +58,11 @@ class Joiner(Actor):
             life = group.life_of(name)
             if not life or group.up.get(name) != life or group.suspects.get(name) == life or group.dropped:
                 continue
+            if name in group.strays.faulty:
+                continue  # It ends, which wakes us.
+            if (pause := group.strays.pause(name, life)) > 0:
+                self._later(pause)
+                continue
             group.is_joining = True
             try:
                 await self._join(primary, name, life)
@@ -78,7 +83,10 @@ class Joiner(Actor):
         group.on_joining(name)
         group.joining[name] = life
         group.watch(name)
+        strayed = group.strays.count
         turn = await group.protocol(primary).ask(Join(epoch, group.place(name)), JOINED_WITHIN)
+        if group.strays.count != strayed:
+            return  # What it had joined with is lost already; whoever has heard of that wakes us.
         if group.epoch != epoch or group.primary != primary or group.life_of(name) != life or group.is_over:
             if group.epoch == epoch and group.primary == primary and group.life_of(name) != life:
                 group.dropped.add(name)  # The primary may wait for the life that has ended.
@@ -88,9 +96,11 @@ class Joiner(Actor):
         group.node.emit(ReplicaJoined(group.path, name, epoch, turn, time.monotonic() - begin))
         group.wake()
 
-    def _later(self) -> None:
+    def _later(self, seconds: float | None = None) -> None:
+        """Look again then; None: what has failed is tried again, after longer each time."""
         loop = self.ctx.cell.node.loop
         if self._timer is not None:
             self._timer.cancel()
-        self._timer = loop.call_later(self._delay, self._group.tell, "join", Look())
-        self._delay = min(self._delay * 2, LONGEST_RETRY)
+        self._timer = loop.call_later(seconds or self._delay, self._group.tell, "join", Look())
+        if seconds is None:
+            self._delay = min(self._delay * 2, LONGEST_RETRY)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from .standing import Standing
 
 
+FOREVER = 10.0 * 86400.0
+"""Seconds: the bricks of one replica wait for each other as long as it takes; a death is told otherwise."""
 SEALED = "sealed"
 """The name of a letter that says it inside."""
 LETTER_BYTES = 8 * 1024 * 1024
@@ -34,6 +36,10 @@ class Letter(Message[bytes]):
     name: str
     body: bytes
     sheets: int = 0
+    size: int = 0  # of the body, sheets and all
+    stream: int = 0
+    number: int = 0  # in the stream
+    floor: int = 0  # of those before it, none is asked again
 
 
 class Sheet(Message):

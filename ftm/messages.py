@@ -59,6 +59,19 @@ class ReplyEvicted(Refusal):
     number: int
 
 
+FORWARDED = -(1 << 40)
+"""A batch with this number or a lower one came from a leader, and home knows nothing of it here.
+
+Each state that a follower takes lowers the number: what was on its way to the one before is known by that.
+"""
+
+
+class CannotLead(Refusal):
+    """This replica does not have the state of the last leader (any more): another one has to lead, or none."""
+
+    path: str
+
+
 class Request(msgspec.Struct, array_like=True):
     """One request: who has sent it, in which life, and its number at the address (A45)."""
 
@@ -91,6 +104,22 @@ class Taken(msgspec.Struct, array_like=True):
     """The state behind these outcomes is captured, or nobody needs it: go on."""
 
 
+class Strayed(msgspec.Struct, array_like=True, tag=41):
+    """From a leader: the replica at this path has not got our state any more, and does not count."""
+
+    path: str
+
+
+class WorkLost(msgspec.Struct, array_like=True, tag=42):
+    """From a leader: background work that turns up to this one had begun has ended with the life that ran it."""
+
+    turn: int
+
+
+Beside = PipeDone | Snapshot | Unsaved | Closed | Ignored | Strayed | WorkLost
+"""What goes home besides the ends of turns, behind them."""
+
+
 class Done(Message[Taken]):
     """Outcomes on their way out, in turn order: all of a batch, or a part of it. Asked by Proceed, told to the Proxy.
 
@@ -104,7 +133,7 @@ class Done(Message[Taken]):
     ends: list[TurnEnd]
     is_last: bool
     live: Live | None = None
-    more: list[PipeDone | Snapshot | Unsaved | Closed | Ignored] = []  # noqa: RUF012  # a struct copies it
+    more: list[Beside] = []  # noqa: RUF012  # a struct copies it
     part: int = 0
     wait: bool = False
 

@@ -182,6 +182,8 @@ def nesting_problems(layers: Mechanisms) -> tuple[str, ...]:
 def _pair_problem(outer: Entry, inner: Entry) -> str:
     if outer.layer == inner.layer:
         return f"{outer.name} and {inner.name} are both of {inner.layer}: two of them would work against each other"
+    if 1 < outer.replicas != inner.replicas > 1:
+        return f"{outer.name} keeps {outer.replicas} replicas, and {inner.name} {inner.replicas}"
     if LAYERS.index(outer.layer) < LAYERS.index(inner.layer):
         return ""
     if inner.layer == "link":

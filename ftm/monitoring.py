@@ -22,6 +22,7 @@ from ..actors.actor import Actor, on
 from ..actors.events import Event, EventHub, EventStream
 from ..actors.message import Message
 from ..actors.ref import ActorRef
+from ..supervision.arbiter import Hand, arbiter_of
 from .adaptations import (
     AdaptationDecided,
     AdaptationDone,
@@ -330,7 +331,11 @@ class MonitoringEngine(Actor):
                 self._withdraw(f"it is not wanted any more: {verdict.reason}")
             return
         if verdict.kind == ADAPT:
-            self._announce(verdict)
+            busy = arbiter_of(self.ctx.cell.node).in_the_way(watch.address, Hand.ADAPTATION)
+            if busy is None:
+                self._announce(verdict)
+            else:  # It would be refused.
+                self._tell_once((HOLD, busy.hand), AdaptationHeld, Verdict(HOLD, str(busy), verdict.target))
         elif verdict.kind == HOLD:
             self._tell_once((HOLD, verdict.target), AdaptationHeld, verdict)
         elif verdict.kind == NONE:

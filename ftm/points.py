@@ -22,23 +22,18 @@ from ..checkpoint.keys import key_names, restore_state, save_state, variables
 from ..checkpoint.method import Method
 from ..checkpoint.records import (
     FAILED,
-    Closed,
     Feed,
     Go,
-    Ignored,
     Live,
     Out,
     Outcome,
-    PipeDone,
     Released,
     Restore,
-    Snapshot,
     TurnEnd,
-    Unsaved,
 )
 from ..checkpoint.turns import Fed, GoLive
 from .life import ENDED, NOWHERE, OVER, BeginAgain, PartOver, ServerLife, Skip
-from .messages import Request, State
+from .messages import Beside, Request, State, WorkLost
 
 if TYPE_CHECKING:
     from .server import Server
@@ -73,7 +68,7 @@ class Points(lives.LocalHost):
         self.heard: dict[tuple[int, int], Outcome] = {}  # outcomes of asks since the point before the last part
         self.released: dict[int, list[int]] = {}  # digests of what left in the middle of turns, by turn
         self.ends: list[TurnEnd] = []
-        self.more: list[PipeDone | Snapshot | Unsaved | Closed | Ignored] = []
+        self.more: list[Beside] = []
         self.begun: list[Request] = []
         self.alone: set[tuple[str, str]] = set()  # inputs that have wanted to be at the front once
         self.handed = self.confirmed = 0  # parts: handed over, known to be at home
@@ -98,6 +93,7 @@ class Points(lives.LocalHost):
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None
         self._crashes = 0
+        self._is_work_lost = False
         self._start_turn = -1
         self._async: frozenset[str] | None = None
 
@@ -153,6 +149,10 @@ class Points(lives.LocalHost):
         turn = self._start_turn if point is None else point.turn
         life.begin(start, turn, [] if point is None else point.stash_ids)
         self.life = life
+        if self._is_work_lost:
+            self._is_work_lost = False
+            self.more.append(WorkLost(turn))
+            self.on_more()
         if point is not None:
             cell.extra().trap_exits = point.traps
         actor: Any = cell.actor
@@ -190,6 +190,7 @@ class Points(lives.LocalHost):
         """End the life without a word: its state is kept as bytes."""
         cell = self.cell
         life, self.life = self.life, None
+        self.note_work(life)
         self.work_back()
         if life is None or cell is None or cell.state is DOWN:
             return
@@ -197,6 +198,11 @@ class Points(lives.LocalHost):
         gone = cell.ended()
         self.kill(cell)
         await gone
+
+    def note_work(self, life: ServerLife | None) -> None:
+        """A life has ended; its background work has ended with it, and nobody runs its turns again to begin it anew."""
+        if life is not None and life.pipes and self.standing.leads:
+            self._is_work_lost = True
 
     async def until_work_is_back(self) -> None:
         """Wait until no background work is out: it is part of no state."""

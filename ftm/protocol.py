@@ -21,8 +21,9 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
-from .bricks import FOREVER, Brick, Flush, Where
+from .bricks import FOREVER, Brick, Flush
 from .messages import (
+    CannotLead,
     ConfigMismatch,
     Done,
     Ended,
@@ -36,6 +37,7 @@ from .messages import (
     Work,
 )
 from .orders import Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
+from .post import Where
 from .sealed import Refused
 from .transfer import Assume, Transfer
 
@@ -245,8 +247,10 @@ class RequestProtocol(Transfer):
         standing, server = self._standing, self._standing.server
         if standing.leads and standing.leading == epoch:
             return server.turn
+        if standing.follows and not standing.is_ready:  # It has diverged, or was never brought to the leader's state.
+            raise CannotLead(path=standing.path)
         standing.set_peer(None, "none")
-        standing.is_fenced = False
+        standing.is_fenced = standing.follows = False
         standing.ready()
         await self._replica().ask(Assume(True), timeout=FOREVER)
         standing.leading = epoch
@@ -265,7 +269,7 @@ class RequestProtocol(Transfer):
     async def _begin_to_follow(self) -> int:
         standing = self._standing
         standing.set_peer(None, "none")
-        standing.is_fenced, standing.leading = False, -1
+        standing.is_fenced, standing.leading, standing.follows = False, -1, True
         self._held.clear()
         self._current = self._marker = self._wanted = None
         standing.inside.clear()

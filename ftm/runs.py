@@ -25,19 +25,14 @@ from ..checkpoint.records import (
     DROPPED,
     FAILED,
     Answer,
-    Closed,
-    Ignored,
     Outcome,
-    PipeDone,
-    Snapshot,
     TurnEnd,
-    Unsaved,
 )
 from ..supervision.spec import child
 from .bricks import After, Before
 from .canonical import canonical, end_form
 from .life import ServerLife
-from .messages import Done, Request, State, Work
+from .messages import Beside, Done, Request, State, Work
 from .server import Server
 from .voters import Agreed, AnyVoter, Undecided, _decide
 
@@ -252,10 +247,10 @@ class Shadow(Server):
         self._why = self._why or why
         self.abandon()
 
-    def tell_more(self, record: PipeDone | Snapshot | Unsaved | Closed | Ignored) -> None:
+    def tell_more(self, record: Beside) -> None:
         """It goes nowhere."""
 
-    def take_more(self) -> list[PipeDone | Snapshot | Unsaved | Closed | Ignored]:
+    def take_more(self) -> list[Beside]:
         return []
 
     def want_snapshot(self) -> None:

@@ -39,7 +39,7 @@ from ..checkpoint.records import (
 from ..checkpoint.turns import Fed, GoLive, StopRecorded
 from .life import BLOCKED, ENDED, OVER, UNDONE, ServerLife
 from .mechanism import has_state_access
-from .messages import Request, State
+from .messages import Beside, Request, State
 from .points import Points
 
 PART: Final = 0.001
@@ -96,6 +96,7 @@ class Server(Points):
         if life is not self.life:
             return
         self.life = None
+        self.note_work(life)
         if not self._is_stopping and self._failed is None and reason.is_clean and life.ignored_why is None:
             self.is_over = True
             self.tell_more(Closed(0, pack_exit(reason), False))
@@ -172,7 +173,7 @@ class Server(Points):
         self.begun, self.ends, self.life, self._withheld = [], [], None, []
         last = -1 if self.point is None else self.point.turn
         self.released = {turn: digests for turn, digests in self.released.items() if turn <= last}
-        self.more = [one for one in self.more if not isinstance(one, PipeDone)]
+        self.more = [one for one in self.more if not isinstance(one, PipeDone) or one.turn <= last]
 
     def _after_end(self, pending: deque[Request], chunk: list[Request]) -> bool:
         """The life has ended in the middle of a part. Whether to go on."""
@@ -349,6 +350,7 @@ class Server(Points):
     async def adopt(self, state: State) -> None:
         """Go on from this state, with a life of its own; what led to it has happened elsewhere."""
         live = state.live or (self.life is not None and self.life.is_live)
+        self._is_work_lost = self.standing.leads  # What the turns that lead there have begun, they began elsewhere.
         await self.drop_life()
         self.install(msgspec.structs.replace(state, live=live))
         await self.ensure()
@@ -393,12 +395,12 @@ class Server(Points):
         if life is not None and cell is not None:
             cell.node.loop.call_soon(self._life_ended, life, cell.extra().reason)
 
-    def tell_more(self, record: PipeDone | Snapshot | Unsaved | Closed | Ignored) -> None:
+    def tell_more(self, record: Beside) -> None:
         """Something goes home behind the ends of the part at hand, or by itself."""
         self.more.append(record)
         self.on_more()
 
-    def take_more(self) -> list[PipeDone | Snapshot | Unsaved | Closed | Ignored]:
+    def take_more(self) -> list[Beside]:
         """What goes home behind the ends that are handed over now."""
         if self._snapshot_wanted:
             self._snapshot()

@@ -7,15 +7,15 @@ import itertools
 from typing import TYPE_CHECKING, Any, Literal
 
 from ..actors.errors import HoldfastError
-from ..actors.ref import ActorRef
 from ..checkpoint.records import TurnEnd
-from .messages import ConfigMismatch, Logged, Request, StaleEpoch
+from .messages import FORWARDED, ConfigMismatch, Logged, Request, StaleEpoch
 from .replylog import ReplyLog
 
 if TYPE_CHECKING:
     from ..actors.message import Message
     from ..actors.node import Node
     from .mechanism import Mechanism
+    from .post import Outbox
     from .sealed import SecuredLink
     from .server import Server
 
@@ -47,6 +47,8 @@ class Standing:
         self.leading = -1  # the epoch in which it has begun to lead
         self.computes = False  # whether the protected actor lives here
         self.is_ready = False  # whether it has the state of the one that leads
+        self.follows = False  # it was told to, and has not led since
+        self.forwarded_as = FORWARDED  # the number of batches that lead on from the state that is here
         self.paths: dict[str, str] = {}  # of its bricks, by slot
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to a follower
         self.refused = 0  # messages of other epochs or configurations
@@ -54,7 +56,7 @@ class Standing:
         self.link: SecuredLink | None = None  # what comes and goes has to be sealed
         self._opened: dict[int, Message[Any]] = {}  # came over it, and waits for its handler
         self._opened_keys = itertools.count()
-        self._bricks: dict[str, ActorRef[Any]] = {}  # of the other replica, by slot
+        self._bricks: dict[str, Outbox] = {}  # of the other replica, by slot
         self._unready: list[asyncio.Future[None]] = []
         self._waiting: set[asyncio.Future[Any]] = set()
 
@@ -128,13 +130,13 @@ class Standing:
             if not one.done():
                 one.set_exception(PeerLost("it was replaced, or is gone"))
 
-    def brick(self, slot: str) -> ActorRef[Any] | None:
-        """The same brick of the other replica, if it was found already."""
+    def brick(self, slot: str) -> Outbox | None:
+        """The way to the same brick of the other replica, if that was found already."""
         return self._bricks.get(slot)
 
-    def found(self, slot: str, ref: ActorRef[Any]) -> None:
+    def found(self, slot: str, outbox: Outbox) -> None:
         """Remember where the same brick of the other replica is."""
-        self._bricks[slot] = ref
+        self._bricks[slot] = outbox
 
     def lost(self, slot: str) -> None:
         """It is not there any more."""

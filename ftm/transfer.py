@@ -6,6 +6,7 @@ The two RequestProtocols do it: the leader's captures and sends, the follower's 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message
 from .bricks import FOREVER, Abandon, Brick
 from .gate import Gate
-from .messages import CannotJoin, ConfigMismatch, Logged, StaleEpoch, State
+from .messages import CannotJoin, ConfigMismatch, Done, Logged, StaleEpoch, State, Strayed
 from .orders import Join, Peer
 from .standing import PeerLost
 
@@ -38,22 +39,23 @@ class Assume(Message[None]):
     leads: bool
 
 
-class Resync(Message[None]):
-    """To the RequestProtocol of the leader: this follower does not have your state any more; bring it there again."""
+class Astray(Message[None]):
+    """To the RequestProtocol of the leader: this follower does not have your state any more. Do not count on it."""
 
     path: str
 
 
-class ResyncPeer(Message[None]):
-    """To the RequestProtocol of a follower: have the leader bring us to its state again; answered when we are there."""
+class GoneAstray(Message):
+    """To the RequestProtocol of a follower, from its After: tell the leader."""
 
 
 class Transfer(Gate):
     """The part of a RequestProtocol that speaks with that of the other replica."""
 
-    peer_messages = (Take, Resync)
+    peer_messages = (Take, Astray)
     answers_later = True
 
+    next: Binding[Actor]
     proceed: Binding[Actor]
 
     _holds: int  # who wants nothing to go in
@@ -136,34 +138,30 @@ class Transfer(Gate):
 
     async def from_peer(self, message: Message[Any]) -> Any:
         """We join, or a follower has to join again."""
-        if isinstance(message, Resync):
-            self.ctx.create_task(self._again(message.path))
+        if isinstance(message, Astray):
+            self._forsake(message.path)
             return None
         assert isinstance(message, Take)
         return await self._taken(message)
 
-    async def _again(self, path: str) -> None:
-        async with self._lock:
-            try:
-                await self._bring(path)
-            except HoldfastError:
-                return  # The manager will see that it does not count, and why.
-
-    @on(ResyncPeer)
-    def _resync(self, message: ResyncPeer) -> Any:
-        handle = self.ctx.reply_handle()
-        self._standing.unready()
-        self.ctx.create_task(self._resynced(handle))
-        return handle
-
-    async def _resynced(self, handle: ReplyHandle[Any]) -> None:
-        try:
-            await self.ask_peer(Resync(self._standing.path))
-        except (PeerLost, HoldfastError) as error:
-            handle.fail(error)
+    def _forsake(self, path: str) -> None:
+        """From here on no reply counts on this follower, and the root is told: it has to join again."""
+        standing = self._standing
+        if not standing.leads or standing.is_fenced:
             return
-        await self._standing.until_ready()
-        handle.reply(None)
+        if standing.peer == path:
+            standing.set_peer(None, "none")
+        self.next.tell(Done(standing.epoch, standing.config, -1, [], False, None, [Strayed(path)]))
+
+    @on(GoneAstray)
+    def _astray(self, message: GoneAstray) -> None:
+        self.ctx.create_task(self._tell_leader())
+
+    async def _tell_leader(self) -> None:
+        with contextlib.suppress(
+            HoldfastError
+        ):  # It has died, or counts no more: whoever leads now brings us its state.
+            await self.ask_peer(Astray(self._standing.path))
 
     async def _taken(self, take: Take) -> int:
         standing, server = self._standing, self._standing.server
@@ -171,10 +169,13 @@ class Transfer(Gate):
         if take.state is not None and standing.kept > (standing.epoch, take.state.turn):
             standing.ready()  # It has computed with the leader meanwhile, and is further than that.
             return server.turn
+        standing.unready()
+        standing.forwarded_as -= 1  # What is on its way to Proceed now, or in it, leads on from another state.
         await self.proceed.ask(Abandon(), timeout=FOREVER)
         await server.drop_life()
         server.install(take.state)
         standing.log.replace(take.log)
+        standing.inside.clear()
         if standing.computes:
             await server.ensure()
         standing.ready()

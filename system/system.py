@@ -228,9 +228,16 @@ class ActorSystem(Recorded, Controls):
         return LOCAL
 
     def _group_host(self, spec: ChildSpec) -> Host:
-        """Where the lives of a protected child are lived."""
-        from ..ftm.host import GroupHost  # Most systems protect nobody.
+        """Where the lives of a protected child are lived.
 
+        Raises:
+            MechanismRefused: its mechanisms do not go together, or not in this order.
+        """
+        from ..ftm.adaptation_rules import check_stack  # Most systems protect nobody.
+        from ..ftm.host import GroupHost
+        from ..ftm.mechanism import compose
+
+        check_stack(compose(spec.mechanism), spec.start.kind, spec.id)
         self._workers.want(spec.start.kind.__module__)
         self._workers.want(REPLICA)
         recovery = spec.recovery
@@ -339,6 +346,16 @@ class ActorSystem(Recorded, Controls):
     def homes(self) -> Homes:
         """All recorded addresses, for those who change the tree."""
         return self._homes
+
+    def roll_back(self, path: str) -> None:
+        """Have a recorded actor that is stopped begin its next life with its snapshot before the newest.
+
+        What its turns since did to its state is undone (`RolledBack`); what has left stays out.
+
+        Raises:
+            ControlFailed: it is not recorded, it runs, or it has no older snapshot.
+        """
+        self._homes.roll_back(path, "it was asked for")
 
     def transaction(self, *, dry_run: bool = False, timeout: float = 10.0) -> Transaction:
         """Several changes of the running tree as one: `async with system.transaction() as change: change.add(...)`.

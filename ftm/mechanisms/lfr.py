@@ -21,14 +21,12 @@ from ...actors.errors import HoldfastError
 from ...actors.message import Message
 from ...checkpoint.records import Outcome, TurnEnd
 from ..alarms import Diverged, ProtectionLost
-from ..bricks import FOREVER, After, Before, Brick, Proceed
+from ..bricks import After, Before, Brick, Proceed
 from ..mechanism import Mechanism, Role
-from ..messages import Done, Request, Work
+from ..messages import FORWARDED, Done, Request, Work
 from ..standing import PeerLost
-from ..transfer import ResyncPeer
+from ..transfer import GoneAstray
 
-FORWARDED = -1
-"""In place of a batch's number: it came from the leader, and home knows nothing of it here."""
 GONE = 1e-9
 """A deadline that is over, on whatever clock."""
 
@@ -130,7 +128,7 @@ class Handling(Before):
         work = message.work
         left = [one for one in work.requests if log.find(one.feed.id) is None and one.feed.id not in standing.inside]
         standing.inside.update((one.feed.id, one) for one in left)
-        self.next.tell(Work(standing.epoch, work.config, FORWARDED, left, work.go, work.again))
+        self.next.tell(Work(standing.epoch, work.config, standing.forwarded_as, left, work.go, work.again))
 
 
 class Computing(Proceed, Sender):
@@ -189,9 +187,13 @@ class Comparing(After):
         self._ours: deque[tuple[int, int, int, str]] = deque()  # number, turn, digest, name
         self._theirs: deque[tuple[int, int, int]] = deque()
         self._has_diverged = False
+        self._since = 0  # the state that these lead on from
 
     async def after(self, done: Done) -> Done:
         """Remember what came out here."""
+        if done.number <= FORWARDED and done.number != self._standing.forwarded_as:
+            return done  # It leads on from a state that is given up.
+        self._begin_anew()
         inside, released = self._standing.inside, self._standing.server.released
         for end in done.ends:
             request = inside.get(end.id)
@@ -204,8 +206,17 @@ class Comparing(After):
         """Remember what came out there."""
         assert isinstance(message, Notify)
         await self._standing.until_ready()
+        self._begin_anew()
         self._theirs.extend(message.ends)
         self._compare()
+
+    def _begin_anew(self) -> None:
+        """Another state was taken: what came before it is of no concern."""
+        if self._since != self._standing.forwarded_as:
+            self._since = self._standing.forwarded_as
+            self._ours.clear()
+            self._theirs.clear()
+            self._has_diverged = False
 
     def _compare(self) -> None:
         while self._ours and self._theirs and not self._has_diverged:
@@ -219,20 +230,14 @@ class Comparing(After):
                     self._diverged(theirs[0], theirs[1], ours[3])
 
     def _diverged(self, number: int, turn: int, name: str) -> None:
-        """From here on our state is not the leader's: take its state, or end."""
+        """From here on our state is not the leader's: we must not lead, and do not count until we have joined again."""
         standing = self._standing
         standing.node.emit(Diverged(standing.address, standing.path, standing.epoch, number, name, turn))
         if not standing.server.has_access:
             raise HoldfastError(f"{standing.path} has diverged from its leader at request {number}")
         self._has_diverged = True
-        protocol = self.next
-        self.ctx.create_task(self._resync(protocol))
-
-    async def _resync(self, protocol: Any) -> None:
-        await protocol.ask(ResyncPeer(), timeout=FOREVER)
-        self._ours.clear()
-        self._theirs.clear()
-        self._has_diverged = False
+        standing.unready()
+        self.ctx.cell.node.cell_at(standing.paths["protocol"]).ref.tell(GoneAstray())
 
 
 @dataclasses.dataclass(frozen=True)

@@ -7,6 +7,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.cell import Cell
+from ...supervision.arbiter import Grant, Hand, arbiter_of
 from .draft import Draft, Place, Target, is_elsewhere, rules
 from .living import OnLiving
 from .operation import wrong
@@ -27,16 +28,19 @@ class OnProtection(OnLiving):
         self._before: Any = None  # the mechanism there was
         self._after: Any = None  # and that there is to be
         self._has_begun = False
+        self._grant: Grant | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
+        if (busy := arbiter_of(system.node).in_the_way(self.target, Hand.ADAPTATION)) is not None:
+            raise busy
         place = self._place
         assert place is not None
-        if place.spec is None:
-            raise wrong(self.target, "nobody supervises it, so nobody would start it again")
         above = place.parent
         if above is not None and above.cell is not None and is_elsewhere(above.cell):
             raise wrong(self.target, "its supervisor lives in another process, which cannot have processes of its own")
+        if place.spec is None:
+            raise wrong(self.target, "nobody supervises it, so nobody would start it again")
 
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
         """Change it; whoever is cancelled gives up waiting, the change comes to its end."""
@@ -52,17 +56,30 @@ class OnProtection(OnLiving):
     async def undo(self, system: ActorSystem) -> None:
         if not self._has_begun:
             return
-        if self._under_way is not None:
-            await asyncio.wait((self._under_way,))
-            if not self._under_way.cancelled():
-                self._under_way.exception()
-        cell = self.cell(system)
-        if described(cell.spec.mechanism) != described(self._before):  # Else it stayed as it was.
-            await self._run(system, cell, self._before)
-        system.protection.over(self.target)
+        try:
+            if self._under_way is not None:
+                self._give_up(system)
+                await asyncio.wait((self._under_way,))
+                if not self._under_way.cancelled():
+                    self._under_way.exception()
+            cell = self.cell(system)
+            if described(cell.spec.mechanism) != described(self._before):  # Else it stayed as it was.
+                await self._run(system, cell, self._before)
+            system.protection.over(self.target)
+        finally:
+            self._give_back(system)
+
+    def _give_up(self, system: ActorSystem) -> None:
+        """Have what is under way end soon, if it can."""
+
+    def _give_back(self, system: ActorSystem) -> None:
+        grant, self._grant = self._grant, None
+        if grant is not None:
+            arbiter_of(system.node).release(grant)
 
     async def do(self, system: ActorSystem) -> None:
         cell = self.cell(system)
+        self._grant = arbiter_of(system.node).claim(self.target, Hand.ADAPTATION, self.text)
         self._before, self._has_begun = cell.spec.mechanism, True
         system.protection.begun(self.target, self.text)
         await self._run(system, cell, self._after)
@@ -77,6 +94,7 @@ class OnProtection(OnLiving):
     def seal(self, system: ActorSystem) -> None:
         system.protection.put(self.target, self._before, self._after)
         system.protection.over(self.target)
+        self._give_back(system)
 
     async def finish(self, system: ActorSystem) -> None:
         system.protection.flush()
@@ -166,13 +184,12 @@ class Adapt(OnProtection):
         self._under_way = system.node.loop.create_task(change, name=f"adaptation of {cell.path}")
         await asyncio.shield(self._under_way)
 
-    async def undo(self, system: ActorSystem) -> None:
+    def _give_up(self, system: ActorSystem) -> None:
         if self._under_way is not None and not self._under_way.done():
             group = getattr(self.cell(system).host, "group", None)
             change = None if group is None else group.change
             if change is not None:
                 change.give_up("it is not wanted any more")
-        await super().undo(system)
 
     @property
     def _from_to(self) -> str:

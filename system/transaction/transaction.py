@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError, SpecError, error_text, type_name
 from ...actors.ref import current
+from ...supervision.arbiter import on_errand
 from .change import Change
 from .draft import Draft, difference
 from .errors import TransactionFailed, TransactionRefused
@@ -53,10 +54,13 @@ class Transaction:
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # What it claims is its own; in a repair step it is that step's.
+        token = on_errand.set(self if on_errand.get() is None else on_errand.get())
         try:
             if error is None:
                 await self._carry_out()
         finally:
+            on_errand.reset(token)
             self._shared.bodies.discard(self._task)
 
     async def _carry_out(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Iterable
 from typing import Any
 
@@ -24,7 +25,7 @@ from holdfast.checkpoint.records import (
     TurnEnd,
 )
 from holdfast.ftm.mechanism import Mechanism
-from holdfast.ftm.messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Work
+from holdfast.ftm.messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Strayed, Work
 from holdfast.ftm.orders import Beat, Install, Join, Peer, Setting
 from holdfast.ftm.replica import Replica
 
@@ -40,6 +41,14 @@ class Proxy(hf.Actor):
     @hf.on(Done)
     def done(self, message: Done) -> Any:
         self._driver.take(message)
+        for one in message.more:
+            if isinstance(one, Strayed):
+                self.ctx.create_task(self._again(one.path.rpartition("/")[2]))
+
+    async def _again(self, name: str) -> None:
+        """As the joiner does."""
+        with contextlib.suppress(hf.HoldfastError):
+            await self._driver.join(name)
 
     @hf.on(Outward)
     def outward(self, message: Outward) -> None:

@@ -25,7 +25,7 @@ from holdfast.ftm.model import (
     response_price,
     select,
 )
-from tests.ftm.declarations import AD, EIGHT, LFR, NVP, PBR, RB, SEC, TR, Declared
+from tests.ftm.declarations import AD, EIGHT, LFR, NVP, PBR, RB, SEC, TMR, TR, Declared
 
 GOOD = Application("Account")
 PLENTY = Resources(units=6, certificates=True)
@@ -271,6 +271,7 @@ def test_these_are_nested_rightly(layers: tuple[type[Declared], ...]) -> None:
         ((SEC, SEC), "sec and sec are both of link"),
         ((AD,), "a&d stands over a mechanism of replication, and there is none inside"),
         ((AD, TR), "a&d stands over a mechanism of replication, and there is none inside"),
+        ((AD, TMR), "a&d keeps 2 replicas, and tmr 3"),
     ],
 )
 def test_these_are_not(layers: tuple[type[Declared], ...], why: str) -> None:
@@ -283,7 +284,7 @@ def test_an_order_is_right_exactly_when_no_layer_stands_outside_an_outer_one(lay
     ranks = [LAYERS.index(Entry.of(layer).layer) for layer in layers]
     needs_duplex = [at for at, layer in enumerate(layers) if layer is AD]
     is_right = all(a < b for a, b in itertools.pairwise(ranks)) and all(
-        any(Entry.of(inner).layer == "replication" for inner in layers[at + 1 :]) for at in needs_duplex
+        any(inner in (PBR, LFR) for inner in layers[at + 1 :]) for at in needs_duplex
     )
     assert (nesting_problems(layers) == ()) == is_right
 

@@ -264,9 +264,9 @@ async def test_lower_epochs_and_other_configurations_are_refused(system: hf.Acto
     body = system.node.codec.encoder.encode(Checkpoint(state, []))
     name = "holdfast.ftm.mechanisms.pbr:Checkpoint"
     with pytest.raises(StaleEpoch):
-        await after.ask(Letter(driver.epoch - 1, 0, name, body))
+        await after.ask(Letter(driver.epoch - 1, 0, name, body, size=len(body), stream=1, number=1))
     with pytest.raises(ConfigMismatch):
-        await after.ask(Letter(driver.epoch, 7, name, body))
+        await after.ask(Letter(driver.epoch, 7, name, body, size=len(body), stream=1, number=2))
     for order in (Lead(0, 0), Follow(0, 0), Join(0, driver.path("r2")), Export(0)):
         with pytest.raises((StaleEpoch, hf.RemoteCrash)):
             await driver.protocol("r1").ask(order)

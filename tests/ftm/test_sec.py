@@ -204,11 +204,16 @@ async def test_what_is_replayed_is_refused(secured: hf.ActorSystem, monkeypatch:
     assert group_of(ref).link.rejected["replayed"] > 0
 
 
-async def test_nothing_can_be_read_on_the_way(secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("below", "count"), [(hf.PBR(), 2), (TMR(), 3)])
+async def test_nothing_can_be_read_on_the_way(
+    secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, below: Any, count: int
+) -> None:
+    """Between proxy and replicas, and from each replica to each other."""
     tap = Tap().on_replicas(monkeypatch)
-    plain = await secured.start(hf.child("p", hf.start(Counter), mechanism=hf.PBR()))
-    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), hf.PBR())))
-    await joined(ref)
+    plain = await secured.start(hf.child("p", hf.start(Counter), mechanism=below))
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), below)))
+    await joined(plain, count)
+    await joined(ref, count)
     tap.on_proxy(ref)
     assert await plain.ask(Add(1)) == await ref.ask(Add(1)) == 1
 
@@ -218,7 +223,38 @@ async def test_nothing_can_be_read_on_the_way(secured: hf.ActorSystem, monkeypat
 
     assert b"accounts:Add" in seen("/app/p")
     assert b"accounts:Add" not in seen("/app/c")
+    others = [f"r{number}" for number in range(1, count + 1) if f"r{number}" != group_of(ref).primary]
+    letters = [where for where, m in tap.seen if isinstance(m, Parcel) and m.name.endswith(":Letter")]
+    assert {where.split("/")[4] for where in letters if where.startswith("/app/c/ftm/r")} >= set(others)
     assert not [m for where, m in tap.seen if where.startswith("/app/c") and isinstance(m, (Work, Lead, Join, Done))]
+
+
+class Client(hf.Actor):
+    """Lives in a process of its own."""
+
+    counter: hf.Binding[Counter]
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> int:
+        return await self.counter.ask(message)
+
+
+async def test_a_client_in_another_process_is_answered_and_the_links_behind_the_proxy_are_sealed(
+    secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A66: the link begins where requests enter, at the proxy; it is in the root, to which clients have own pipes."""
+    tap = Tap().on_replicas(monkeypatch)
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), hf.PBR())))
+    await joined(ref)
+    tap.on_proxy(ref)
+    spec = hf.child("client", hf.start(Client), isolation="process", bindings={"counter": "/app/c"})
+    client = await secured.start(spec)
+    assert [await client.ask(Add(n)) for n in range(5)] == [1, 2, 3, 4, 5]
+    os.kill(secured.pid_of(client), signal.SIGKILL)
+    assert await secured.ref("/app/client", Client).ask(Add(5), timeout=20.0) == 6
+    said = [m.body if isinstance(m, Parcel) else repr(m).encode() for where, m in tap.seen if "/app/c/" in where]
+    assert not [one for one in said if b"accounts:Add" in one]
+    assert await ref.ask(Tags()) == [0, 1, 2, 3, 4, 5]
 
 
 async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:

@@ -1,0 +1,236 @@
+"""A model from the live system: any holdfast system is diagnosable from day one.
+
+The runtime knows who lives, who is supervised by whom, who subscribes to what, and who is bound to whom. Who publishes
+what is heard, for a while, on every topic that has subscribers. The actors do not notice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator
+
+import msgspec
+
+from ..actors.actor import Actor, Start, on
+from ..actors.cell import Cell
+from ..actors.node import Node, cell_kind
+from ..supervision.spec import ChildSpec
+from .assembly import observer
+from .literals import ok
+from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS
+from .model import Component, Declaration, Expectation, Kind
+from .observers.general import GeneralObserver
+from .observers.hearing import Heard, listen
+from .observers.node import NodeObserver
+from .observers.observer import Manner, Observer
+from .observers.verdicts import Agreement
+
+OURS = frozenset({DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR, ROS_DIAGNOSTICS})
+"""Topics of diagnosis itself."""
+
+
+BASE = (f"{__package__}.", f"{(__package__ or '').rpartition('.')[0]}.checkpoint.")
+"""Packages whose actors look after the system and are no part of it."""
+
+
+class Wired(msgspec.Struct, frozen=True, kw_only=True):
+    """One actor as it is connected; other actors by their component names."""
+
+    path: str
+    kind: str
+    supervisor: str | None = None
+    """The address of who restarts it; None: nobody does."""
+    publishes: tuple[str, ...] = ()
+    subscribes: tuple[str, ...] = ()
+    bound: dict[str, str] = {}
+    """Port to component."""
+
+
+class Generated(msgspec.Struct, frozen=True):
+    """What was found: a declaration to begin with, and how it came about.
+
+    Attributes:
+        declaration: each actor is a component. A topic depends on the publisher's subscriptions and, through replies
+            (`NAME:replies`), on those it is bound to.
+        addresses: component to address.
+        wiring: component to how it is connected.
+        left_out: dependencies that would close a circle; a fault goes round in it, so one has to be cut.
+    """
+
+    declaration: Declaration
+    addresses: dict[str, str]
+    wiring: dict[str, Wired]
+    left_out: tuple[str, ...] = ()
+
+
+async def generate(
+    node: Node, *, seconds: float = 3.0, topics: Iterable[str] = (), leave_out: Collection[str] = ()
+) -> Generated:
+    """Look at a running system for a while and write down what it is made of.
+
+    Args:
+        node: `system.node`.
+        seconds: how long to listen for publishers; one that publishes more rarely is not found.
+        topics: to listen to besides those that have subscribers.
+        leave_out: addresses; they and all below them are no part of the model. Diagnosis itself never is.
+    """
+    heard: dict[str, set[str]] = {}
+    wanted = [topic for topic in dict.fromkeys((*node.topics.names(), *topics)) if topic not in OURS]
+    cell = node.spawn(Start(Listener, (tuple(wanted), heard)))
+    try:
+        await asyncio.sleep(seconds)
+    finally:
+        out = [*leave_out, cell.path]
+        cell.request_stop()
+        await cell.ended()
+    return declared(_wiring(node, heard, out))
+
+
+class Listener(Actor):
+    """Notes who publishes on which topics."""
+
+    deterministic = False
+
+    def __init__(self, topics: tuple[str, ...], heard: dict[str, set[str]]) -> None:
+        self._listens_to, self._publishers = topics, heard
+
+    def on_start(self, restored: bool) -> None:
+        """Listen."""
+        for topic in self._listens_to:
+            listen(self, topic)
+
+    @on(Heard)
+    def _heard(self, message: Heard) -> None:
+        if message.sender is not None:
+            self._publishers.setdefault(message.sender, set()).add(message.topic)
+
+
+def _wiring(node: Node, heard: dict[str, set[str]], out: Collection[str]) -> dict[str, Wired]:
+    root = node.root
+    if root is None:
+        return {}
+    cells = [cell for cell in _below(root, out) if not _is_ours(cell)]
+    names = {cell.path: cell.path[len(root.path) + 1 :] for cell in cells}
+    return {names[cell.path]: _wired(cell, names, heard) for cell in cells}
+
+
+def _below(cell: Cell, out: Collection[str]) -> Iterator[Cell]:
+    """Actors that somebody restarts. Supervisors are no components: what they supervise is."""
+    for child in (cell.children or {}).values():
+        if child.path in out or child.is_dead:
+            continue
+        spec = child.spec
+        if spec is not None and not spec.is_supervisor and spec.restart != "temporary":
+            yield child
+        yield from _below(child, out)
+
+
+def _is_ours(cell: Cell) -> bool:
+    """Whether an actor belongs to diagnosis or recovery; the power board belongs to the system."""
+    kind = cell_kind(cell)
+    if kind is None or issubclass(kind, Observer):
+        return True
+    module = f"{kind.__module__}."
+    return module.startswith(BASE) and not module.startswith(f"{__package__}.board.")
+
+
+def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]]) -> Wired:
+    more, kind = cell.more, cell_kind(cell)
+    bound = more.bindings if more is not None else {}
+    return Wired(
+        path=cell.path,
+        kind="" if kind is None else f"{kind.__module__}.{kind.__qualname__}",
+        supervisor=None if cell.parent is None else cell.parent.path,
+        publishes=tuple(sorted(heard.get(cell.path, ()))),
+        subscribes=tuple(sorted(set(more.topics) - OURS if more is not None else ())),
+        bound={port: names[target.path] for port, target in sorted(bound.items()) if target.path in names},
+    )
+
+
+def declared(wiring: dict[str, Wired]) -> Generated:
+    """The declaration that follows from the wiring."""
+    inputs: dict[str, list[str]] = {}  # what an actor publishes or replies is made from these
+    served = {name for wired in wiring.values() for name in wired.bound.values()}
+    published = {topic for wired in wiring.values() for topic in wired.publishes}
+    for name, wired in wiring.items():
+        heard = [topic for topic in wired.subscribes if topic in published and topic not in wired.publishes]
+        inputs[name] = [*heard, *(_replies(other) for other in dict.fromkeys(wired.bound.values()) if other != name)]
+    outputs = {
+        name: [*wired.publishes, *([_replies(name)] if name in served else [])] for name, wired in wiring.items()
+    }
+    left_out = _cut_circles(inputs, outputs)
+    makers = Counter(out for outs in outputs.values() for out in outs)
+    components = tuple(
+        Component(
+            name=name,
+            kind=Kind.NODE,
+            out={out: tuple(inputs[name]) for out in outputs[name] if makers[out] == 1},
+            where=wired.path,
+        )
+        for name, wired in wiring.items()
+    )
+    # What several publish is as it should be while all of them work, not while any of them does.
+    shared = tuple(_shared(out, inputs, outputs) for out, count in makers.items() if count > 1)
+    addresses = {name: wired.path for name, wired in wiring.items()}
+    return Generated(Declaration(components=components, expectations=shared), addresses, wiring, left_out)
+
+
+def _shared(topic: str, inputs: dict[str, list[str]], outputs: dict[str, list[str]]) -> Expectation:
+    publishers = tuple(name for name, outs in outputs.items() if topic in outs)
+    given = dict.fromkeys(str(ok(wanted)) for name in publishers for wanted in inputs[name])
+    return Expectation(str(ok(topic)), publishers, tuple(given))
+
+
+def _replies(name: str) -> str:
+    return f"{name}:replies"
+
+
+def _cut_circles(inputs: dict[str, list[str]], outputs: dict[str, list[str]]) -> tuple[str, ...]:
+    """Take out the inputs that lead back to where one came from; returns them in words."""
+    makers: dict[str, list[str]] = {}
+    for name, outs in outputs.items():
+        for out in outs:
+            makers.setdefault(out, []).append(name)
+    left_out: list[str] = []
+    done: set[str] = set()
+
+    def sources(name: str) -> Iterator[tuple[str, str]]:
+        return iter([(wanted, maker) for wanted in inputs[name] for maker in makers.get(wanted, ())])
+
+    for start in inputs:
+        path = {} if start in done else {start: sources(start)}  # without recursion: chains may be long
+        while path:
+            name = next(reversed(path))
+            wanted, maker = next(path[name], (None, name))
+            if wanted is None:
+                del path[name]
+                done.add(name)
+            elif maker not in path:
+                path |= {} if maker in done else {maker: sources(maker)}
+            elif wanted in inputs[name]:
+                inputs[name].remove(wanted)
+                left_out.append(f"{name} depends on {wanted}")
+    return tuple(left_out)
+
+
+def observers_for(
+    generated: Generated, *, window: float = 2.0, hung_after: float | None = None, manner: Manner | None = None
+) -> tuple[ChildSpec, ...]:
+    """An observer for all actors that were found, and one that learns its rate for each topic.
+
+    Args:
+        generated: what was found.
+        window: seconds over which messages are counted; several should come within it.
+        hung_after: see `NodeObserver`.
+        manner: of all of them; by default two of three looks must agree, so that a restart is no fault yet.
+    """
+    manner = manner or Manner(agreement=Agreement(2, 3))
+    topics = dict.fromkeys(topic for wired in generated.wiring.values() for topic in wired.publishes)
+    nodes = observer("nodes", Start(NodeObserver, (generated.addresses,), {"hung_after": hung_after, "manner": manner}))
+    rates = (
+        observer(f"rate of {topic.strip('/').replace('/', '.')}", Start(GeneralObserver, (topic,), kwargs))
+        for topic in topics
+        for kwargs in ({"window": window, "manner": manner},)
+    )
+    return (nodes, *rates)

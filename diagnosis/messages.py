@@ -1,0 +1,114 @@
+"""The words that observers, the diagnoser and repair exchange, and the topics they are published on."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from ..actors.message import Message
+from .engine import Diagnosis
+from .literals import Literal
+from .model import Declaration
+from .observations import Observed
+
+OBSERVATIONS: Final = "/observations"
+"""`Observation`, one for each literal (D7)."""
+DIAGNOSIS: Final = "/diagnosis"
+"""`Diagnosis`, when it changes (D8)."""
+EXPLANATION: Final = "/explanation"
+"""`Explained`, after each diagnosis that is published."""
+ROS_DIAGNOSTICS: Final = "/diagnostics"
+"""`RosDiagnostics`, after each diagnosis that is published (D33)."""
+MODEL: Final = "/model"
+"""`ModelChanged`."""
+GRACE: Final = "/grace"
+"""`Grace`, from whoever acts upon the system."""
+REPAIR: Final = "/repair"
+"""`Touched`, and whatever else repair tells."""
+
+
+class Grace(Message):
+    """Something is about to start: for `seconds` nothing bad is said of these components, topics and values (T51).
+
+    What was said of them before is taken back: it is unknown. What is good is said at once. Not for actions that are
+    expected to make something false, such as a stop.
+    """
+
+    names: tuple[str, ...]
+    seconds: float
+
+
+class Touched(Message):
+    """A repair action upon these components has ended: among equals they are suspected last for a while (O3).
+
+    `grace` asks for so many seconds of grace for them and for what depends on them; 0 after a stop, whose effect is
+    that something does not hold.
+    """
+
+    components: tuple[str, ...]
+    action: str
+    time: float
+    grace: float = 0.0
+
+
+class ModelChanged(Message):
+    """The model has another version now."""
+
+    version: int
+    declaration: Declaration
+    reason: str = ""
+
+
+class NextBest(Message):
+    """An atom that is worth observing: how many bits that would tell."""
+
+    atom: Literal
+    gain: float
+
+
+class Explained(Message):
+    """Why, in plain words, and what to look at next."""
+
+    text: str
+    conflicts: tuple[str, ...] = ()
+    consequences: tuple[str, ...] = ()
+    next_best: tuple[NextBest, ...] = ()
+    refused: tuple[str, ...] = ()
+    """Observations that the model has no words for, with their sources (T53)."""
+
+
+class RosDiagnostics(Message):
+    """A `diagnostic_msgs/DiagnosticArray` as plain data."""
+
+    array: dict[str, object]
+
+
+class GetDiagnosis(Message[Diagnosis]):
+    """The newest diagnosis; answered when all that was observed before has been thought through."""
+
+
+class GetExplanation(Message[Explained]):
+    """Why that is the diagnosis."""
+
+
+class GetObserved(Message[Observed]):
+    """What is known now."""
+
+
+__all__ = [
+    "DIAGNOSIS",
+    "EXPLANATION",
+    "GRACE",
+    "MODEL",
+    "OBSERVATIONS",
+    "REPAIR",
+    "ROS_DIAGNOSTICS",
+    "Explained",
+    "GetDiagnosis",
+    "GetExplanation",
+    "GetObserved",
+    "Grace",
+    "ModelChanged",
+    "NextBest",
+    "RosDiagnostics",
+    "Touched",
+]

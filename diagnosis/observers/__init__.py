@@ -1,0 +1,48 @@
+"""Observers: actors that look at a system from outside, and say what they see as literals on `/observations`.
+
+A new one is one class: derive from `Observer`, override `hear` or `look`, and call `verdict`.
+"""
+
+from .binary import BinaryQualitativeObserver, Source
+from .diagnostic import Check, DiagnosticObserver
+from .general import GeneralObserver
+from .hardware import Channel, HardwareObserver
+from .multiple import ConditionedObserver, TriggeredObserver
+from .node import NodeObserver
+from .observer import Look, Manner, Observer
+from .property import Bound, Property, PropertyObserver
+from .qualitative import QualitativeObserver, trend
+from .regression import Fit, Regression
+from .score import ScoreObserver
+from .timeout import TimeoutObserver
+from .verdicts import Agreement, Debounce, Limits, Median, Smooth
+
+__all__ = [
+    "Agreement",
+    "BinaryQualitativeObserver",
+    "Bound",
+    "Channel",
+    "Check",
+    "ConditionedObserver",
+    "Debounce",
+    "DiagnosticObserver",
+    "Fit",
+    "GeneralObserver",
+    "HardwareObserver",
+    "Limits",
+    "Look",
+    "Manner",
+    "Median",
+    "NodeObserver",
+    "Observer",
+    "Property",
+    "PropertyObserver",
+    "QualitativeObserver",
+    "Regression",
+    "ScoreObserver",
+    "Smooth",
+    "Source",
+    "TimeoutObserver",
+    "TriggeredObserver",
+    "trend",
+]

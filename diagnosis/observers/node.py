@@ -1,0 +1,87 @@
+"""Is it running? `running(n)` for actors (D20)."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Mapping
+from typing import Final
+
+from ...actors.cell import RUNNING, Cell
+from ...actors.control.calls import ask_status
+from ...actors.control.orders import Status, status_of
+from ...actors.errors import HoldfastError, SpecError
+from ...actors.process.relay import OutsideHost, Peer
+from ...actors.process.remote import ProcessHost
+from ..literals import Literal, running
+from .observer import Manner, Observer
+
+PATIENCE: Final = 1.0
+"""Seconds an actor's process gets to answer."""
+
+
+class NodeObserver(Observer):
+    """Looks whether actors live; they need not know of it. One that is suspended is unknown.
+
+    Args:
+        actors: component to address.
+        hung_after: seconds; an actor whose turn takes longer, or whose process does not answer so long, counts as not
+            running. None: nothing takes too long.
+        manner: see `Observer`.
+    """
+
+    def __init__(
+        self, actors: Mapping[str, str], *, hung_after: float | None = None, manner: Manner | None = None
+    ) -> None:
+        super().__init__(manner=manner)
+        self._actors = {running(component): path for component, path in actors.items()}
+        self._hung_after = hung_after
+
+    def on_start(self, restored: bool) -> None:
+        """Begin. Raises SpecError in a process of its own."""
+        at_root(self)
+        super().on_start(restored)
+
+    async def look(self) -> None:
+        """Look them all up; those that have to be asked are asked at the same time."""
+        asked: list[Literal] = []
+        answers: list[Awaitable[bool | None]] = []
+        for atom, path in self._actors.items():
+            seen = self._runs(self.ctx.cell.node.find(path))
+            if seen is None or isinstance(seen, bool):
+                self.verdict(atom, seen)
+            else:
+                asked.append(atom)
+                answers.append(seen)
+        if asked:
+            for atom, answer in zip(asked, await asyncio.gather(*answers), strict=True):
+                self.verdict(atom, answer)
+
+    def _runs(self, cell: Cell | None) -> bool | Awaitable[bool | None] | None:
+        if cell is None:
+            return False
+        host = cell.host
+        if isinstance(host, OutsideHost):
+            return self._answers(host.peer, cell, PATIENCE if self._hung_after is None else self._hung_after)
+        if cell.state is not RUNNING or not host.is_up(cell):
+            return False
+        worker = host.worker_of(cell) if isinstance(host, ProcessHost) else None
+        if worker is None or self._hung_after is None:
+            return self._judged(status_of(cell))
+        return self._answers(worker, cell, self._hung_after)
+
+    async def _answers(self, peer: Peer, cell: Cell, timeout: float) -> bool | None:
+        try:
+            return self._judged(await ask_status(peer, cell, timeout))
+        except HoldfastError:  # It has ended, or its process does not answer.
+            return False
+
+    def _judged(self, status: Status) -> bool | None:
+        if status.state == "suspended":
+            return None
+        return status.state == "running" and (self._hung_after is None or status.turn_seconds <= self._hung_after)
+
+
+def at_root(observer: Observer) -> None:
+    """Refuse an observer that sees only its own process. Raises SpecError."""
+    if observer.ctx.cell.node.uplink is not None:
+        raise SpecError(observer.ctx.path, f"{type(observer).__name__} must be in the system's own process: a task")

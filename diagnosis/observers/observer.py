@@ -1,0 +1,180 @@
+"""The base of all observers: a new one is one class.
+
+It says what it sees by `verdict` or `say`; when that is published, renewed and taken back is decided here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable
+from typing import Any, Final
+
+import msgspec
+
+from ...actors.actor import Actor, on, subscribe
+from ...actors.message import Message
+from ..literals import BadLiteral, Literal, parse
+from ..messages import GRACE, OBSERVATIONS, Grace
+from ..observations import Observation
+from .hearing import Heard, listen
+from .verdicts import Agreement, Debounce
+
+RENEWALS: Final = 3
+"""How often a literal is said again within its time to live."""
+
+
+class Manner(msgspec.Struct, frozen=True, kw_only=True):
+    """How an observer goes about it.
+
+    Attributes:
+        every: seconds between two looks; silence is seen by looking.
+        time_to_live: seconds after which what it said is unknown if it does not say it again.
+        agreement: how many of how many samples must agree before it says something else.
+        grace: seconds after its start in which nothing bad is said.
+    """
+
+    every: float = 1.0
+    time_to_live: float = 5.0
+    agreement: Agreement = Agreement()
+    grace: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (0 < self.every <= self.time_to_live / RENEWALS and self.grace >= 0):
+            raise ValueError(
+                f"an observer looks every {self.every:g} s, and what it says lives {self.time_to_live:g} s: that must "
+                f"be {RENEWALS} times as long at least, or it would be forgotten in between"
+            )
+
+
+class Look(Message):
+    """It is time to look."""
+
+
+class _Word:
+    """What was said of one atom, or of the trend of one value."""
+
+    __slots__ = ("debounce", "said", "time")
+
+    def __init__(self, agreement: Agreement) -> None:
+        self.debounce = Debounce[Literal](agreement)
+        self.said: Literal | None = None
+        self.time = 0.0
+
+
+class Observer(Actor):
+    """Sees something and says so on `/observations`.
+
+    Override `hear`, which gets what is published on `topics`, or `look`, which is called every so often, or both, and
+    call `verdict` in them. It needs nothing of what it observes.
+
+    Args:
+        topics: what it hears.
+        manner: how often it looks, and when it believes what it sees.
+    """
+
+    deterministic = False
+
+    def __init__(self, *topics: str, manner: Manner | None = None) -> None:
+        self.topics = tuple(dict.fromkeys(topics))
+        self.manner = manner or Manner()
+        self._words: dict[Literal, _Word] = {}
+        self._grace: dict[str, float] = {}
+        self._outbox: list[Observation] = []
+
+    # -- for those who write an observer ----------------------------------------------------------------------------
+
+    def hear(self, topic: str, message: Any) -> None:
+        """A message was published on one of the topics."""
+
+    def look(self) -> Awaitable[None] | None:
+        """It is time to look; may be async."""
+
+    @property
+    def now(self) -> float:
+        """Seconds on the loop clock (T67)."""
+        return self.ctx.cell.node.loop.time()
+
+    @property
+    def age(self) -> float:
+        """Seconds since this observer began."""
+        return self.now - self._began
+
+    def verdict(self, atom: Literal, holds: bool | None) -> None:
+        """One more sample: the atom holds, or does not, or (None) nothing is known."""
+        self.say(atom, None if holds is None else atom if holds else ~atom)
+
+    def say(self, about: Literal, literal: Literal | None) -> None:
+        """One more sample of one thing of which different literals can be said, such as the trend of a value."""
+        word = self._words.get(about)
+        if word is None:
+            word = self._words[about] = _Word(self.manner.agreement)
+        self._settle(word, word.debounce(literal))
+
+    def said(self, about: Literal) -> bool | None:
+        """What was settled of an atom: it holds, or does not, or (None) it is unknown."""
+        word = self._words.get(about)
+        settled = word.debounce.settled if word is not None else None
+        return None if settled is None else settled.positive
+
+    # -- the rest ---------------------------------------------------------------------------------------------------
+
+    def on_start(self, restored: bool) -> None:
+        """Begin to hear and to look."""
+        self._began = self.now
+        for topic in self.topics:
+            listen(self, topic)
+        self.ctx.every(self.manner.every, Look())
+        self.ctx.ref.tell(Look())
+
+    @on(Heard)
+    def _heard(self, message: Heard) -> Any:
+        self.hear(message.topic, message.message)
+        return self._publish() if self._outbox else None
+
+    @on(Look)
+    async def _look(self, message: Look) -> None:
+        seen = self.look()
+        if seen is not None:
+            await seen
+        await self._publish()
+
+    @subscribe(GRACE)
+    @on(Grace)
+    async def _spare(self, message: Grace) -> None:
+        now = self.now
+        self._grace = {name: until for name, until in self._grace.items() if until > now}
+        self._grace |= {name: max(self._grace.get(name, 0.0), now + message.seconds) for name in message.names}
+        names = set(message.names)
+        for about, word in self._words.items():
+            if not names.isdisjoint(about.args):
+                word.debounce.clear()  # samples from before say nothing about after
+                if word.said is not None and not word.said.positive:
+                    self._settle(word, None)
+        await self._publish()
+
+    def _settle(self, word: _Word, settled: Literal | None) -> None:
+        now = self.now
+        if settled is not None and not settled.positive and self._is_spared(settled, now):
+            settled = None
+        if settled is None:
+            if word.said is not None:  # A word that dies at once: it is unknown from now on.
+                self._outbox.append(Observation(word.said, now, self.ctx.path, 0.0))
+                word.said = None
+        elif settled != word.said or now - word.time >= self.manner.time_to_live / RENEWALS:
+            word.said, word.time = settled, now
+            self._outbox.append(Observation(settled, now, self.ctx.path, self.manner.time_to_live))
+
+    def _is_spared(self, literal: Literal, now: float) -> bool:
+        return now < self._began + self.manner.grace or any(now < self._grace.get(name, 0.0) for name in literal.args)
+
+    async def _publish(self) -> None:
+        outbox, self._outbox = self._outbox, []
+        for observation in outbox:
+            await self.ctx.publish(OBSERVATIONS, observation)
+
+
+def atom_of(given: Literal | str) -> Literal:
+    """An atom, given as such or as text. Raises BadLiteral."""
+    literal = parse(given) if isinstance(given, str) else given
+    if not literal.positive:
+        raise BadLiteral(str(literal), "an observer is told of the atom; whether it holds is what it finds out")
+    return literal

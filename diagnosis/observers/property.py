@@ -1,0 +1,197 @@
+"""Properties of an actor and of the process it lives in: memory, load, waiting messages, restarts (D25)."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import enum
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Final
+
+import msgspec
+import psutil
+
+from ...actors.cell import Cell
+from ...actors.control.calls import ask_status, order
+from ...actors.control.orders import Look as LookAt
+from ...actors.control.orders import Status, status_of
+from ...actors.control.tap import Statistics
+from ...actors.errors import HoldfastError
+from ...actors.process.relay import OutsideHost
+from ...actors.process.remote import ProcessHost
+from ..literals import Literal
+from .node import at_root
+from .observer import Manner, Observer, atom_of
+from .regression import Regression
+from .verdicts import Filter, Limits
+
+PATIENCE: Final = 1.0
+"""Seconds an actor's process gets to answer; while it does not, its loop lags by these."""
+
+
+class Property(enum.Enum):
+    """What can be measured of an actor."""
+
+    CPU = "cpu"
+    """Percent of one core, of its process."""
+    MEMORY = "memory"
+    """Bytes of its process in memory."""
+    DESCRIPTORS = "descriptors"
+    """Open files of its process."""
+    THREADS = "threads"
+    """Threads of its process."""
+    LOOP_LAG = "loop_lag"
+    """Seconds by which the event loop of its process comes late."""
+    MAILBOX = "mailbox"
+    """Messages that wait for it."""
+    WAITING = "waiting"
+    """Seconds that its turn has taken so far, if it waits for something."""
+    TURN = "turn"
+    """Seconds of a turn, on average since the last look. Counting costs the actor a little per message."""
+    RESTARTS = "restarts"
+    """Restarts per minute, over the last minute."""
+    GROWTH = "growth"
+    """Bytes per second by which its process has grown over the last looks, by linear regression."""
+
+
+OF_PROCESS: Final = frozenset(
+    {Property.CPU, Property.MEMORY, Property.DESCRIPTORS, Property.THREADS, Property.GROWTH, Property.LOOP_LAG}
+)
+MINUTE: Final = 60.0
+EARLY: Final = 0.001
+"""Seconds by which a timer may come before its time."""
+
+
+class Bound(msgspec.Struct, frozen=True):
+    """While a property is within limits, the atom holds.
+
+    Attributes:
+        atom: such as `ok(matcher.memory)`.
+        property: what is measured.
+        limits: what is good.
+        filter: makes a filter that the values go through.
+    """
+
+    atom: Literal | str
+    property: Property
+    limits: Limits
+    filter: Callable[[], Filter] | None = None
+
+
+class PropertyObserver(Observer):
+    """Measures an actor and its process from outside. What cannot be measured, because it is not there, is unknown.
+
+    Args:
+        path: the actor's address.
+        bounds: what is good.
+        growth_window: seconds over which `Property.GROWTH` is seen.
+        manner: see `Observer`.
+    """
+
+    def __init__(
+        self, path: str, bounds: Iterable[Bound], *, growth_window: float = 60.0, manner: Manner | None = None
+    ) -> None:
+        super().__init__(manner=manner)
+        self._path = path
+        self._bounds = [
+            (atom_of(one.atom), one.property, one.limits, one.filter() if one.filter is not None else None)
+            for one in bounds
+        ]
+        self._wanted = {wanted for _, wanted, _, _ in self._bounds}
+        self._process: psutil.Process | None = None
+        self._counts: Statistics | None = None
+        self._lives: deque[tuple[float, int]] = deque()
+        self._growth = Regression(growth_window)
+
+    def on_start(self, restored: bool) -> None:
+        """Begin. Raises SpecError in a process of its own."""
+        at_root(self)
+        super().on_start(restored)
+
+    async def look(self) -> None:
+        """Measure it all."""
+        late = self.age % self.manner.every
+        self._late = late if self.manner.every - late > EARLY else 0.0
+        values = await self._measure()
+        for atom, wanted, limits, smooth in self._bounds:
+            value = values.get(wanted)
+            if value is not None and smooth is not None:
+                value = smooth(value)
+            self.verdict(atom, None if value is None else limits.holds(value, self.said(atom)))
+
+    async def _measure(self) -> dict[Property, float]:
+        cell = self.ctx.cell.node.find(self._path)
+        if cell is None:
+            return {}
+        values: dict[Property, float] = {Property.RESTARTS: self._restarts(cell)}
+        status = await self._status(cell, values)
+        if status is not None and status.state in ("running", "suspended"):
+            values |= {Property.MAILBOX: cell.host.backlog(cell), Property.WAITING: status.turn_seconds}
+            if not OF_PROCESS.isdisjoint(self._wanted):
+                values |= self._of_process(status.pid)
+            if Property.TURN in self._wanted:
+                values |= await self._turns(cell)
+        return values
+
+    async def _status(self, cell: Cell, values: dict[Property, float]) -> Status | None:
+        """Its status; how long the answer takes is how late its loop comes."""
+        host = cell.host
+        peer = host.peer if isinstance(host, OutsideHost) else None
+        if isinstance(host, ProcessHost):
+            peer = host.worker_of(cell)
+            if peer is None:
+                return None
+        began = time.monotonic()
+        if peer is None:
+            await asyncio.sleep(0)
+            values[Property.LOOP_LAG] = max(time.monotonic() - began, self._late)
+            return status_of(cell)
+        try:
+            found: Status = await ask_status(peer, cell, PATIENCE)
+        except HoldfastError:  # Its process has ended, or its loop does not come to it.
+            values[Property.LOOP_LAG] = time.monotonic() - began
+            return None
+        values[Property.LOOP_LAG] = time.monotonic() - began
+        return found
+
+    def _restarts(self, cell: Cell) -> float:
+        """Per minute; the first look only tells where to count from."""
+        self._lives.append((self.now, cell.life))
+        while len(self._lives) > 2 and self._lives[1][0] <= self.now - MINUTE:
+            self._lives.popleft()
+        return self._lives[-1][1] - self._lives[0][1]
+
+    def _of_process(self, pid: int) -> dict[Property, float]:
+        """What psutil says of it; nothing if it has ended meanwhile."""
+        try:
+            if self._process is None or self._process.pid != pid:
+                self._process = psutil.Process(pid)
+                self._growth = Regression(self._growth.window)
+                self._process.cpu_percent(None)  # The first one has nothing to compare with.
+                return {}
+            with self._process.oneshot():
+                memory = self._process.memory_info().rss
+                values: dict[Property, float] = {
+                    Property.CPU: self._process.cpu_percent(None),
+                    Property.MEMORY: memory,
+                    Property.THREADS: self._process.num_threads(),
+                }
+            if Property.DESCRIPTORS in self._wanted:
+                values[Property.DESCRIPTORS] = self._process.num_fds()
+        except psutil.Error:
+            self._process = None
+            return {}
+        self._growth.add(self.now, memory)
+        line = self._growth.fit() if self._growth.is_full else None
+        return values if line is None else {**values, Property.GROWTH: line.slope}
+
+    async def _turns(self, cell: Cell) -> dict[Property, float]:
+        """The average turn since the last look; an actor that had none was not slow."""
+        with contextlib.suppress(HoldfastError):
+            before, self._counts = self._counts, await order(cell, LookAt(True, None), PATIENCE)
+            now = self._counts
+            if before is not None and now is not None and now.since == before.since and now.turns > before.turns:
+                return {Property.TURN: (now.turn_seconds - before.turn_seconds) / (now.turns - before.turns)}
+        return {}

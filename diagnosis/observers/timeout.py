@@ -1,0 +1,43 @@
+"""A topic that must not be silent for long, whatever its rate."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..literals import Literal, ok
+from .observer import Manner, Observer, atom_of
+
+
+class TimeoutObserver(Observer):
+    """Not ok when nothing has come for too long; also when nothing has ever come since this observer began.
+
+    Args:
+        topic: what it hears.
+        timeout: seconds.
+        atom: what is said; `ok(topic)` unless given.
+        manner: see `Observer`.
+    """
+
+    def __init__(
+        self, topic: str, timeout: float, *, atom: Literal | str | None = None, manner: Manner | None = None
+    ) -> None:
+        super().__init__(topic, manner=manner)
+        if not timeout > 0:
+            raise ValueError(f"timeout is {timeout!r}; it must be > 0 seconds")
+        self._timeout = timeout
+        self._atom = ok(topic) if atom is None else atom_of(atom)
+        self._last: float | None = None
+
+    def hear(self, topic: str, message: Any) -> None:
+        """Something came: that is good at once, if it was not."""
+        self._last = self.now
+        if self.said(self._atom) is not True:
+            self.verdict(self._atom, True)
+
+    def look(self) -> None:
+        """Whether it has been too long."""
+        since = self.age if self._last is None else self.now - self._last
+        if since > self._timeout:
+            self.verdict(self._atom, False)
+        elif self._last is not None:
+            self.verdict(self._atom, True)

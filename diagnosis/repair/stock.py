@@ -1,0 +1,368 @@
+"""The actions that come with holdfast, each made for the actors, channels or commands of a system.
+
+What an action can be done to follows from what it is given: `start_node({"jn": "/robot/jn"})` can start `jn` only.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import inspect
+import os
+import signal
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from typing import Any, Final, Protocol
+
+from ...actors.actor import Actor
+from ...actors.errors import HoldfastError
+from ...actors.ref import ActorRef
+from ...supervision.admin import ChildBusy, RestartChild, TerminateChild
+from ..board import SwitchChannel
+from .actions import Act, ActionFailed, RepairAction, Run
+
+PATIENCE: Final = 10.0
+"""Seconds for a supervisor or a board to answer."""
+CHANGED_WITHIN: Final = 30.0
+"""Seconds in which a mechanism must have been changed."""
+OUTPUT: Final = 500
+"""Characters of a failed command's output that are told."""
+
+
+# -- actors ---------------------------------------------------------------------------------------------------------
+
+
+def start_node(addresses: Mapping[str, str], *, timeout: float = PATIENCE, **options: Any) -> RepairAction:
+    """`start_node(n)`: have its supervisor start the stopped actor (again).
+
+    Args:
+        addresses: of each component that can be started so: a child of a supervisor.
+        timeout: seconds.
+        options: those of `RepairAction`.
+    """
+    run = functools.partial(_start, addresses=addresses, timeout=timeout)
+    return _action("start_node", run, addresses, {"grace": 1.0, "timeout": timeout} | options)
+
+
+def stop_node(addresses: Mapping[str, str], *, timeout: float = PATIENCE, **options: Any) -> RepairAction:
+    """`stop_node(n)`: have its supervisor stop the actor; its spec and what was recorded of it stay."""
+    run = functools.partial(_stop, addresses=addresses, timeout=timeout)
+    return _action("stop_node", run, addresses, {"timeout": timeout} | options)
+
+
+def restart_child(
+    addresses: Mapping[str, str],
+    *,
+    name: str = "restart_child",
+    cost: int = 1,
+    timeout: float = PATIENCE,
+    **options: Any,
+) -> RepairAction:
+    """`restart_child(n)`: stop it and start it, in one action."""
+    run = functools.partial(_restart, addresses=addresses, timeout=timeout)
+    more = {"grace": 1.0, "timeout": 2 * timeout} | options
+    return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
+
+
+def restart_subtree(
+    addresses: Mapping[str, str],
+    *,
+    name: str = "restart_subtree",
+    cost: int = 5,
+    timeout: float = PATIENCE,
+    **options: Any,
+) -> RepairAction:
+    """`restart_subtree(n)`: stop and start the supervisor above a component, with all below it.
+
+    Args:
+        addresses: of each component the supervisor that is restarted: itself a child of a supervisor. What lives below
+            it is touched too, and is in our hands meanwhile.
+        name: of the action.
+        cost: dearer than what touches one component only, so that it comes when nothing else is left.
+        timeout: seconds for each half.
+        options: those of `RepairAction`.
+    """
+    return restart_child(addresses, name=name, cost=cost, timeout=timeout, **options)
+
+
+def roll_back(
+    addresses: Mapping[str, str],
+    back: Callable[[str], Awaitable[None] | None],
+    *,
+    name: str = "roll_back",
+    cost: int = 10,
+    timeout: float = PATIENCE,
+    **options: Any,
+) -> RepairAction:
+    """`roll_back(n)`: stop it, have `back(address)` put an older state in its place, and start it."""
+    run = functools.partial(_roll_back, addresses=addresses, back=back, timeout=timeout)
+    more = {"grace": 1.0, "timeout": 3 * timeout} | options
+    return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
+
+
+def bind_port(
+    bindings: Mapping[str, tuple[str, str, str]], *, name: str = "rebind", cost: int = 2, **options: Any
+) -> RepairAction:
+    """`rebind(n)`: point a binding of an actor elsewhere, such as from a failed provider to its stand-in.
+
+    Args:
+        bindings: of each component (its address, the port, the address the port shall lead to).
+        name: of the action.
+        cost: of the action.
+        options: those of `RepairAction`.
+    """
+    owners = {component: owner for component, (owner, _, _) in bindings.items()}
+    run = functools.partial(_bind, bindings=bindings)
+    return _action(name, run, owners, options, pddl=_mend_text(name, cost))
+
+
+def _action(
+    name: str, run: Run, addresses: Mapping[str, str], options: Mapping[str, Any], *, pddl: str = ""
+) -> RepairAction:
+    known: dict[str, Any] = {"takes": addresses.__contains__, "reach": addresses.get}
+    return RepairAction(name, run, pddl, **(known | dict(options)))
+
+
+async def _start(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
+    keeper, child = _keeper(act, addresses[node])
+    try:
+        started = await keeper.ask(RestartChild(child), timeout)
+    except ChildBusy:
+        return  # It runs, or is being started: whether it does, its observer says.
+    if started is None:
+        raise ActionFailed(str(act.step), f"{addresses[node]} did not want to be started")
+
+
+async def _stop(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
+    keeper, child = _keeper(act, addresses[node])
+    await keeper.ask(TerminateChild(child), timeout)
+
+
+async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
+    await _stop(act, node, addresses=addresses, timeout=timeout)
+    act.check()
+    await _start(act, node, addresses=addresses, timeout=timeout)
+
+
+async def _roll_back(
+    act: Act, node: str, *, addresses: Mapping[str, str], back: Callable[[str], Any], timeout: float
+) -> None:
+    await _stop(act, node, addresses=addresses, timeout=timeout)
+    act.check()
+    try:
+        waiting = back(addresses[node])
+        if inspect.isawaitable(waiting):
+            await waiting
+    finally:  # Also if it could not be put back: it was running before.
+        await _start(act, node, addresses=addresses, timeout=timeout)
+
+
+async def _bind(act: Act, node: str, *, bindings: Mapping[str, tuple[str, str, str]]) -> None:
+    address, port, target = bindings[node]
+    here = act.ctx.cell.node
+    here.bind(here.find_ref(address, Actor)._cell, port, here.find_ref(target, Actor)._cell)
+
+
+def _keeper(act: Act, address: str) -> tuple[ActorRef[Any], str]:
+    """The supervisor of an address, and the child's id."""
+    above, _, child = address.rpartition("/")
+    try:
+        return act.ctx.find(above, Actor), child
+    except HoldfastError as error:
+        raise ActionFailed(str(act.step), f"the supervisor of {address} is not there: {error}") from error
+
+
+def _restart_text(name: str, cost: int) -> str:
+    return (
+        f"(:action {name} :parameters (?n - node)"
+        " :precondition (and (bad ?n) (forall (?h - hardware) (imply (drives ?n ?h) (and (on ?h) (good ?h)))))"
+        f" :effect (and (running ?n) (good ?n) (not (bad ?n)) (increase (total-cost) {cost})))"
+    )
+
+
+def _mend_text(name: str, cost: int, kind: str = "component") -> str:
+    return (
+        f"(:action {name} :parameters (?c - {kind}) :precondition (bad ?c)"
+        f" :effect (and (good ?c) (not (bad ?c)) (increase (total-cost) {cost})))"
+    )
+
+
+# -- the power board ------------------------------------------------------------------------------------------------
+
+
+def power_up(board: str, channels: Mapping[str, int], *, timeout: float = PATIENCE, **options: Any) -> RepairAction:
+    """`power_up(h)`: switch the device's channel on.
+
+    Args:
+        board: the address of the `BoardActor`.
+        channels: of each device.
+        timeout: seconds.
+        options: those of `RepairAction`.
+    """
+    run = functools.partial(_switch, board=board, channels=channels, on=True, timeout=timeout)
+    return _channel("power_up", run, channels, {"grace": 1.0, "timeout": timeout} | options)
+
+
+def shutdown(board: str, channels: Mapping[str, int], *, timeout: float = PATIENCE, **options: Any) -> RepairAction:
+    """`shutdown(h)`: switch the device's channel off."""
+    run = functools.partial(_switch, board=board, channels=channels, on=False, timeout=timeout)
+    return _channel("shutdown", run, channels, {"timeout": timeout} | options)
+
+
+def _channel(name: str, run: Run, channels: Mapping[str, int], options: Mapping[str, Any]) -> RepairAction:
+    known: dict[str, Any] = {"takes": channels.__contains__}
+    return RepairAction(name, run, **(known | dict(options)))
+
+
+async def _switch(act: Act, device: str, *, board: str, channels: Mapping[str, int], on: bool, timeout: float) -> None:
+    await act.ctx.find(board, Actor).ask(SwitchChannel(channels[device], on), timeout)
+
+
+# -- anything else --------------------------------------------------------------------------------------------------
+
+
+def run_coroutine(pddl: str, run: Run, **options: Any) -> RepairAction:
+    """Any coroutine as an action; `action` is the decorator for it."""
+    from .actions import action
+
+    return action(pddl, **options)(run)
+
+
+def run_command(pddl: str, *command: str, timeout: float = 30.0, **options: Any) -> RepairAction:
+    """A command of the operating system, such as the paper's USB reset (D11).
+
+    Args:
+        pddl: the `(:action ...)`; `{0}`, `{1}`, ... in the command are its parameters.
+        command: the program and its arguments; no shell reads them.
+        timeout: seconds; after them it is killed, with all that it has started.
+        options: those of `RepairAction`.
+    """
+    if not command:
+        raise ValueError("run_command needs a program")
+    return run_coroutine(pddl, functools.partial(_command, command=command), timeout=timeout, **options)
+
+
+async def _command(act: Act, *names: str, command: Sequence[str]) -> None:
+    argv = [part.format(*names) for part in command]
+    process = await asyncio.create_subprocess_exec(
+        *argv,
+        stdin=asyncio.subprocess.DEVNULL,
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.STDOUT,
+        start_new_session=True,
+    )
+    try:
+        said, _ = await process.communicate()
+    finally:
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(process.pid, signal.SIGKILL)
+            await process.communicate()
+    if process.returncode:
+        text = said.decode(errors="replace").strip()[-OUTPUT:]
+        raise ActionFailed(str(act.step), f"{argv[0]} ended with {process.returncode}: {text}")
+
+
+# -- fault-tolerance mechanisms -------------------------------------------------------------------------------------
+
+
+class Change(Protocol):
+    """What a transaction collects, as far as these actions need it."""
+
+    def attach(self, target: str, mechanism: Any) -> None:
+        """Protect an actor."""
+
+    def compose(self, target: str, mechanism: Any, *, outside: bool = False) -> None:
+        """Nest one more mechanism."""
+
+    def transition(self, target: str, mechanism: Any) -> None:
+        """Put a mechanism in the place of another."""
+
+
+class Transaction(Protocol):
+    """`system.transaction`: the system gives it, since repair knows nothing of mechanisms."""
+
+    def __call__(self, *, timeout: float) -> AbstractAsyncContextManager[Change]:
+        """Collect what is to be done in the block; at its end it is done, or undone."""
+        ...
+
+
+def attach_mechanism(
+    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], **options: Any
+) -> RepairAction:
+    """`attach_pbr(n)`: protect an actor by a mechanism, while requests flow. The other two take the same.
+
+    Args:
+        transaction: `system.transaction`.
+        mechanism: its name, its file, one with its settings, or several, outermost first.
+        addresses: of each component that can be protected so.
+        options: those of `RepairAction`; `name` of the action, `cost`, and `timeout`: seconds until it is undone.
+    """
+    return _mechanism("attach", transaction, mechanism, addresses, options)
+
+
+def compose_mechanism(
+    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], *, outside: bool = False, **options: Any
+) -> RepairAction:
+    """`compose_tr(n)`: nest one more mechanism inside of those that an actor has, or `outside`."""
+    return _mechanism("compose", transaction, mechanism, addresses, options, outside=outside)
+
+
+def transition_mechanism(
+    transaction: Transaction, mechanism: Any, addresses: Mapping[str, str], **options: Any
+) -> RepairAction:
+    """`transition_lfr(n)`: put a mechanism in the place of the one of its sort, or several in the place of all."""
+    return _mechanism("transition", transaction, mechanism, addresses, options)
+
+
+def _mechanism(
+    verb: str,
+    transaction: Transaction,
+    mechanism: Any,
+    addresses: Mapping[str, str],
+    options: Mapping[str, Any],
+    **settings: Any,
+) -> RepairAction:
+    whole: dict[str, Any] = {"timeout": CHANGED_WITHIN, "cost": 5, "name": f"{verb}_{_word(mechanism)}", **options}
+    seconds, cost, name = whole.pop("timeout"), whole.pop("cost"), whole.pop("name")
+
+    async def run(act: Act, node: str) -> None:
+        async with transaction(timeout=seconds) as change:
+            getattr(change, verb)(addresses[node], mechanism, **settings)
+
+    more = {"grace": 1.0, "timeout": seconds + PATIENCE} | whole
+    return _action(name, run, addresses, more, pddl=_mend_text(name, cost, "node"))
+
+
+def _word(mechanism: Any) -> str:
+    """A mechanism in the name of an action."""
+    if isinstance(mechanism, (tuple, list)):
+        return "_".join(map(_word, mechanism))
+    name = mechanism if isinstance(mechanism, str) else getattr(mechanism, "name", "")
+    return name if name.isidentifier() else "mechanism"
+
+
+def change_mechanism(
+    change: Callable[[str], Awaitable[None]],
+    addresses: Mapping[str, str],
+    *,
+    name: str = "change_mechanism",
+    cost: int = 5,
+    **options: Any,
+) -> RepairAction:
+    """`change_mechanism(n)`: have mechanisms changed in any other way, such as several at once.
+
+    Args:
+        change: `await change(address)` does it, in the context of this call: a transaction in another task would be
+            refused, since the actor is in our hands.
+        addresses: of each component that can be protected otherwise.
+        name: of the action; give each change its own.
+        cost: of the action.
+        options: those of `RepairAction`.
+    """
+
+    async def run(act: Act, node: str) -> None:
+        await change(addresses[node])
+
+    return _action(name, run, addresses, options, pddl=_mend_text(name, cost, "node"))

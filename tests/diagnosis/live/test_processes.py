@@ -1,0 +1,60 @@
+"""What actors in processes of their own publish is heard, and who they are is known."""
+
+from collections.abc import AsyncIterator
+
+import pytest
+
+import holdfast as hf
+from holdfast.diagnosis import OBSERVATIONS, generate, observer
+from holdfast.diagnosis.observations import Observation
+from holdfast.diagnosis.observers import Manner, TimeoutObserver
+from holdfast.testing import probe
+
+
+class Beat(hf.Message):
+    number: int
+
+
+class Next(hf.Message):
+    pass
+
+
+class Heart(hf.Actor):
+    def on_start(self, restored: bool) -> None:
+        self.beats = 0
+        self.ctx.every(0.05, Next())
+
+    @hf.on(Next)
+    async def _beat(self, message: Next) -> None:
+        self.beats += 1
+        await self.ctx.publish("/beat", Beat(self.beats))
+
+
+class Other(hf.Actor):
+    @hf.subscribe("/beat")
+    @hf.on(Beat)
+    def _hear(self, message: Beat) -> None:
+        pass
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("t", log=False) as running:
+        await running.start(hf.child("heart", hf.start(Heart), isolation="process"))
+        yield running
+
+
+async def test_what_a_process_publishes_is_heard(system: hf.ActorSystem) -> None:
+    heard = probe(system)
+    heard.subscribe(OBSERVATIONS)
+    manner = Manner(every=0.1, time_to_live=1.0)
+    await system.start(observer("o", hf.start(TimeoutObserver, "/beat", 10.0, manner=manner)))
+    seen = await heard.expect(Observation, timeout=9.0)
+    assert str(seen.literal) == "ok(/beat)"
+
+
+async def test_who_publishes_from_a_process_is_known(system: hf.ActorSystem) -> None:
+    await system.start(hf.child("other", hf.start(Other), isolation="process"))
+    found = await generate(system.node, seconds=1.0)
+    assert found.wiring["heart"].publishes == ("/beat",)
+    assert found.wiring["other"].subscribes == ("/beat",)

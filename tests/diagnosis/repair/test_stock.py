@@ -1,0 +1,281 @@
+"""The actions that come with holdfast, done to real actors, a real board and real commands."""
+
+import asyncio
+import sys
+from collections.abc import AsyncIterator
+
+import pytest
+
+import holdfast as hf
+from holdfast.diagnosis.board import BoardActor, BoardSimulator, BoardState, GetBoard
+from holdfast.diagnosis.planning import PlanningError, Step
+from holdfast.diagnosis.repair import (
+    Act,
+    ActionFailed,
+    RepairAction,
+    Repertoire,
+    action,
+    bind_port,
+    change_mechanism,
+    power_up,
+    restart_child,
+    restart_subtree,
+    roll_back,
+    run_command,
+    run_coroutine,
+    shutdown,
+    start_node,
+    stop_node,
+)
+
+LONG = 20.0
+RESET = "(:action reset_usb :parameters (?d - device) :precondition (bad ?d) :effect (and (good ?d) (not (bad ?d))))"
+
+
+class Ask(hf.Message[str]):
+    """Who answers?"""
+
+
+class Who(hf.Message[int]):
+    """Which life is this?"""
+
+
+class Node(hf.Actor):
+    provider: hf.Binding[hf.Actor]
+
+    @hf.on(Who)
+    def _who(self, message: Who) -> int:
+        return self.ctx.life
+
+    @hf.on(Ask)
+    async def _ask(self, message: Ask) -> str:
+        return self.provider.path
+
+
+class Note(hf.Message):
+    """One more."""
+
+    text: str
+
+
+class Read(hf.Message[list[str]]):
+    """All of them."""
+
+
+class Notes(hf.Actor):
+    def __init__(self) -> None:
+        self.notes: list[str] = []
+
+    @hf.on(Note)
+    def _note(self, message: Note) -> None:
+        self.notes.append(message.text)
+
+    @hf.on(Read)
+    def _read(self, message: Read) -> list[str]:
+        return self.notes
+
+
+class Caller(hf.Actor):
+    """Carries actions out, as the repairer does."""
+
+    def on_start(self, restored: bool) -> None:
+        self.seen = self.ctx
+
+
+@pytest.fixture
+async def system() -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("t", log=False, seed=1) as running:
+        yield running
+
+
+async def do(system: hf.ActorSystem, one: RepairAction, *names: str, check=lambda: None) -> None:
+    caller = system.spawn(hf.start(Caller))
+    await system.node.settled()
+    actor = caller._cell.actor
+    assert actor is not None
+    act = Act(Step(one.name, names), 1, "a test", actor.ctx, check)
+    async with asyncio.timeout(LONG):
+        await one(act, *names)
+
+
+async def tree(system: hf.ActorSystem) -> dict[str, str]:
+    children = [hf.child(name, hf.start(Node)) for name in ("a", "b")]
+    await system.start(hf.supervisor("s", children=[hf.supervisor("low", children=children)]))
+    return {name: f"/t/s/low/{name}" for name in ("a", "b")}
+
+
+async def states(system: hf.ActorSystem) -> dict[str, str]:
+    return {one.id: one.state for one in await system.ref("/t/s/low", hf.Supervisor).ask(hf.WhichChildren())}
+
+
+async def life(system: hf.ActorSystem, path: str) -> int:
+    return await system.ref(path, Node).ask(Who())
+
+
+async def test_stop_and_start(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+    await do(system, stop_node(addresses), "a")
+    assert await states(system) == {"a": "stopped", "b": "running"}
+    await do(system, start_node(addresses), "a")
+    assert await states(system) == {"a": "running", "b": "running"}
+    await do(system, start_node(addresses), "a")  # it runs already
+
+
+async def test_restart_child(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+    before = system.ref(addresses["a"], Node)._cell
+    await do(system, restart_child(addresses), "a")
+    assert system.ref(addresses["a"], Node)._cell is not before or await life(system, addresses["a"]) > 1
+    assert await life(system, addresses["b"]) == 1
+
+
+async def test_a_restart_stops_halfway_when_the_actor_is_taken_away(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+
+    def taken() -> None:
+        raise ActionFailed("restart_child(a)", "failover has it")
+
+    with pytest.raises(ActionFailed, match="failover has it"):
+        await do(system, restart_child(addresses), "a", check=taken)
+    assert await states(system) == {"a": "stopped", "b": "running"}
+
+
+async def test_restart_subtree(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+    cells = {name: system.ref(path, Node)._cell for name, path in addresses.items()}
+    one = restart_subtree(dict.fromkeys(addresses, "/t/s/low"))
+    assert one.reach is not None
+    assert one.reach("a") == "/t/s/low"
+    await do(system, one, "a")
+    assert {name: system.ref(path, Node)._cell is cells[name] for name, path in addresses.items()} == {
+        "a": False,
+        "b": False,
+    }
+
+
+async def test_a_supervisor_that_is_not_there_is_told(system: hf.ActorSystem) -> None:
+    with pytest.raises(ActionFailed, match="the supervisor of /t/none/a is not there"):
+        await do(system, start_node({"a": "/t/none/a"}), "a")
+
+
+async def test_rebind(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+    system.spawn(hf.start(Node), name="standin")
+    await do(system, bind_port({"a": (addresses["a"], "provider", "/t/standin")}), "a")
+    assert await system.ref(addresses["a"], Node).ask(Ask()) == "/t/standin"
+
+
+async def test_roll_back_stops_goes_back_and_starts(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+    seen: list[tuple[str, str]] = []
+
+    async def back(address: str) -> None:
+        seen.append((address, (await states(system))["a"]))
+
+    await do(system, roll_back(addresses, back), "a")
+    assert seen == [("/t/s/low/a", "stopped")]
+    assert (await states(system))["a"] == "running"
+
+
+async def test_roll_back_to_an_older_snapshot(system: hf.ActorSystem) -> None:
+    path = "/t/s/notes"
+    spec = hf.child("notes", hf.start(Notes), recovery=hf.hybrid(interval=1000.0))
+    await system.start(hf.supervisor("s", children=[spec]))
+    notes = system.ref(path, Notes)
+    for text in ("a", "b", "c"):
+        await notes.ask(Note(text))
+        if text != "c":
+            await system.checkpoint(notes)
+    await do(system, roll_back({"n": path}, system.roll_back), "n")
+    # The stop in good order has taken one more snapshot, with all three.
+    assert await system.ref(path, Notes).ask(Read()) == ["a", "b"]
+    with pytest.raises(hf.ControlFailed, match="stop it first"):
+        system.roll_back(path)
+
+
+async def test_if_there_is_nothing_to_go_back_to_the_actor_runs_again(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+
+    def back(address: str) -> None:
+        raise ActionFailed("roll_back(a)", "there is no older snapshot")
+
+    with pytest.raises(ActionFailed, match="no older snapshot"):
+        await do(system, roll_back(addresses, back), "a")
+    assert (await states(system))["a"] == "running"
+
+
+async def test_change_a_mechanism(system: hf.ActorSystem) -> None:
+    seen: list[str] = []
+
+    async def attach(address: str) -> None:
+        seen.append(address)
+
+    await do(system, change_mechanism(attach, {"a": "/t/a"}), "a")
+    assert seen == ["/t/a"]
+
+
+async def test_channels_of_a_board(system: hf.ActorSystem) -> None:
+    simulator = system.spawn(hf.start(BoardSimulator), name="simulator")
+    before: BoardState = await simulator.ask(GetBoard())
+    system.spawn(hf.start(BoardActor, before.url), name="board")
+    await do(system, power_up("/t/board", {"ja": 0}), "ja")
+    assert (await simulator.ask(GetBoard())).on == {0, 1}
+    await do(system, shutdown("/t/board", {"ja": 0}), "ja")
+    assert (await simulator.ask(GetBoard())).on == {1}
+
+
+async def test_a_command_gets_its_arguments_and_no_shell(system: hf.ActorSystem, tmp_path) -> None:
+    # D11: the paper's USB reset is such a command.
+    mark = tmp_path / "mark"
+    text = f"import sys, pathlib; pathlib.Path({str(mark)!r}).write_text(sys.argv[1])"
+    await do(system, run_command(RESET, sys.executable, "-c", text, "{0}; exit 3"), "js")
+    assert mark.read_text() == "js; exit 3"
+
+
+async def test_a_command_that_fails_says_what_it_said(system: hf.ActorSystem) -> None:
+    text = "import sys; print('no such device'); sys.exit(3)"
+    with pytest.raises(ActionFailed, match=r"ended with 3: no such device"):
+        await do(system, run_command(RESET, sys.executable, "-c", text), "js")
+
+
+async def test_a_command_that_hangs_is_killed(system: hf.ActorSystem, tmp_path) -> None:
+    # T61: the fixtures fail when a process is left.
+    mark = tmp_path / "mark"
+    text = f"import pathlib, time; pathlib.Path({str(mark)!r}).write_text('up'); time.sleep(600)"
+    task = asyncio.ensure_future(do(system, run_command(RESET, sys.executable, "-c", text), "js"))
+    async with asyncio.timeout(LONG):
+        while not mark.exists():
+            await asyncio.sleep(0.01)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+
+
+async def test_any_coroutine(system: hf.ActorSystem) -> None:
+    seen: list[str] = []
+
+    async def reset(act: Act, device: str) -> None:
+        seen.append(f"{act.step} because of {act.reason}")
+
+    await do(system, run_coroutine(RESET, reset, attempts=1), "js")
+    await do(system, action(RESET)(reset), "js")
+    assert seen == ["reset_usb(js) because of a test"] * 2
+
+
+def test_what_is_not_implemented_is_not_planned() -> None:
+    domain = Repertoire([start_node({"a": "/t/a"})]).domain
+    assert [one.name for one in domain.actions] == ["start_node"]
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: action("(:action broken"), "parentheses"),
+        (lambda: action(""), "one action"),
+        (lambda: Repertoire([start_node({}), start_node({})]), "there twice"),
+        (lambda: Repertoire([RepairAction("dance", start_node({}).run)]), "no PDDL text"),
+    ],
+)
+def test_wrong_actions_are_refused(make, says: str) -> None:
+    with pytest.raises(PlanningError, match=says):
+        make()

@@ -1,0 +1,282 @@
+"""Each mechanism is attached, exchanged for each other, composed, updated and detached while requests flow (A76)."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import sys
+from asyncio.subprocess import PIPE, STDOUT
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.console.endpoint import control_endpoint
+from holdfast.ftm.adaptation import STEPS
+from holdfast.ftm.declaration import LAYERS
+from holdfast.ftm.mechanism import BUILT_IN, Mechanism, code_of, find
+from holdfast.ftm.model import nesting_problems
+from holdfast.ftm.sec.authority import CertificationAuthority
+from tests.ftm import versions
+from tests.ftm.accounts import Counter, Load, Tags
+from tests.ftm.test_adaptation import stack, transition
+from tests.ftm.test_adaptation_trouble import fails, struck
+from tests.ftm.test_failover import group_of, two_again
+
+# Processes do not care which event loop the root has.
+pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
+
+CA = "/app/ca"
+SETTINGS: dict[str, dict[str, Any]] = {
+    "ad": {"assertions": (versions.tags_are_known,)},
+    "rb": {"alternates": (versions.SameCounter,), "test": (versions.tags_are_known,)},
+    "nvp": {"versions": (versions.SameCounter, versions.OtherCounter)},
+    "sec": {"authority": CA},
+}
+Stack = tuple[str, ...]
+
+
+def made(names: Stack) -> tuple[Mechanism, ...]:
+    return tuple(find(name)(**SETTINGS.get(name, {})) for name in names)
+
+
+def valid_stacks() -> list[Stack]:
+    """All compositions that the change model calls valid, small ones first."""
+    sorts = [[name for name in BUILT_IN if find(name).layer == layer] for layer in LAYERS]
+    found = (tuple(name for name in chosen if name) for chosen in itertools.product(*([*one, ""] for one in sorts)))
+    return sorted((one for one in found if one and not nesting_problems(made(one))), key=len)
+
+
+STACKS = valid_stacks()
+ALONE = [*(one for one in STACKS if len(one) == 1), ("ad", "pbr"), ("ad", "lfr")]
+"""Each mechanism by itself, as far as it can stand so."""
+
+
+def tour(stacks: list[Stack]) -> list[Stack]:
+    """A way that goes from each to each other one, once, and ends where it began."""
+    left = {one: [other for other in stacks if other != one] for one in stacks}
+    way, found = [stacks[0]], list[Stack]()
+    while way:
+        if left[way[-1]]:
+            way.append(left[way[-1]].pop())
+        else:
+            found.append(way.pop())
+    return found[::-1]
+
+
+@pytest.fixture
+async def office(system: hf.ActorSystem) -> hf.ActorSystem:
+    """With a certification authority."""
+    await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+    return system
+
+
+async def change_to(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load, wanted: Stack) -> None:
+    before = stack(ref)
+    try:
+        await transition(system, ref, made(wanted))
+        assert stack(ref) == wanted
+        assert len(group_of(ref).names) == max(one.replicas for one in made(wanted))
+        await load.reached(3)
+    except BaseException as error:
+        error.add_note(f"from {before} to {wanted}")
+        raise
+
+
+async def test_there_are_as_many_as_the_model_says() -> None:
+    """With and without SEC: A&D over PBR or LFR, each way to keep replicas, each way to repeat."""
+    assert len(STACKS) == 2 * (1 + 3 + 2) * 4 - 1
+    way = tour(ALONE)
+    assert len(way) == len(ALONE) * (len(ALONE) - 1) + 1
+    assert len(set(itertools.pairwise(way))) == len(way) - 1
+
+
+async def test_each_is_exchanged_for_each_other_one(office: hf.ActorSystem) -> None:
+    way = tour(ALONE)
+    ref = await office.start(hf.child("alice", hf.start(Counter), mechanism=made(way[0])))
+    load = Load(ref, clients=2)
+    await load.reached(3)
+    for wanted in way[1:]:
+        await change_to(office, ref, load, wanted)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert ref._cell.life == 1
+
+
+async def test_each_composition_is_changed_to(office: hf.ActorSystem) -> None:
+    """Those of more than one layer."""
+    ref = await office.start(hf.child("alice", hf.start(Counter), mechanism=made(STACKS[0])))
+    load = Load(ref, clients=2)
+    for wanted in STACKS[::-1]:
+        if wanted not in ALONE:
+            await change_to(office, ref, load, wanted)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert ref._cell.life == 1
+
+
+def brick_of(mechanism: Mechanism) -> tuple[str, str, str]:
+    """One brick that is its own: role, part, the name of its class."""
+    for role, one in mechanism.roles.items():
+        for part in ("after", "before"):
+            kind = getattr(one, part)
+            if kind is not None:
+                return role, part, code_of(kind).kind
+    raise AssertionError(f"{mechanism.name} has none")
+
+
+@pytest.mark.parametrize("names", ALONE, ids="+".join)
+async def test_each_is_attached_updated_composed_and_detached(
+    office: hf.ActorSystem, tmp_path: Path, names: Stack
+) -> None:
+    """The new code comes from a file that the system has never seen."""
+    ref = await office.start(hf.child("alice", hf.start(Counter)))
+    load, first = Load(ref, clients=2), made(names)[0]
+    await load.reached(3)
+    async with office.transaction(timeout=30) as change:
+        change.attach(ref, made(names))
+    await load.reached(3)
+
+    role, part, kind = brick_of(first)
+    module, _, name = kind.partition(":")
+    file = tmp_path / "newer.py"
+    file.write_text(f"from {module} import {name}\n\n\nclass Newer({name}): ...\n")
+    file.chmod(0o600)
+    async with office.transaction(timeout=30) as change:
+        change.update(ref, part, file, mechanism=first.name, role=role)
+    (brick,) = group_of(ref).cell.host.layers[0].exchanged.values()  # type: ignore[attr-defined]
+    assert brick.__name__ == "Newer"
+    await load.reached(3)
+
+    inner = next(one for one in ("tr", "pbr") if (*names, one) in STACKS or (one, *names) in STACKS)
+    async with office.transaction(timeout=30) as change:
+        change.compose(ref, made((inner,))[0], outside=(*names, inner) not in STACKS)
+    await load.reached(3)
+    async with office.transaction(timeout=30) as change:
+        change.detach(ref, inner)
+    assert stack(ref) == names
+    await load.reached(3)
+    async with office.transaction(timeout=30) as change:
+        change.detach(ref)
+    await load.reached(3)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+    assert (ref._cell.spec.mechanism, ref._cell.life) == (None, 1)
+
+
+# -- three replicas ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("step", STEPS)
+async def test_the_engine_dies_with_three_replicas_and_its_next_life_goes_on(system: hf.ActorSystem, step: str) -> None:
+    """T38 to T41: a replica comes in, and goes again."""
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.PBR()))
+    load = Load(ref, clients=2)
+    for wanted in (("tmr",), ("pbr",)):
+        await load.reached(3)
+        seen = struck(ref, step, fails)
+        await change_to(system, ref, load, wanted)
+        assert step in seen
+        assert await all_again(ref) == wanted
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+
+
+@pytest.mark.parametrize("step", STEPS[:4])
+async def test_a_change_with_three_replicas_that_is_given_up_is_undone(system: hf.ActorSystem, step: str) -> None:
+    """The engine dies as well, in the middle of undoing it."""
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.TMR()))
+    load, host = Load(ref, clients=2), ref._cell.host
+    await load.reached(3)
+    change = asyncio.ensure_future(transition(system, ref, made(("tmr", "tr"))))
+    seen: list[str] = []
+
+    def on_step(name: str) -> None:
+        seen.append(name)
+        if name == step and seen.count(step) == 1:
+            change.cancel()
+        elif name == "abort" and seen.count("abort") == 1:
+            fails()
+
+    host.on_step = on_step  # type: ignore[attr-defined]
+    with pytest.raises(asyncio.CancelledError):
+        await change
+    assert "abort" in seen
+    assert await all_again(ref) == ("tmr",)
+    await load.reached(3)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+
+
+async def all_again(ref: hf.ActorRef[Any]) -> Stack:
+    """The stack, when all replicas are there and have the same."""
+    await two_again(ref)
+    group, host = group_of(ref), ref._cell.host
+    assert (group.config, group.change) == (host.config, None)  # type: ignore[attr-defined]
+    assert not group.is_resting
+    assert not group.is_changing
+    return stack(ref)
+
+
+# -- elsewhere --------------------------------------------------------------------------------------------------------
+
+
+async def test_in_a_subtree_with_a_process_of_its_own_it_is_refused_with_the_reason(system: hf.ActorSystem) -> None:
+    """Its replicas would need processes, and a process there is the child of another one."""
+    far = hf.supervisor("far", isolation="process", children=[hf.child("alice", hf.start(Counter))])
+    await system.start(far)
+    why = "its supervisor lives in another process, which cannot have processes of its own"
+    with pytest.raises(hf.TransactionRefused, match=why):
+        async with system.transaction() as change:
+            change.attach("/app/far/alice", hf.PBR())
+    assert await system.ref("/app/far/alice", Counter).ask(Tags()) == []
+
+
+SCRIPT = """
+import asyncio
+import holdfast as hf
+
+
+async def reconfigure(system):
+    for step in (
+        lambda change: change.attach("/app/alice", "pbr"),
+        lambda change: change.compose("/app/alice", "tr"),
+        lambda change: change.update("/app/alice", "after", "newer.py", mechanism="pbr", role="primary"),
+        lambda change: change.detach("/app/alice", "tr"),
+    ):
+        async with system.transaction(timeout=30.0) as change:
+            step(change)
+        status = await system.get_status("/app/alice")
+        print(status.state)
+    async with system.transaction(timeout=30.0, dry_run=True) as change:
+        change.detach("/app/alice")
+"""
+
+
+async def test_a_script_does_all_of_it_from_another_process(
+    system: hf.ActorSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`holdfast apply`, over the control endpoint: files are named as the script's user names them."""
+    script, newer = tmp_path / "script.py", tmp_path / "newer.py"
+    script.write_text(SCRIPT)
+    newer.write_text("from holdfast.ftm.mechanisms.pbr import Checkpointing\n\n\nclass Newer(Checkpointing): ...\n")
+    for file in (script, newer):
+        file.chmod(0o600)
+    ref = await system.start(hf.child("alice", hf.start(Counter)))
+    load = Load(ref, clients=2)
+    await load.reached(3)
+    monkeypatch.chdir(tmp_path)
+    async with control_endpoint(system, tmp_path / "app.sock") as socket:
+        command = [sys.executable, "-m", "holdfast.console.cli", "apply", str(script), "--socket", str(socket)]
+        process = await asyncio.create_subprocess_exec(*command, stdout=PIPE, stderr=STDOUT)
+        async with asyncio.timeout(60):
+            said, _ = await process.communicate()
+    assert process.returncode == 0, said.decode()
+    assert said.decode().endswith("done\n")
+    assert stack(ref) == ("pbr",)
+    (brick,) = ref._cell.spec.mechanism.exchanged.values()
+    assert brick.__name__ == "Newer"
+    await load.reached(3)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
