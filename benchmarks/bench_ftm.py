@@ -50,7 +50,7 @@ CHANGES: dict[str, tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     "PBR to PBR+TR and back": (STACKS["PBR"], STACKS["PBR+TR"]),
 }
 PACE = 1000  # requests per second while mechanisms are changed
-WINDOW = 0.25  # seconds around a change, and of the quiet time beside it
+WINDOW = 0.15  # seconds around a change, and of the quiet time beside it
 
 
 @contextlib.asynccontextmanager

@@ -80,7 +80,15 @@ def restore_state(actor: Actor, data: bytes) -> None:
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
-    saved: Any = read_image(data) if is_image(data) else decode_value(data)
+    put_back(actor, read_image(data) if is_image(data) else decode_value(data))
+
+
+def put_back(actor: Actor, saved: Any) -> None:
+    """As `restore_state`, of what was read already; it becomes the actor's own.
+
+    Raises:
+        StateMismatch: it is of another class or schema version.
+    """
     where = actor.ctx.path
     if not (isinstance(saved, tuple) and len(saved) == 3):
         raise StateMismatch(where, "it was not written by save_state")

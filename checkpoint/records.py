@@ -2,6 +2,8 @@
 
 The home (`switch.py`) numbers and journals inputs and feeds them; the life (`life.py`) runs one turn per input and
 reports each turn's outputs and outcome. Payloads stay encoded in between.
+
+What there is many of is not seen by the garbage collector (`gc=False`): nothing in it refers back.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ OK, FAILED, DROPPED, STASHED = "ok", "failed", "dropped", "stashed"
 REPLY, REFUSAL, ERROR, CRASH, LATER, NOTHING = "reply", "refusal", "error", "crash", "later", ""
 
 
-class Out(msgspec.Struct, array_like=True):
+class Out(msgspec.Struct, array_like=True, gc=False):
     """One output of a turn; `k` counts them in program order from 1."""
 
     k: int
@@ -39,7 +41,7 @@ class Out(msgspec.Struct, array_like=True):
         return zlib.crc32(self.body, zlib.crc32(head))
 
 
-class Answer(msgspec.Struct, array_like=True):
+class Answer(msgspec.Struct, array_like=True, gc=False):
     """The outcome of an ask: a reply or an error, encoded."""
 
     kind: str = NOTHING
@@ -50,7 +52,7 @@ class Answer(msgspec.Struct, array_like=True):
 # -- home to life ----------------------------------------------------------------------------------------------------
 
 
-class Feed(msgspec.Struct, array_like=True, tag=1):
+class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
     """An input.
 
     `turn` is the number it had before the crash, -1 if it never ended; `pipes` have their result already; from
@@ -151,7 +153,7 @@ class Released(msgspec.Struct, array_like=True, tag=11):
     outs: list[Out]
 
 
-class TurnEnd(msgspec.Struct, array_like=True, tag=12):
+class TurnEnd(msgspec.Struct, array_like=True, tag=12, gc=False):
     """A turn has ended; `outs` are those not released yet."""
 
     turn: int

@@ -19,6 +19,7 @@ from ..checkpoint.records import (
     TurnEnd,
     Unsaved,
 )
+from .images import Image, Patch
 
 
 class StaleEpoch(Refusal):
@@ -72,7 +73,7 @@ class CannotLead(Refusal):
     path: str
 
 
-class Request(msgspec.Struct, array_like=True):
+class Request(msgspec.Struct, array_like=True, gc=False):
     """One request: who has sent it, in which life, and its number at the address (A45)."""
 
     client: str
@@ -159,22 +160,40 @@ class Ended(Message):
     number: int
 
 
-class State(msgspec.Struct, array_like=True):
-    """The state of the server after turn `turn`, with what belongs to it.
+class State(msgspec.Struct, array_like=True, tag=1):
+    """The state of the server after turn `turn`, with what belongs to it: `data`, and `deltas` on top of that.
 
-    Either all of it (`data`, and `deltas` on top of that), or (`base` >= 0) the deltas since turn `base`. `live`: it
-    has caught up with its home. Large ones travel in pieces.
+    `live`: it has caught up with its home. Large ones travel in pieces.
     """
 
     turn: int
-    data: bytes
+    data: Image
     deltas: list[bytes]
     stash: list[Feed]
     returned: list[Feed]
     live: bool
-    base: int = -2
     stash_ids: list[int] = []
     traps: bool = False  # `ctx.trap_exits`
+    absent: list[str] = []  # variables that `__init__` has made, and that are no more
+
+
+class Change(msgspec.Struct, array_like=True, tag=2):
+    """What leads from the state after turn `base` to that after `turn`.
+
+    Either `deltas` (with their checksum) on top of those that are there, or, with a `patch`, another image with these.
+    """
+
+    turn: int
+    base: int
+    patch: Patch | None
+    deltas: list[bytes]
+    check: int
+    stash: list[Feed]
+    returned: list[Feed]
+    live: bool
+    stash_ids: list[int] = []
+    traps: bool = False
+    absent: list[str] = []
 
 
 class Lead(Message[int]):

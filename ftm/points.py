@@ -6,6 +6,7 @@ Between two parts of a batch the state is captured; from there a life can be beg
 from __future__ import annotations
 
 import asyncio
+import zlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
 from typing import TYPE_CHECKING, Any, Final, cast
@@ -15,10 +16,10 @@ import msgspec
 from ..actors import lives, mailbox
 from ..actors.actor import Actor
 from ..actors.cell import DOWN, Cell
-from ..actors.errors import StartFailed
+from ..actors.errors import DamagedValue, StartFailed
 from ..actors.mail import Item
 from ..actors.values import decode_value, encode_value
-from ..checkpoint.keys import key_names, restore_state, save_state, variables
+from ..checkpoint.keys import key_names, put_back, variables
 from ..checkpoint.method import Method
 from ..checkpoint.records import (
     FAILED,
@@ -32,8 +33,10 @@ from ..checkpoint.records import (
     TurnEnd,
 )
 from ..checkpoint.turns import Fed, GoLive
+from .images import BLOCK, Images, Misfit
+from .images import patch as make_patch
 from .life import ENDED, NOWHERE, OVER, BeginAgain, PartOver, ServerLife, Skip
-from .messages import Beside, Request, State, WorkLost
+from .messages import Beside, Change, Request, State, WorkLost
 
 if TYPE_CHECKING:
     from .server import Server
@@ -41,12 +44,22 @@ if TYPE_CHECKING:
 
 COMPACT_BYTES: Final = 64 * 1024
 """Deltas that are larger than the state they belong to, and than this, are replaced by a whole state."""
+MOST_DELTAS: Final = 4096
+"""So are more than these: whoever leads next has to apply them."""
 UNKNOWN: Final = -3
 """In place of the turn that a delta begins after."""
 
 HandOver = Callable[[list[TurnEnd], bool], Awaitable[None]]
 TurnHook = Callable[[Any, TurnEnd], TurnEnd]
 """Takes the server and the end of a turn, and returns what the end is to be."""
+
+
+def checksum(parts: Iterable[bytes]) -> int:
+    """Of bytes, one behind the other."""
+    found = 0
+    for part in parts:
+        found = zlib.crc32(part, found)
+    return found
 
 
 class Points(lives.LocalHost):
@@ -62,6 +75,9 @@ class Points(lives.LocalHost):
         self.is_over = False  # it has ended itself
         self.is_lazy = False  # what comes out is the same each time: points may be far apart
         self.point: State | None = None
+        self._images = Images()
+        self._given: State | None = None  # the point that another replica was told last
+        self._chain: tuple[State | None, int] = None, 0  # a point, and the bytes of its deltas
         self.marks: list[int] = []  # the turns that the point's deltas begin after
         self.tail: list[tuple[Request, TurnEnd | None]] = []  # handed over since the point; with the end if it failed
         self.previous: tuple[State, list[Request]] | None = None  # before the last part, and that part
@@ -92,6 +108,7 @@ class Points(lives.LocalHost):
         self._is_quiet = self._is_again = self._is_stopping = self._is_abandoned = False
         self._snapshot_wanted = False
         self._point_names: set[str] | None = None
+        self._begun_names: set[str] = set()  # the variables that the life has begun with
         self._crashes = 0
         self._is_work_lost = False
         self._start_turn = -1
@@ -143,9 +160,13 @@ class Points(lives.LocalHost):
         start = cell.extra().start
         assert start is not None
         life = ServerLife(cell, cast("Server", self), self.method)
-        has_state = point is not None and point.data != b""
+        has_state = point is not None and point.data.size > 0
         if point is not None and has_state:
-            life.from_home(Restore(point.data))
+            try:
+                data = point.data.whole()
+            except DamagedValue as error:
+                raise StartFailed(self.address, str(error)) from error
+            life.from_home(Restore(data))
         turn = self._start_turn if point is None else point.turn
         life.begin(start, turn, [] if point is None else point.stash_ids)
         self.life = life
@@ -156,7 +177,10 @@ class Points(lives.LocalHost):
         if point is not None:
             cell.extra().trap_exits = point.traps
         actor: Any = cell.actor
+        self._begun_names = set(variables(actor)) if self.has_access else set()
         if point is not None:
+            for name in self._begun_names.intersection(point.absent):  # `__init__` has made it, a turn has deleted it.
+                delattr(actor._state_root(), name)
             for delta in point.deltas:
                 actor.apply_delta(decode_value(delta))
             senders = cell.node
@@ -315,13 +339,13 @@ class Points(lives.LocalHost):
         actor: Any = life.cell.actor
         stash = [fed.feed for fed in life.stash]
         returned = [fed.feed for fed in life.returned.values()]
-        is_chain = self.has_deltas and point is not None and not point.stash_ids
-        if is_chain and point is not None and sum(map(len, point.deltas)) <= max(COMPACT_BYTES, len(point.data)):
+        if self.has_deltas and point is not None and self._takes_delta(point):
             delta = encode_value(actor.get_delta(), where=f"{self.address}.get_delta()")
             self.marks = [*self.marks, point.turn]
             self.point = State(life.turn, point.data, [*point.deltas, delta], stash, returned, life.is_live)
+            self._chain = self.point, self._chain[1] + len(delta)
         else:
-            data = save_state(actor)
+            data = self._images.take(actor, None if point is None else point.data)
             if self.has_deltas:
                 actor.get_delta()
             self.marks = []
@@ -331,37 +355,70 @@ class Points(lives.LocalHost):
         self.point.stash_ids = [key for key in ids if all(fed.feed.id != key for fed in life.stash)]
         self._point_names = None
         if getattr(actor, "get_state", None) is None and key_names(actor) is None:
-            self._point_names = set(variables(actor))
+            self._point_names = names = set(variables(actor))
+            self.point.absent = sorted(self._begun_names - names)
         self.tail = []
         return self.point
 
-    def since(self, turn: int) -> State:
-        """The present point, as what has changed since an earlier one if that is known; else all of it."""
-        point = self.capture()
-        ids, traps = point.stash_ids, point.traps
-        if turn == point.turn:
-            at = len(point.deltas)
-        elif turn in self.marks:
-            at = self.marks.index(turn)
-        else:
-            return point
-        deltas = point.deltas[at:]
-        return State(point.turn, b"", deltas, point.stash, point.returned, point.live, turn, ids, traps)
+    def _takes_delta(self, point: State) -> bool:
+        """Whether what has changed is kept on top of this point."""
+        if self._chain[0] is not point:
+            self._chain = point, sum(map(len, point.deltas))
+        is_short = len(point.deltas) < MOST_DELTAS and self._chain[1] <= max(COMPACT_BYTES, point.data.size)
+        return is_short and not point.stash_ids
 
-    def apply(self, state: State) -> None:
-        """Take a state from another replica, whole or not at all.
+    def since(self, turn: int) -> Change | None:
+        """What leads to the present point from the one after an earlier turn; None if all of it is no more than that.
+
+        Whoever is given it has all of the present point from now on.
+        """
+        point, given = self.point, self._given
+        assert point is not None
+        self._given = point
+        patch, deltas = None, point.deltas
+        at = self._place_of(turn, point)
+        if at is not None:
+            deltas = point.deltas[at:]
+        else:
+            before = None if self.previous is None else self.previous[0]
+            base = next((one for one in (given, before) if one is not None and one.turn == turn), None)
+            if base is None or point.data.size <= BLOCK:
+                return None
+            patch = make_patch(base.data, point.data)
+        check = checksum(deltas)
+        ids, traps, absent = point.stash_ids, point.traps, point.absent
+        stash, returned = point.stash, point.returned
+        return Change(point.turn, turn, patch, deltas, check, stash, returned, point.live, ids, traps, absent)
+
+    def _place_of(self, turn: int, point: State) -> int | None:
+        """The first of the point's deltas that this turn has not got, if there only deltas are missing."""
+        if turn == point.turn:
+            return len(point.deltas)
+        if self.marks and self.marks[-1] == turn:
+            return len(self.marks) - 1
+        return self.marks.index(turn) if turn in self.marks else None
+
+    def led_to(self, state: State | Change) -> State:
+        """The state that another replica has said; the one that is here stays as it is.
 
         Raises:
-            ValueError: it is a delta to a state that is not here.
+            Misfit, DamagedValue: these are differences to something that is not here, or it has come damaged.
         """
-        if state.base == -2:
-            self.install(state)
-            return
+        if isinstance(state, State):
+            state.data.check()
+            return state
         point = self.point
         if point is None or point.turn != state.base:
-            raise ValueError(f"a delta to turn {state.base}, and turn {-1 if point is None else point.turn} is here")
-        state.data, state.deltas, state.base = point.data, [*point.deltas, *state.deltas], -2
-        self.install(state)
+            raise Misfit(f"it is to turn {state.base}, and turn {-1 if point is None else point.turn} is here")
+        if checksum(state.deltas) != state.check:
+            raise Misfit("its deltas have come damaged")
+        data, deltas = point.data, [*point.deltas, *state.deltas]
+        if state.patch is not None:
+            data, deltas = state.patch.applied(point.data), state.deltas
+        return State(
+            state.turn, data, deltas, state.stash, state.returned, state.live, state.stash_ids, state.traps,
+            state.absent,
+        )  # fmt: skip
 
     def forget_point(self) -> None:
         """The state was replaced in no turn: no earlier point leads to it."""
@@ -379,13 +436,14 @@ class Points(lives.LocalHost):
         assert life.feed is None
         actor: Any = life.cell.actor
         names = self._point_names
-        restore_state(actor, point.data)
+        saved = point.data.value()
+        put_back(actor, saved)
         for delta in point.deltas:
             actor.apply_delta(decode_value(delta))
         if self.has_deltas:
             actor.get_delta()
         if names is not None:
-            for name in set(variables(actor)) - set(self._names_of(point)):
+            for name in set(variables(actor)) - set(saved[2]):
                 delattr(actor._state_root(), name)
         senders = life.cell.node
         life.cell.extra().trap_exits = point.traps
@@ -395,11 +453,6 @@ class Points(lives.LocalHost):
         ]
         self.point, self.tail = point, []
         self.marks = [UNKNOWN] * len(point.deltas)
-
-    @staticmethod
-    def _names_of(point: State) -> list[str]:
-        saved: Any = decode_value(point.data)
-        return list(saved[2])
 
     def skip_to(self, turn: int) -> None:
         """These numbers are used, though no turn has left anything."""

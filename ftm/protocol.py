@@ -22,6 +22,7 @@ from ..actors.message import message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
 from .bricks import FOREVER, Brick, Flush
+from .images import image_from
 from .messages import (
     CannotLead,
     ConfigMismatch,
@@ -235,7 +236,7 @@ class RequestProtocol(Transfer):
             data, self._pieces = b"".join(self._pieces), []
             server = self._standing.server
             await server.drop_life()
-            server.install(State(message.turn, data, [], [], [], False, -2, message.stash, message.traps))
+            server.install(State(message.turn, image_from(data), [], [], [], False, message.stash, message.traps))
             self._standing.log.replace(message.log)
 
     @on(Lead)

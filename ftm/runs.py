@@ -101,16 +101,15 @@ def form(run: Run, *, with_state: bool = True) -> Any:
 
 def state_form(state: State) -> Any:
     """The canonical form of a state."""
-    saved: Any = decode_value(state.data) if state.data else None
+    saved = state.data.value()
     stash = ("list", *(f"{feed.id}" for feed in state.stash))
     return ("state", f"{state.turn}", canonical(saved), canonical(list(map(decode_value, state.deltas))), stash)
 
 
 def digest_of_state(state: State) -> bytes:
     """A digest of a state; the order of sets and dicts does not count."""
-    parts = [state.data, *state.deltas]
     stash = [feed.id for feed in state.stash]
-    return state_digest([state.turn, stash, [decode_value(part) if part else None for part in parts]])
+    return state_digest([state.turn, stash, [state.data.value(), *map(decode_value, state.deltas)]])
 
 
 def vote(voter: AnyVoter, runs: Sequence[Run | None], *, with_state: bool = True) -> Agreed[Run] | Undecided:

@@ -441,7 +441,7 @@ class Server(Points):
         point = self.point
         assert life.cell.actor is not None
         is_known = point is not None and point.turn == life.turn and not point.deltas and not self.tail
-        data = point.data if point is not None and is_known else save_state(life.cell.actor)
+        data = point.data.whole() if point is not None and is_known else save_state(life.cell.actor)
         stash = [fed.feed.id for fed in life.stash]
         parts, pause = pieces(data), time.perf_counter() - begin
         for index, one in enumerate(parts, 1):

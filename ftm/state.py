@@ -2,30 +2,45 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
 from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
+from ..actors.errors import DamagedValue
 from ..actors.message import Message
 from ..checkpoint.records import TurnEnd
-from .messages import State
+from .images import Misfit
+from .messages import Change, State
 
 if TYPE_CHECKING:
     from .standing import Standing
 
+MISFIT: Final = -3
+"""In place of a turn: these differences do not fit; all of it is wanted."""
 
-class Capture(Message[State]):
-    """The state after the last turn; as what has changed since turn `since`, if that is known."""
+
+class Captured(msgspec.Struct):
+    """A state, and what leads to it from an earlier one, if that is known and less."""
+
+    state: State
+    change: Change | None
+
+
+class Capture(Message[Captured]):
+    """The state after the last turn, and what has changed since turn `since`."""
 
     since: int = -2
 
 
 class Apply(Message[int]):
-    """Keep this state instead of one's own, whole or not at all; a life is made of it when one is wanted (T8b)."""
+    """Keep this state instead of one's own, whole or not at all; a life is made of it when one is wanted (T8b).
 
-    state: State
+    The reply is its turn; `MISFIT` if these are differences to something else, or damaged: then nothing has changed.
+    """
+
+    state: State | Change
 
 
 class Ran(msgspec.Struct):
@@ -59,18 +74,24 @@ class StateManager(Actor):
         self._standing = standing
 
     @on(Capture)
-    def capture(self, message: Capture) -> State:
+    def capture(self, message: Capture) -> Captured:
         """Save the state."""
-        return self._standing.server.since(message.since)
+        server = self._standing.server
+        state = server.capture()
+        return Captured(state, server.since(message.since))
 
     @on(Apply)
     async def apply(self, message: Apply) -> int:
         """Take a state."""
         server = self._standing.server
+        try:
+            state = server.led_to(message.state)
+        except (Misfit, DamagedValue):
+            return MISFIT
         had_life = server.life is not None
         if had_life:
             await server.drop_life()
-        server.apply(message.state)
+        server.install(state)
         if had_life:
             await server.ensure()
         return server.turn

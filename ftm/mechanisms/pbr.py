@@ -19,15 +19,18 @@ from ...actors.message import Message
 from ..alarms import ProtectionLost
 from ..bricks import FOREVER, After
 from ..mechanism import Mechanism, Role
-from ..messages import Done, Logged, State
+from ..messages import Change, Done, Logged, State
 from ..standing import PeerLost
-from ..state import Apply, Capture
+from ..state import MISFIT, Apply, Capture
 
 
 class Checkpoint(Message[int]):
-    """The state behind outcomes, and the outcomes, for the reply log of the backup (A52, A54)."""
+    """The state behind outcomes, and the outcomes, for the reply log of the backup (A52, A54).
 
-    state: State
+    The reply is the turn that the backup has; `MISFIT` if it wants all of the state.
+    """
+
+    state: State | Change
     log: list[Logged]
 
 
@@ -53,20 +56,21 @@ class Checkpointing(After):
                 standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
             return done
         self._was_alone = None
-        state = await self.state.ask(Capture(standing.peer_turn), timeout=FOREVER)
+        captured = await self.state.ask(Capture(standing.peer_turn), timeout=FOREVER)
+        state = captured.state
         standing.peer_turn = state.turn
         self._unheard += standing.entries(done.ends)
-        checkpoint, said = Checkpoint(state, list(self._unheard)), self._heard + len(self._unheard)
+        checkpoint, said = Checkpoint(captured.change or state, list(self._unheard)), self._heard + len(self._unheard)
         self.taken()
         assert isinstance(self.mechanism, PBR)
         if standing.peer_state == "joining":
-            self._send(checkpoint, said)  # It does not count yet: what it has not got does not hold up anybody.
+            self._send(checkpoint, said, state)  # It does not count yet: what it has not got does not hold up anybody.
         elif self.mechanism.acknowledge:
-            await self._hand_over(checkpoint, said)
+            await self._hand_over(checkpoint, said, state)
         else:
             while len(self._out) >= self.mechanism.window:
                 await asyncio.wait(self._out, return_when=asyncio.FIRST_COMPLETED)
-            self._send(checkpoint, said)
+            self._send(checkpoint, said, state)
         return done
 
     async def drain(self) -> None:
@@ -74,9 +78,10 @@ class Checkpointing(After):
         for task in list(self._out):
             await asyncio.wait((task,))
 
-    async def _hand_over(self, checkpoint: Checkpoint, said: int) -> None:
+    async def _hand_over(self, checkpoint: Checkpoint, said: int, state: State) -> None:
         try:
-            await self.ask_peer(checkpoint)
+            if await self.ask_peer(checkpoint) == MISFIT:
+                await self.ask_peer(Checkpoint(state, checkpoint.log))
         except PeerLost:
             said = self._heard + len(self._unheard)  # We are alone, or another one is brought to our state.
         self._forget_unheard(said)
@@ -86,8 +91,8 @@ class Checkpointing(After):
             del self._unheard[: said - self._heard]
             self._heard = said
 
-    def _send(self, checkpoint: Checkpoint, said: int) -> None:
-        task = self.ctx.create_task(self._hand_over(checkpoint, said))
+    def _send(self, checkpoint: Checkpoint, said: int, state: State) -> None:
+        task = self.ctx.create_task(self._hand_over(checkpoint, said, state))
         self._out.add(task)
         task.add_done_callback(self._out.discard)
 
@@ -106,7 +111,8 @@ class StateUpdate(After):
             standing.log.add(message.log)  # Else what it says of these requests would be known to nobody here.
             return standing.server.turn  # It was overtaken.
         turn = await self.state.ask(Apply(message.state), timeout=FOREVER)
-        standing.log.add(message.log)
+        if turn != MISFIT:
+            standing.log.add(message.log)
         return turn
 
 

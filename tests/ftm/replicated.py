@@ -201,7 +201,8 @@ async def pair(
 ) -> Driver:
     """A primary that has handled turn 0, and a backup that has joined it."""
     await system.start(hf.child("other", hf.start(Other)))
-    driver = Driver(system, hf.start(kind), layers or (PBR(),))
+    recipe = kind if isinstance(kind, hf.Start) else hf.start(kind)
+    driver = Driver(system, recipe, layers or (PBR(),))
     driver.outside = doubled(system)
     await driver.start(("r1", *others), **setting)
     await driver.begin(*others)

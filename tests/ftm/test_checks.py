@@ -15,9 +15,10 @@ from holdfast.checkpoint.records import DROPPED, OK, REPLY, Answer, TurnEnd
 from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
-from holdfast.ftm.messages import Done, NotFollowing, ReplyEvicted, Request, State, Work
+from holdfast.ftm.messages import Change, Done, NotFollowing, ReplyEvicted, Request, State, Work
+from holdfast.ftm.points import checksum
 from holdfast.ftm.replylog import ReplyLog
-from holdfast.ftm.state import Apply
+from holdfast.ftm.state import MISFIT, Apply
 from tests.ftm import accounts
 from tests.ftm.replicated import Add, Read, Total, pair
 from tests.ftm.test_failover import group_of, pid_of, stop_process, two_again
@@ -29,7 +30,8 @@ async def said(driver: Any, state: State, *, epoch: int) -> int:
     """What the backup answers to this state."""
     body = driver.system.node.codec.encoder.encode(Checkpoint(state, []))
     after = driver.system.node.cell_at(driver.path("r2") + "/after").ref
-    return msgspec.msgpack.decode(await after.ask(Letter(epoch, 0, CHECKPOINT, body)))
+    letter = Letter(epoch, 0, CHECKPOINT, body, size=len(body), stream=1, number=1)
+    return msgspec.msgpack.decode(await after.ask(letter))
 
 
 async def test_who_was_not_told_that_it_follows_takes_nothing(system: hf.ActorSystem) -> None:
@@ -55,16 +57,15 @@ async def test_a_state_that_was_overtaken_does_not_come_back(system: hf.ActorSys
 
 
 async def test_what_has_changed_since_a_state_that_is_not_here_is_not_taken(system: hf.ActorSystem) -> None:
-    """The replica ends: its next life is given a whole state."""
+    """All of it is wanted instead."""
     driver = await pair(system)
     assert await driver.ask(Add(1)) == 1
-    cell = system.node.cell_at(driver.path("r2"))
-    gone = cell.ended()
-    state = State(7, b"", [b"\x80"], [], [], True, 5)
-    with pytest.raises(hf.HoldfastError):
-        await system.node.cell_at(driver.path("r2") + "/state").ref.ask(Apply(state))
-    async with asyncio.timeout(10):
-        await gone
+    change = Change(7, 5, None, [b"\x80"], checksum([b"\x80"]), [], [], True)
+    assert await system.node.cell_at(driver.path("r2") + "/state").ref.ask(Apply(change)) == MISFIT
+    assert driver.standing("r2").server.turn == 1
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Read()) == [1]
 
 
 async def test_a_request_whose_outcome_was_evicted_is_not_handled_again(system: hf.ActorSystem) -> None:

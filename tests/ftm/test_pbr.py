@@ -14,6 +14,7 @@ from holdfast.actors.exits import SHUTDOWN, pack_exit
 from holdfast.checkpoint.records import OK, STASHED, TurnEnd
 from holdfast.checkpoint.records import Closed as LifeClosed
 from holdfast.ftm.alarms import ProtectionLost
+from holdfast.ftm.images import image_from
 from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
 from holdfast.ftm.messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
@@ -390,5 +391,5 @@ async def test_kills_at_any_moment_lose_and_double_nothing(system: hf.ActorSyste
 
 def test_names_used_here_are_those_of_the_library() -> None:
     assert issubclass(Closed, Total)
-    assert State(0, b"", [], [], [], False).base == -2
+    assert State(0, image_from(b""), [], [], [], False).stash_ids == []
     assert Done(0, 0, 0, [], True).more == []

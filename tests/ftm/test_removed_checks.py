@@ -68,8 +68,8 @@ CHECKS = {
     ),
     "T4: PBR: a reply leaves when the backup has its state": Check(
         "ftm/mechanisms/pbr.py",
-        "        elif self.mechanism.acknowledge:\n            await self._hand_over(checkpoint, said)\n",
-        "        elif self.mechanism.acknowledge:\n            self._send(checkpoint, said)\n",
+        "        elif self.mechanism.acknowledge:\n            await self._hand_over(checkpoint, said, state)\n",
+        "        elif self.mechanism.acknowledge:\n            self._send(checkpoint, said, state)\n",
         PBR,
         "test_a_reply_leaves_only_when",
     ),
