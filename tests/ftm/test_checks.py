@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -12,6 +13,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.records import DROPPED, OK, REPLY, Answer, TurnEnd
+from holdfast.ftm.host import GroupHost
 from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
@@ -26,9 +28,9 @@ from tests.ftm.test_failover import group_of, pid_of, stop_process, two_again
 CHECKPOINT = "holdfast.ftm.mechanisms.pbr:Checkpoint"
 
 
-async def said(driver: Any, state: State, *, epoch: int) -> int:
+async def said(driver: Any, state: State | Change, *, epoch: int, log: Any = ()) -> int:
     """What the backup answers to this state."""
-    body = driver.system.node.codec.encoder.encode(Checkpoint(state, []))
+    body = driver.system.node.codec.encoder.encode(Checkpoint(state, list(log)))
     after = driver.system.node.cell_at(driver.path("r2") + "/after").ref
     letter = Letter(epoch, 0, CHECKPOINT, body, size=len(body), stream=1, number=1)
     return msgspec.msgpack.decode(await after.ask(letter))
@@ -66,6 +68,18 @@ async def test_what_has_changed_since_a_state_that_is_not_here_is_not_taken(syst
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
     assert await driver.ask(Read()) == [1]
+
+
+async def test_outcomes_without_their_state_are_not_known(system: hf.ActorSystem) -> None:
+    """Else a request would be answered that has left nothing behind."""
+    driver = await pair(system)
+    (key,) = driver.send(Add(1))
+    assert await driver.reply(key) == 1
+    change = Change(7, 5, None, [b"\x80"], checksum([b"\x80"]), [], [], True)
+    log = [("", 0, 77, TurnEnd(7, 77, OK, [], Answer(REPLY, "", b"\x63")))]
+    assert await said(driver, change, epoch=driver.epoch, log=log) == MISFIT
+    assert driver.standing("r2").log.find(77) is None
+    assert driver.standing("r2").log.find(key) is not None
 
 
 async def test_a_request_whose_outcome_was_evicted_is_not_handled_again(system: hf.ActorSystem) -> None:
@@ -132,3 +146,21 @@ async def test_what_an_earlier_epoch_says_and_what_is_said_twice_is_nobodys_answ
     os.kill(pid, signal.SIGCONT)
     assert await asked == 2
     assert await ref.ask(accounts.Tags()) == [0, 1]
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_who_led_before_is_dead_when_another_one_is_told_to_lead(system: hf.ActorSystem) -> None:
+    """T38, fail-silence: it was silent only, and could have gone on at any moment."""
+    ref = await system.start(hf.child("alice", hf.start(accounts.Counter), mechanism=PBR()))
+    await two_again(ref)
+    assert await ref.ask(accounts.Add(0)) == 1
+    group, host = group_of(ref), ref._cell.host
+    assert isinstance(host, GroupHost)
+    assert group.primary is not None
+    pid = pid_of(system, ref, group.primary)
+    seen: list[tuple[str, bool]] = []
+    host.on_step = lambda step: seen.append((step, Path(f"/proc/{pid}").exists()))
+    await stop_process(pid)
+    assert await ref.ask(accounts.Add(1), timeout=30) == 2
+    assert ("depose", True) in seen
+    assert [alive for step, alive in seen if step in ("lead", "bind")] == [False, False]
