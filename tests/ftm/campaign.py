@@ -272,11 +272,11 @@ class Campaign:
         """What was told, and whether a fault of this kind explains it."""
         told = self.events.take()
         trial.alarms = [type(one).__name__ for one in told if isinstance(one, TOLD)]
-        # A follower that gets something twice, late or in another order has really come to something else.
-        is_out_of_order = self.kind in LATE and trial.fault.leads is False
-        false: tuple[type[Any], ...] = () if self.kind in VALUES or is_out_of_order else OF_VALUES
+        false: tuple[type[Any], ...] = () if self.kind in VALUES else OF_VALUES
         if self.kind in LATE | FRAMES:
             false += (FailedOver, ProtectionLost, ReplicaLost)  # A machine under load may well suspect for a moment.
+        if self.kind in LATE and trial.fault.leads is False:
+            false = ()  # A follower that gets something twice or in another order has really come to something else.
         wrong = [one for one in told if isinstance(one, false)]
         self.row.false_alarms += len(wrong)
         self.row.trouble += [f"{trial.fault} nth={trial.fault.nth}: false alarm {one}" for one in wrong[:2]]
