@@ -12,7 +12,7 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.records import DROPPED, OK, REPLY, Answer, TurnEnd
+from holdfast.checkpoint.records import DROPPED, OK, REPLY, Answer, Outcome, TurnEnd
 from holdfast.ftm.host import GroupHost
 from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanisms.lfr import LFR
@@ -22,7 +22,7 @@ from holdfast.ftm.points import checksum
 from holdfast.ftm.replylog import ReplyLog
 from holdfast.ftm.state import MISFIT, Apply
 from tests.ftm import accounts
-from tests.ftm.replicated import Add, Read, Total, pair
+from tests.ftm.replicated import Add, Fetch, Read, Total, pair
 from tests.ftm.test_failover import group_of, pid_of, stop_process, two_again
 
 CHECKPOINT = "holdfast.ftm.mechanisms.pbr:Checkpoint"
@@ -120,6 +120,32 @@ async def test_a_batch_that_comes_to_proceed_twice_is_computed_once(system: hf.A
     await system.resume(proceed)
     assert await driver.reply(key) == 1
     assert await driver.ask(Read()) == [1]
+
+
+async def test_what_a_follower_hears_before_it_has_the_state_does_not_keep_the_state_away(
+    system: hf.ActorSystem,
+) -> None:
+    """A new life at an address that is known joins while a turn waits for what it has asked."""
+    driver = await pair(system, Total, LFR())
+    answer, driver.outside = driver.outside, lambda out: None
+    (key,) = driver.send(Fetch(2))
+    async with asyncio.timeout(10):
+        while not driver.released:
+            await asyncio.sleep(0.001)
+    await driver.stop_replica("r2")
+    await driver.add("r2")
+    joining = asyncio.ensure_future(driver.join("r2"))
+    async with asyncio.timeout(10):
+        while driver.standing("r1").peer_state != "joining":
+            await asyncio.sleep(0.001)
+    for (turn, k), out in driver.released.items():
+        driver.inward(Outcome(turn, k, answer(out)))
+    async with asyncio.timeout(10):
+        await joining
+    assert await driver.reply(key) == 2
+    await driver.stop_replica("r1")
+    await driver.fail_over("r2")
+    assert await driver.ask(Read()) == [-2, 4]
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])

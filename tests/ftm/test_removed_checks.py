@@ -171,6 +171,13 @@ CHECKS = {
         PBR,
         "test_a_turn_that_asks_is_undone",
     ),
+    "what a follower hears does not stand in the way of its state": Check(
+        "ftm/mechanisms/lfr.py",
+        "    answers_later = True  # What has to wait for the leader's state must not hold up the order",
+        "    answers_later = False  # What has to wait for the leader's state must not hold up the order",
+        CHECKS_ALONE,
+        "test_what_a_follower_hears",
+    ),
     "T8: outcomes of leader and follower are compared": Check(
         "ftm/mechanisms/lfr.py",
         "                if ours[:3] != theirs:\n",
