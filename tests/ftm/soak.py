@@ -105,8 +105,8 @@ class Changes:
             self.done[name] += 1
 
 
-async def run(seconds: float, rng: random.Random) -> Found:
-    """Soak for so long."""
+async def run(seconds: float, rng: random.Random, *, least: int = 0) -> Found:
+    """Soak for so long, and for so many changes."""
     async with running() as system:
         await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
         load = Plain(30.0, rng)
@@ -114,10 +114,11 @@ async def run(seconds: float, rng: random.Random) -> Found:
         load.begin()
         changes, loop = Changes(system, ref, rng), asyncio.get_running_loop()
         end, kills, bad, stuck = loop.time() + seconds, 0, Bad(), ""
+        over = asyncio.Event()
 
         async def kill() -> None:
             nonlocal kills
-            while loop.time() < end:
+            while not over.is_set():
                 await asyncio.sleep(rng.uniform(0.1, 0.8))
                 group = group_of(ref)
                 if group is None or group.primary is None or not all(map(group.is_well, group.names)):
@@ -129,10 +130,11 @@ async def run(seconds: float, rng: random.Random) -> Found:
 
         killing = asyncio.create_task(kill())
         try:
-            while loop.time() < end:
+            while loop.time() < end or changes.done.total() < least:
                 began = loop.time()
                 await changes.one()
                 await asyncio.sleep(max(0.0, PAUSE - (loop.time() - began)))
+            over.set()
             await killing
             await load.reached(20)
             if group_of(ref) is not None:
@@ -142,6 +144,7 @@ async def run(seconds: float, rng: random.Random) -> Found:
         except (Stuck, TimeoutError, hf.AskTimeout) as error:
             stuck = str(error) or described(group_of(ref))
         finally:
+            over.set()
             load.abandon()
         if load.failed:
             bad.lost.extend(load.failed)
