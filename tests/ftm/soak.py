@@ -130,7 +130,7 @@ async def run(seconds: float, rng: random.Random, *, least: int = 0) -> Found:
 
         killing = asyncio.create_task(kill())
         try:
-            while loop.time() < end or changes.done.total() < least:
+            while loop.time() < end or (changes.done.total() < least and loop.time() < end + 60):
                 began = loop.time()
                 await changes.one()
                 await asyncio.sleep(max(0.0, PAUSE - (loop.time() - began)))
