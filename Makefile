@@ -23,6 +23,8 @@ campaign: $(VENV)/.dev
 	HOLDFAST_KILLS=10000 HOLDFAST_CUTS=5000 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
 	    -o faulthandler_timeout=900 \
 	    tests/checkpoint/test_kills.py tests/checkpoint/sqlite/test_power.py tests/checkpoint/test_removed.py
+	HOLDFAST_REQUESTS=10000 HOLDFAST_STRIKES=2000 HOLDFAST_SOAK=60 HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s \
+	    tests/ftm/test_campaign_faults.py tests/ftm/test_campaign.py tests/ftm/test_soak.py tests/ftm/test_removed_checks.py
 
 # The static part of `check`, cheapest first.
 lint: $(VENV)/.dev .link/holdfast

@@ -6,12 +6,13 @@ import time
 from typing import TYPE_CHECKING
 
 from ..actors.actor import Actor, on
-from ..actors.errors import HoldfastError
+from ..actors.errors import AskTimeout, HoldfastError
 from .events import ReplicaJoined
 from .failover import bury
 from .group import Look
 from .messages import ConfigMismatch, Follow
 from .orders import Join
+from .sealed import Refused
 
 if TYPE_CHECKING:
     import asyncio
@@ -22,6 +23,8 @@ FOLLOWED_WITHIN = 2.0
 """Seconds in which a replica has to say that it follows."""
 JOINED_WITHIN = 60.0
 """Seconds that the transfer of a state may take."""
+DEAF_AFTER = 2
+"""Orders to follow that a replica does not take, one after the other: then it is started again."""
 FIRST_RETRY, LONGEST_RETRY = 0.02, 2.0
 """Seconds until a replica that could not join is tried again; doubled each time."""
 
@@ -35,6 +38,7 @@ class Joiner(Actor):
         self._group = group
         self._timer: asyncio.TimerHandle | None = None
         self._delay = FIRST_RETRY
+        self._deaf = ("", 0, 0)  # who has not answered, in which life, and how often
 
     def on_start(self, restored: bool) -> None:
         """Whoever was about to join begins anew."""
@@ -79,7 +83,7 @@ class Joiner(Actor):
 
     async def _join(self, primary: str, name: str, life: int) -> None:
         group, epoch, begin = self._group, self._group.epoch, time.monotonic()
-        await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
+        await self._tell_to_follow(name, life, epoch)
         group.on_joining(name)
         group.joining[name] = life
         group.watch(name)
@@ -95,6 +99,18 @@ class Joiner(Actor):
         group.joined(name, life)
         group.node.emit(ReplicaJoined(group.path, name, epoch, turn, time.monotonic() - begin))
         group.wake()
+
+    async def _tell_to_follow(self, name: str, life: int, epoch: int) -> None:
+        """One that was started with links that are secured otherwise does not even understand that it is a mismatch."""
+        group = self._group
+        try:
+            await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
+        except (AskTimeout, Refused):
+            self._deaf = (name, life, self._deaf[2] + 1 if self._deaf[:2] == (name, life) else 1)
+            if self._deaf[2] < DEAF_AFTER:
+                raise
+            await bury(group, name, life)  # Its next life has the present stack of mechanisms.
+            raise
 
     def _later(self, seconds: float | None = None) -> None:
         """Look again then; None: what has failed is tried again, after longer each time."""

@@ -135,6 +135,7 @@ class Computing(Proceed, Sender):
     """Proceed of both: what the actor hears on the leader, it hears on the follower."""
 
     peer_messages = (Heard,)
+    answers_later = True  # What has to wait for the leader's state must not hold up the order that brings it.
 
     async def heard(self, outcome: Outcome) -> None:
         """Pass on what the leader's turn has heard."""

@@ -7,30 +7,11 @@ whether the checks and the tests are where this table says.
 from __future__ import annotations
 
 import os
-import shutil
-import subprocess
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import pytest
 
-import holdfast
-
-ROOT = Path(holdfast.__file__).parent
-NEVER_COPIED = (".*", "__pycache__", "build", "dist", "*.egg-info")
-
-
-class Check(NamedTuple):
-    """A check, what the code is without it, and who misses it."""
-
-    file: str
-    there: str
-    gone: str
-    test: str
-    select: str
-
+from tests.removing import Check, copied, is_true, missed, without
 
 CHECKS = {
     "T13: after a failed sync nothing takes effect": Check(
@@ -277,44 +258,17 @@ CHECKS = {
 
 @pytest.mark.parametrize("name", CHECKS)
 def test_the_table_is_true(name: str) -> None:
-    check = CHECKS[name]
-    assert (ROOT / check.file).read_text().count(check.there) == 1
-    first = check.select.partition(" ")[0]
-    assert first in (ROOT / check.test).read_text()
+    assert is_true(CHECKS[name])
 
 
 @pytest.fixture(scope="module")
 def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The package and its tests, to be broken."""
-    folder = tmp_path_factory.mktemp("removed") / "holdfast"
-    shutil.copytree(ROOT, folder, ignore=shutil.ignore_patterns(*NEVER_COPIED))
-    (folder / ".link").mkdir()
-    (folder / ".link" / "holdfast").symlink_to("..")
-    return folder
-
-
-@pytest.fixture
-def broken(copy: Path, name: str) -> Iterator[Check]:
-    check = CHECKS[name]
-    file = copy / check.file
-    whole = file.read_text()
-    file.write_text(whole.replace(check.there, check.gone))
-    yield check
-    file.write_text(whole)
+    return copied(tmp_path_factory.mktemp("removed"))
 
 
 @pytest.mark.skipif("HOLDFAST_REMOVED" not in os.environ, reason="HOLDFAST_REMOVED=1 has the checks removed")
 @pytest.mark.parametrize("name", CHECKS)
-def test_without_the_check_a_test_fails(copy: Path, broken: Check) -> None:
-    command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist"]
-    done = subprocess.run(
-        [*command, broken.test, "-k", broken.select],
-        cwd=copy,
-        env={**os.environ, "PYTHONPATH": str(copy / ".link"), "PYTHONDONTWRITEBYTECODE": "1"},
-        capture_output=True,
-        text=True,
-        timeout=110,
-        check=False,
-    )
-    assert done.returncode == 1, f"{broken.test} does not miss it:\n{done.stdout[-3000:]}{done.stderr[-3000:]}"
-    assert " failed" in done.stdout
+def test_without_the_check_a_test_fails(copy: Path, name: str) -> None:
+    with without(copy, CHECKS[name]):
+        assert missed(copy, CHECKS[name]), f"{CHECKS[name].test} does not miss it"

@@ -176,8 +176,8 @@ def claims(layers: Layers, kind: str) -> bool:
 
 def makes_sense(layers: Layers, kind: str, workload: str = "counter") -> bool:
     """Whether there is such a fault here: one replica alone has no other, and not all have links to be secured."""
-    if kind in CRASHES and kind != "crash of a root part" and max(one.replicas for one in layers) < 2:
-        return False
+    if max(one.replicas for one in layers) < 2 and kind in (CRASHES | {"message lost"}) - {"crash of a root part"}:
+        return False  # What it knows would be gone with it.
     if kind == "message, transient" and workload != "counter":
         return False  # No assertion could see that another sum was meant.
     return kind == "nothing" or bool(KINDS[kind](layers))

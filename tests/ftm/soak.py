@@ -11,15 +11,16 @@ from collections import Counter as Tally
 from typing import Any
 
 import holdfast as hf
-from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
-from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.messages import Done
 from tests.ftm.accounts import Counter
-from tests.ftm.campaign import group_of, running, whole
+from tests.ftm.campaign import Stuck, described, group_of, running, whole
+from tests.ftm.stacks import CA, STACKS
 from tests.ftm.workloads import Bad, Counting
 
 PAUSE = 0.2
+REPLICATED = ("PBR", "LFR", "AD+PBR", "AD+LFR", "TMR", "PBR+TR", "LFR+TR", "SEC+PBR", "SEC+PBR+TR", "PBR+own")
+"""What is attached, and changed to: at any moment one replica may be killed."""
 
 
 class Renewed(Checkpointing):
@@ -39,13 +40,14 @@ class Found:
     kills: int
     done: Tally[str]
     refused: Tally[str]
+    stuck: str = ""
 
     def __str__(self) -> str:
         return (
             f"{self.requests} requests, {self.kills} kills, {self.done.total()} changes {dict(self.done)}, "
             f"{self.refused.total()} rolled back {dict(self.refused)}; failed {self.failed}, "
             f"lost {len(self.bad.lost)}, "
-            f"wrong {len(self.bad.wrong)}, twice {len(self.bad.doubled)}"
+            f"wrong {len(self.bad.wrong)}, twice {len(self.bad.doubled)}" + (f"; STUCK {self.stuck}" * bool(self.stuck))
         )
 
 
@@ -66,20 +68,25 @@ class Changes:
         self.why: list[str] = []
 
     def _choices(self) -> dict[str, Any]:
-        ref, group = self._ref, group_of(self._ref)
+        ref, group, name = self._ref, group_of(self._ref), self._rng.choice(REPLICATED)
+        stack = STACKS[name]("counter")
         if group is None:
-            stack = self._rng.choice(((PBR(),), (LFR(),), (PBR(), TR()), (LFR(), TR())))
-            return {"attach": lambda change: change.attach(ref, stack)}
+            return {f"attach {name}": lambda change: change.attach(ref, stack)}
         found: Any = ref._cell.host
         names = [one.name for one in found.layers]
         choices: dict[str, Any] = {
             "detach": lambda change: change.detach(ref),
-            "transition": lambda change: change.transition(ref, LFR() if "pbr" in names else PBR()),
+            "transition": lambda change: change.transition(ref, stack),
         }
         if "tr" in names:
             choices["detach a layer"] = lambda change: change.detach(ref, "tr")
-        else:
-            choices["compose"] = lambda change: change.compose(ref, TR())
+        elif names in (["pbr"], ["lfr"], ["sec", "pbr"]):
+            choices["compose"] = lambda change: change.compose(ref, hf.TR())
+            choices["transition of a layer"] = lambda change: change.transition(
+                ref, hf.LFR() if "pbr" in names else PBR()
+            )
+        if names in (["pbr"], ["lfr"]):
+            choices["compose outside"] = lambda change: change.compose(ref, hf.SEC(CA), outside=True)
         if "pbr" in names:
             new = {"mechanism": "pbr", "role": "primary"}
             choices["update"] = lambda change: change.update(ref, "after", Renewed, **new)
@@ -98,18 +105,20 @@ class Changes:
             self.done[name] += 1
 
 
-async def run(seconds: float, rng: random.Random) -> Found:
-    """Soak for so long."""
+async def run(seconds: float, rng: random.Random, *, least: int = 0) -> Found:
+    """Soak for so long, and for so many changes."""
     async with running() as system:
+        await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
         load = Plain(30.0, rng)
         ref = await load.start(system, None)
         load.begin()
         changes, loop = Changes(system, ref, rng), asyncio.get_running_loop()
-        end, kills = loop.time() + seconds, 0
+        end, kills, bad, stuck = loop.time() + seconds, 0, Bad(), ""
+        over = asyncio.Event()
 
         async def kill() -> None:
             nonlocal kills
-            while loop.time() < end:
+            while not over.is_set():
                 await asyncio.sleep(rng.uniform(0.1, 0.8))
                 group = group_of(ref)
                 if group is None or group.primary is None or not all(map(group.is_well, group.names)):
@@ -120,19 +129,26 @@ async def run(seconds: float, rng: random.Random) -> Found:
                     os.kill(pid, signal.SIGKILL)
 
         killing = asyncio.create_task(kill())
-        while loop.time() < end:
-            began = loop.time()
-            await changes.one()
-            await asyncio.sleep(max(0.0, PAUSE - (loop.time() - began)))
-        await killing
-        await load.reached(20)
-        if group_of(ref) is not None:
-            await whole(ref)
-        await load.stop()
-        bad = await load.bad()
+        try:
+            while loop.time() < end or (changes.done.total() < least and loop.time() < end + 60):
+                began = loop.time()
+                await changes.one()
+                await asyncio.sleep(max(0.0, PAUSE - (loop.time() - began)))
+            over.set()
+            await killing
+            await load.reached(20)
+            if group_of(ref) is not None:
+                await whole(ref)
+            await load.stop()
+            bad = await load.bad()
+        except (Stuck, TimeoutError, hf.AskTimeout) as error:
+            stuck = str(error) or described(group_of(ref))
+        finally:
+            over.set()
+            load.abandon()
         if load.failed:
             bad.lost.extend(load.failed)
             changes.why.append(repr(next(iter(load.failed.values()))))
     for line in changes.why[:10]:
         print(f"#   {line}")
-    return Found(bad, load.sent, len(load.failed), kills, changes.done, changes.refused)
+    return Found(bad, load.sent, len(load.failed), kills, changes.done, changes.refused, stuck)
