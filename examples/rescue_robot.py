@@ -36,10 +36,7 @@ RATE: Final = 25.0
 """Messages per second of each device, and so of each topic."""
 OBSERVED: Final = ("/odom", "/map", "/scan", "/imu_data", "/cmd_vel")
 GRACE: Final = 2.0
-"""Seconds after power-up in which a silent topic is no news."""
-QUIET: Final = 2.5
-"""Seconds after their start in which observers say nothing bad."""
-ON: Final = "/robot/nodes"
+"""Seconds after a start of anything in which nobody says that something is bad."""
 LONG: Final = 50.0
 """Seconds that nothing here takes, unless something is wrong."""
 
@@ -111,27 +108,22 @@ class Device(hf.Actor):
 
     @hf.on(Ready)
     def _ready(self, message: Ready) -> None:
-        if message.number != self._number:
-            return  # Its power went meanwhile.
-        self._is_ready = True
-        for driver, handle in self._waiting:
-            self._connected(driver)
-            handle.reply(None)
-        self._waiting.clear()
+        self._is_ready = message.number == self._number  # Else its power went meanwhile.
+        self._serve()
 
     @hf.on(Connect)
     def _connect(self, message: Connect) -> hf.ReplyHandle[None]:
         handle: hf.ReplyHandle[None] = self.ctx.reply_handle()
-        if self._is_ready:
-            self._connected(self.ctx.sender)
-            handle.reply(None)
-        else:
-            self._waiting.append((self.ctx.sender, handle))
+        self._waiting.append((self.ctx.sender, handle))
+        self._serve()
         return handle
 
-    def _connected(self, driver: hf.ActorRef[Any] | None) -> None:
-        if driver is not None:
-            self._drivers.add(driver)
+    def _serve(self) -> None:
+        while self._is_ready and self._waiting:
+            driver, handle = self._waiting.pop()
+            if driver is not None:
+                self._drivers.add(driver)
+            handle.reply(None)
 
     @hf.on(Tick)
     def _tick(self, message: Tick) -> None:
@@ -212,9 +204,9 @@ def model() -> System:
 
 def care(url: str) -> hf.ChildSpec:
     """The board, the observers, the diagnoser and the repairer: all that keeps the robot alive."""
-    addresses = {name: f"{ON}/{name}" for name in NODES}
+    addresses = {name: f"/robot/nodes/{name}" for name in NODES}
     # At first nothing bad is said, until the rates are known too: then all of it is said at once.
-    manner = Manner(every=0.05, time_to_live=2.0, grace=QUIET)
+    manner = Manner(every=0.05, time_to_live=2.0, grace=GRACE)
     steady = msgspec.structs.replace(manner, agreement=Agreement(2, 3))
     rates = (hf.start(GeneralObserver, topic, RATE, RATE - 1, window=1.0, manner=steady) for topic in OBSERVED)
     observers = [
@@ -257,8 +249,7 @@ class Line(msgspec.Struct):
     what: Any
 
 
-class GetLines(hf.Message[list[Line]]):
-    """What has happened?"""
+class GetLines(hf.Message[list[Line]]): ...
 
 
 class Recorder(hf.Actor):
@@ -303,9 +294,7 @@ class Recorder(hf.Actor):
     @hf.on(repair.ActionEnded)
     @hf.on(repair.Repaired)
     @hf.on(repair.GaveUp)
-    def _repairs_it(
-        self, message: repair.Planned | repair.ActionBegan | repair.ActionEnded | repair.Repaired | repair.GaveUp
-    ) -> None:
+    def _repairs_it(self, message: hf.Message) -> None:
         match message:
             case repair.Planned():
                 self._add("planned", [[str(step) for step in stage] for stage in message.stages])
@@ -319,11 +308,13 @@ class Recorder(hf.Actor):
             case repair.GaveUp():
                 self._repairs += 1
                 self._add("gave up", [*message.components, message.why])
+            case _:
+                raise AssertionError(message)
 
     @hf.on(Until)
     def _until(self, message: Until) -> hf.ReplyHandle[None]:
-        self._waiting = message, self.ctx.reply_handle()
-        handle = self._waiting[1]
+        handle: hf.ReplyHandle[None] = self.ctx.reply_handle()
+        self._waiting = message, handle
         self._add("waiting", list(message.literals))
         return handle
 
@@ -348,10 +339,6 @@ class Told(msgspec.Struct):
     seconds: float
     own: float
     beyond: float
-
-    def of(self, kind: str) -> list[Any]:
-        """All of one kind, in order."""
-        return [line.what for line in self.lines if line.kind == kind]
 
 
 ALL_DOWN: Final = (
@@ -391,7 +378,7 @@ async def play(scenario: str, board: str | None) -> Told:
             mending = system.ref("/robot/diagnosis/repairer", repair.Repairer)
             first = Until(ALL_DOWN, State.FAULTY) if is_off else Until(ALL_WELL, State.HEALTHY)
             await recorder.ask(first, LONG)
-            await asyncio.sleep(0 if is_off else QUIET)
+            await asyncio.sleep(0 if is_off else GRACE)
             began = asyncio.get_running_loop().time()
             mending.tell(repair.SetMode(repair.NORMAL))
             if not is_off:
@@ -452,10 +439,10 @@ def text(told: Told) -> str:
 
 def draw(told: Told, path: Path) -> None:
     """The time line as a picture: what was observed of each component and topic, and what was done."""
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure  # of the extra `programs`
 
     atoms = list(dict.fromkeys(line.what.removeprefix("not ") for line in told.lines if line.kind == "observed"))
-    steps = list(dict.fromkeys(told.of("began")))
+    steps = list(dict.fromkeys(line.what for line in told.lines if line.kind == "began"))
     rows = {name: place for place, name in enumerate([*steps, *atoms])}
     figure = Figure(figsize=(11, 0.27 * len(rows) + 1.5), layout="constrained")
     axes = figure.add_subplot()
