@@ -103,7 +103,7 @@ async def test_a_suspected_value_fault_leads_to_time_redundancy_while_requests_f
     noise.touch()
     begun = await heard.fish(ActionBegan, timeout=60.0)
     assert str(begun.step) == "compose_tr(alice)"
-    ended = await heard.fish(lambda one: isinstance(one, (Repaired, GaveUp)), timeout=60.0)
+    ended: object = await heard.fish(lambda one: isinstance(one, (Repaired, GaveUp)), timeout=60.0)
     assert isinstance(ended, Repaired)
     assert noise.exists()
     assert stack(ref) == ("pbr", "tr")
