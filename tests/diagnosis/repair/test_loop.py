@@ -310,6 +310,20 @@ async def test_dangerous_actions_wait_for_a_person(system: hf.ActorSystem) -> No
         await here.repairer.ask(Approve(wanted.number))
 
 
+async def test_who_got_well_while_a_person_was_asked_is_left_alone(system: hf.ActorSystem) -> None:
+    # T60: all that the action asks for still holds, but nobody blames hm any more.
+    here = await scene(system, Policy(dangerous=frozenset({"stop_node"}), approval=60.0, **QUICK))
+    await here.change(lambda world: world.hung.add("hm"))
+    wanted = await here.hear(ApprovalWanted)
+    await here.change(lambda world: world.hung.discard("hm"))
+    await asyncio.sleep(5.0)
+    await here.repairer.ask(Approve(wanted.number))
+    ended = await here.hear(ActionEnded)
+    assert (ended.outcome, ended.why) == (SKIPPED, "a new diagnosis finds hm good")
+    await here.hear(Repaired)
+    assert here.done() == []
+
+
 @pytest.mark.parametrize("says", ["no", "nothing"])
 async def test_what_a_person_does_not_allow_is_not_done(system: hf.ActorSystem, says: str) -> None:
     here = await scene(system, Policy(dangerous=frozenset({"power_up"}), approval=20.0, **QUICK))
