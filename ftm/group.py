@@ -274,6 +274,8 @@ class Group(Securing):
 
     def next_work(self) -> Work | None:
         """The next batch, if there is something, and none is out. What was inside once is ended in any case."""
+        if self._quiet:
+            self._ended(set())  # Another one may lead now, and nothing was inside the last one.
         if self.out is not None or self.primary is None or not self.waiting or (self.has_gone and self.is_held):
             return None
         takes_new = not (self.is_suspended or self.is_stopping or self.is_resting)
@@ -349,6 +351,8 @@ class Group(Securing):
         self.finished.clear()
         self.switch.arrival.cancel()  # The last one may have died in the middle of a snapshot,
         self.switch.due.restarted()  # or before it began with it.
+        if self.switch.due.wishes:
+            self.switch.due.on_want(self.switch)
 
     def only_suspect_input(self) -> int:
         """The input in whose turn a replica must have died, if only one was inside; else -1."""

@@ -21,7 +21,7 @@ from ..actors.control.moving import (
     sorted_out,
     twin,
 )
-from ..actors.errors import CannotMove, StartFailed
+from ..actors.errors import AskTimeout, CannotMove, HoldfastError, StartFailed
 from ..actors.exits import ExitReason, unpack_exit
 from ..actors.links import Down, Exit, Monitor
 from ..actors.lives import LOCAL
@@ -39,7 +39,12 @@ from ..checkpoint.records import DOWN, EXIT, MESSAGE, PIPE, START, TICK
 from ..checkpoint.switch import Switch
 from .host import GroupHost
 from .orders import Export
+from .steering import AGAIN_AFTER
 from .unkept import is_unkept
+
+EXPORTED_WITHIN = 5.0
+"""Seconds until whoever leads is asked again for the state: it may have died with the question."""
+FAILED_OVER_WITHIN = 1.0
 
 
 class FromGroup(Move):
@@ -63,9 +68,37 @@ class FromGroup(Move):
         group = self._group
         group.is_stopping = True
         self.rest_at = now()
-        await self.within(self._group.quiet(), self.timeout, lambda: "a turn of it has not ended")
-        if self.given_up.done():
-            raise CannotMove(self.cell.path, self.given_up.result())
+        end = self.rest_at + self.timeout
+        while True:
+            await self.within(group.quiet(), end - now(), lambda: "a turn of it has not ended")
+            if self.given_up.done():
+                raise CannotMove(self.cell.path, self.given_up.result())
+            epoch = group.epoch
+            try:
+                await self.collect(epoch, end)
+            except CannotMove:
+                raise
+            except AskTimeout:
+                continue  # It is asked again: until its time is over, or the move is given up.
+            except HoldfastError:
+                if await self._has_died(epoch):
+                    continue
+                raise
+            if group.epoch == epoch and group.primary is not None and group.out is None and not group.inside:
+                return
+
+    async def _has_died(self, epoch: int) -> bool:
+        """Whether it was for a failover that no state came: it shows within a second."""
+        group = self._group
+        for _ in range(round(FAILED_OVER_WITHIN / AGAIN_AFTER)):
+            if group.epoch != epoch or group.is_over:
+                break
+            await asyncio.sleep(AGAIN_AFTER)
+        return group.epoch != epoch and not group.is_over
+
+    async def collect(self, epoch: int, end: float) -> None:
+        """Get the state as it is now from whoever leads; after a failover it is done again."""
+        raise NotImplementedError
 
     def rested(self) -> None:
         """Nothing is inside any more; if no replica is left meanwhile, the life ends when it is known where it is."""
@@ -107,11 +140,12 @@ class ToRecordedTask(FromGroup):
 
     async def take(self) -> None:
         await super().take()
-        switch = self._switch
-        if switch.method.snapshots:
-            await self.within(switch.due.wish(), self.timeout, lambda: "its state was not saved")
         self.rested()
-        self._home = Detached(switch)
+        self._home = Detached(self._switch)
+
+    async def collect(self, epoch: int, end: float) -> None:
+        if self._switch.method.snapshots:
+            await self.within(self._switch.due.wish(), end - now(), lambda: "its state was not saved")
 
     async def carry(self) -> None:
         cell, host, start = self.cell, self.host, self.cell.extra().start
@@ -167,23 +201,21 @@ class ToPlainTask(FromGroup):
         self._stash: list[int] = []
 
     async def take(self) -> None:
+        switch = self._switch
         await super().take()
-        group, switch = self._group, self._switch
         if switch.later:
             raise CannotMove(
                 self.cell.path, f"{len(switch.later)} asks wait for replies that only its handles can give"
             )
-        primary = group.primary
-        assert primary is not None
-        exported = await self.within(
-            group.protocol(primary).ask(Export(group.epoch), self.timeout),
-            self.timeout,
-            lambda: "its state did not come",
-        )
-        self._data, self._stash = exported.data, list(exported.stash)
-        if group.out is not None:
-            raise CannotMove(self.cell.path, "its primary was replaced meanwhile; try again")
         self.rested()
+
+    async def collect(self, epoch: int, end: float) -> None:
+        group = self._group
+        primary = group.primary
+        if primary is not None:
+            ask = group.protocol(primary).ask(Export(epoch), EXPORTED_WITHIN)
+            exported = await self.within(ask, end - now(), lambda: "its state did not come")
+            self._data, self._stash = exported.data, list(exported.stash)
 
     async def carry(self) -> None:
         cell, start = self.cell, self.cell.extra().start

@@ -40,6 +40,7 @@ class Moves:
         self._node, self._workers = node, workers
         self._turns: weakref.WeakKeyDictionary[Cell, asyncio.Lock] = weakref.WeakKeyDictionary()
         self._tasks: set[asyncio.Task[None]] = set()
+        self._under_way: dict[Cell, Move] = {}  # of mechanisms
 
     async def move(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
         """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
@@ -201,13 +202,19 @@ class Moves:
         spec = _spec_there(cell, isolation, limits)
         await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec))
 
+    def give_up(self, cell: Cell, why: str) -> None:
+        """What is under way there ends soon, undone, unless it is done already."""
+        move = self._under_way.get(cell)
+        if move is not None:
+            move.give_up(why)
+
     async def _moved(self, cell: Cell, timeout: float, made: Callable[[], Move], moved: Callable[[], None]) -> Any:
         """Carry out a move; if the life ends before it is at rest, its next life is moved."""
         end = self._node.loop.time() + timeout
         while True:
             if not cell.host.is_up(cell):
                 await order(cell, Ready(), timeout)
-            move = made()
+            move = self._under_way[cell] = made()
             move.moved = moved
             try:
                 await move.run()
@@ -217,6 +224,7 @@ class Moves:
             else:
                 return move
             finally:
+                del self._under_way[cell]
                 ending: asyncio.Future[None] | None = getattr(move, "ending", None)
                 if ending is not None:  # The processes of replicas that are not needed.
                     await ending

@@ -71,6 +71,7 @@ class OnProtection(OnLiving):
 
     def _give_up(self, system: ActorSystem) -> None:
         """Have what is under way end soon, if it can."""
+        system._moves.give_up(self.cell(system), "it is not wanted any more")
 
     def _give_back(self, system: ActorSystem) -> None:
         grant, self._grant = self._grant, None

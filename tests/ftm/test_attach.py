@@ -84,6 +84,38 @@ async def test_an_attached_actor_survives_the_death_of_its_primary(system: hf.Ac
     load.check(await ref.ask(Tags()))
 
 
+async def test_detached_while_nobody_leads_and_nothing_is_inside(system: hf.ActorSystem, recovery: Any) -> None:
+    """Nothing has to come out, and yet it waits until somebody can say what the state is."""
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery, mechanism=PBR()))
+    for number in range(5):
+        await ref.ask(Add(number))
+    group = group_of(ref)
+    await two_again(ref)
+    os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+    async with asyncio.timeout(10):
+        while group.primary is not None:
+            await asyncio.sleep(0)
+    await detach(system, ref)
+    assert await ref.ask(Tags()) == list(range(5))
+
+
+async def test_detached_while_whoever_leads_dies_with_the_question(system: hf.ActorSystem, recovery: Any) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery, mechanism=PBR()))
+    for number in range(5):
+        await ref.ask(Add(number))
+    group = group_of(ref)
+    await two_again(ref)
+    pid = pid_of(system, ref, group.primary or "")
+    os.kill(pid, signal.SIGSTOP)  # It gets the question, and will not answer it.
+    detaching = asyncio.ensure_future(detach(system, ref))
+    async with asyncio.timeout(10):
+        while not group.is_stopping:
+            await asyncio.sleep(0)
+    os.kill(pid, signal.SIGKILL)
+    await detaching
+    assert await ref.ask(Tags()) == list(range(5))
+
+
 async def test_its_next_lives_are_protected_too_and_not_after_a_detach(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid()))
     await attach(system, ref)
