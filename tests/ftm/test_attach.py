@@ -116,6 +116,56 @@ async def test_detached_while_whoever_leads_dies_with_the_question(system: hf.Ac
     assert await ref.ask(Tags()) == list(range(5))
 
 
+async def test_a_last_snapshot_that_died_with_whoever_led_is_asked_for_again(system: hf.ActorSystem) -> None:
+    """Also when the interval is far from over."""
+    recovery = hf.hybrid(interval=1000.0)
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery, mechanism=PBR()))
+    for number in range(5):
+        await ref.ask(Add(number))
+    group = group_of(ref)
+    await two_again(ref)
+    pid = pid_of(system, ref, group.primary or "")
+    os.kill(pid, signal.SIGSTOP)
+    detaching = asyncio.ensure_future(detach(system, ref))
+    async with asyncio.timeout(10):
+        while group.switch.due.asked_at < 0 or group.inward:
+            await asyncio.sleep(0)
+    os.kill(pid, signal.SIGKILL)
+    await detaching
+    assert await ref.ask(Tags()) == list(range(5))
+
+
+class Gate(hf.Message[int]):
+    path: str
+
+
+class Gated(Counter):
+    @hf.on(Gate)
+    async def wait(self, message: Gate) -> int:
+        while not os.path.exists(message.path):
+            await asyncio.sleep(0.005)
+        return 0
+
+
+async def test_a_detach_that_is_not_wanted_any_more_is_undone_at_once(system: hf.ActorSystem, tmp_path: Path) -> None:
+    """A turn that does not end holds it up: the transaction's time is over long before its own."""
+    ref = await system.start(hf.child("alice", hf.start(Gated), mechanism=PBR()))
+    waiting = ref.ask(Gate(str(tmp_path / "gate")), timeout=60)
+    group = group_of(ref)
+    async with asyncio.timeout(10):
+        while group.out is None:
+            await asyncio.sleep(0)
+    with pytest.raises(hf.TransactionFailed, match="not within") as failed:
+        async with system.transaction(timeout=0.5) as change:
+            change.detach(ref)
+    assert failed.value.kept == ()
+    assert not group.is_stopping
+    (tmp_path / "gate").touch()
+    assert await waiting == 0
+    assert await ref.ask(Add(1)) == 1
+    assert group_of(ref) is group
+
+
 async def test_its_next_lives_are_protected_too_and_not_after_a_detach(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid()))
     await attach(system, ref)
