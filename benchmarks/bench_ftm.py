@@ -19,12 +19,13 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import AsyncGenerator, Sequence
+from collections.abc import AsyncGenerator, Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 from harness import Run, ask_all, main
+from limits import echo_process
 
 import holdfast as hf
 from holdfast.ftm import host
@@ -194,8 +195,8 @@ async def _stopped(run: Run) -> None:
 class Paced:
     """Clients that ask so many times a second; each reply's moment is noted."""
 
-    def __init__(self, find: Any) -> None:
-        self.find, self.replies = find, list[float]()
+    def __init__(self, ask: Callable[[], Awaitable[Any]]) -> None:
+        self.ask, self.replies = ask, list[float]()
         self.answered = self.failed = 0
         self._stopping = False
         self._task = asyncio.create_task(self._run())
@@ -214,7 +215,7 @@ class Paced:
 
     async def _one(self) -> None:
         try:
-            await self.find().ask(Bump(), timeout=10.0)
+            await self.ask()
         except hf.HoldfastError:
             self.failed += 1
         else:
@@ -250,10 +251,12 @@ async def _windows(clients: Paced, change: Any) -> tuple[float, float]:
 
 async def transitions(run: Run) -> None:
     """Client gaps while mechanisms are changed, beside stopping the child and starting it with the new spec."""
+    machine = await _machine(run.size(200))
+    print(f"# two bare processes, a quiet window beyond another, ms: {_spread(machine)}", flush=True)
     for name, (first, second) in CHANGES.items():
         windows = await _transitions(first, second, run.size(200))
         gaps = [around - quiet for quiet, around in windows]
-        noise = [after[0] - before[0] for before, after in itertools.pairwise(windows)]
+        noise = _differences([quiet for quiet, _ in windows])
         restarts = [around - quiet for quiet, around in await _restarts(first, second, run.size(20))]
         print(
             f"# {name}: longest client gap beyond that of the quiet window before, ms: {_spread(gaps)}; "
@@ -263,6 +266,24 @@ async def transitions(run: Run) -> None:
         )
         job = f"transition, {name}, client gap, p99 of {len(gaps)}"
         run.bound(job, _percentile(gaps, 99), unit="ms", target=5.0)
+
+
+async def _machine(count: int) -> list[float]:
+    """What the machine alone does to the longest gap: the same clients ask an echo between two bare processes."""
+    async with echo_process() as bare:
+        clients, gaps = Paced(lambda: bare.ask(b"")), list[float]()
+        await asyncio.sleep(0.3)
+        for _ in range(count):
+            begin = time.perf_counter()
+            await asyncio.sleep(WINDOW)
+            gaps.append(clients.longest(begin, time.perf_counter()))
+            del clients.replies[:-10]
+        await clients.stop()
+    return _differences(gaps)
+
+
+def _differences(gaps: list[float]) -> list[float]:
+    return [after - before for before, after in itertools.pairwise(gaps)]
 
 
 def _percentile(values: list[float], at: int) -> float:
@@ -279,7 +300,7 @@ def _spread(values: list[float]) -> str:
 async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) -> list[tuple[float, float]]:
     async with _system() as system:
         ref = await _protected(system, "c", first)
-        clients, gaps = Paced(lambda: ref), list[tuple[float, float]]()
+        clients, gaps = Paced(lambda: ref.ask(Bump(), timeout=10.0)), list[tuple[float, float]]()
         await asyncio.sleep(0.3)
         for number in range(count):
             target = first if number % 2 else second
@@ -299,7 +320,7 @@ async def _transitions(first: Sequence[Any], second: Sequence[Any], count: int) 
 async def _restarts(first: Sequence[Any], second: Sequence[Any], count: int) -> list[tuple[float, float]]:
     async with _system() as system:
         holder = [await _protected(system, "c", first)]
-        clients, gaps = Paced(lambda: holder[0]), list[tuple[float, float]]()
+        clients, gaps = Paced(lambda: holder[0].ask(Bump(), timeout=10.0)), list[tuple[float, float]]()
         await asyncio.sleep(0.3)
         for number in range(count):
             target = first if number % 2 else second
