@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
+import random
 from typing import Any
 
 import holdfast as hf
-from holdfast.checkpoint.records import REPLY, Answer
+from holdfast.checkpoint.records import OK, REPLY, Answer
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.orders import Peer
 from tests.ftm.driver import Driver
 
 
@@ -207,3 +210,46 @@ async def pair(
     await driver.start(("r1", *others), **setting)
     await driver.begin(*others)
     return driver
+
+
+async def traffic(driver: Driver, dice: random.Random, sent: list[int]) -> None:
+    """Bursts of requests of all kinds (their keys go to `sent`), and a moment in which some are handled."""
+    for _ in range(dice.randint(1, 4)):
+        kinds: list[Any] = [Add, Add, Add, Fetch, Say, Fail]
+        sent += driver.send(*(dice.choice(kinds)(len(sent) + n) for n in range(dice.randint(1, 12))))
+    for _ in range(dice.randint(0, 60)):
+        await asyncio.sleep(0)
+
+
+async def all_once(driver: Driver, system: hf.ActorSystem, sent: list[int]) -> None:
+    """Each request has its answer, and has been handled once."""
+    expected: list[int] = []
+    for key in sent:
+        end = await driver.until(key)
+        message = system.node.codec.decode(driver.kinds[key], driver.feeds[key].body)
+        if isinstance(message, Fetch):
+            expected += [-message.n, 2 * message.n]
+        elif not isinstance(message, Fail):
+            expected.append(message.n)
+        assert end.status == ("failed" if isinstance(message, Fail) else OK)
+    assert sorted(await driver.ask(Read())) == sorted(expected)
+    assert driver.doubled == []
+
+
+async def kills_of_two(driver: Driver, system: hf.ActorSystem, dice: random.Random) -> None:
+    """The primary or the backup ends again and again while requests flow (A44 to A59): nothing is lost or doubled."""
+    sent: list[int] = []
+    backup = "r2"
+    for step in range(12):
+        await traffic(driver, dice, sent)
+        new = f"n{step}"
+        await driver.add(new)
+        if dice.random() < 0.7:
+            await driver.stop_replica(driver.primary)
+            await driver.fail_over(backup)
+        else:
+            await driver.stop_replica(backup)
+            await driver.protocol(driver.primary).ask(Peer(driver.epoch, None))
+        await driver.join(new)
+        backup = new
+    await all_once(driver, system, sent)

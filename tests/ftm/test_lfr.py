@@ -9,14 +9,13 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.records import OK
 from holdfast.ftm.alarms import Diverged
 from holdfast.ftm.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.messages import CannotJoin, CannotLead
 from holdfast.ftm.orders import Peer
-from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Guess, Put, Read, Say, Total, pair
+from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Guess, Put, Read, Say, Total, kills_of_two, pair
 from tests.ftm.versions import FAULTY
 
 
@@ -140,37 +139,7 @@ def test_it_is_refused_for_what_says_that_it_is_not_deterministic() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 async def test_kills_at_any_moment_lose_and_double_nothing(system: hf.ActorSystem, seed: int) -> None:
-    dice = random.Random(seed)
-    driver = await pair(system, Total, LFR())
-    sent: list[int] = []
-    backup = "r2"
-    for step in range(12):
-        for _ in range(dice.randint(1, 4)):
-            kinds: list[Any] = [Add, Add, Add, Fetch, Say, Fail]
-            sent += driver.send(*(dice.choice(kinds)(len(sent) + n) for n in range(dice.randint(1, 12))))
-        for _ in range(dice.randint(0, 60)):
-            await asyncio.sleep(0)
-        new = f"n{step}"
-        await driver.add(new)
-        if dice.random() < 0.7:
-            await driver.stop_replica(driver.primary)
-            await driver.fail_over(backup)
-        else:
-            await driver.stop_replica(backup)
-            await driver.protocol(driver.primary).ask(Peer(driver.epoch, None))
-        await driver.join(new)
-        backup = new
-    expected: list[int] = []
-    for key in sent:
-        end = await driver.until(key)
-        message = system.node.codec.decode(driver.kinds[key], driver.feeds[key].body)
-        if isinstance(message, Fetch):
-            expected += [-message.n, 2 * message.n]
-        elif not isinstance(message, Fail):
-            expected.append(message.n)
-        assert end.status == ("failed" if isinstance(message, Fail) else OK)
-    assert sorted(await driver.ask(Read())) == sorted(expected)
-    assert driver.doubled == []
+    await kills_of_two(await pair(system, Total, LFR()), system, random.Random(seed))
 
 
 @pytest.mark.parametrize("what", ["answer", "state"])

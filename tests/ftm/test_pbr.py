@@ -35,6 +35,7 @@ from tests.ftm.replicated import (
     Spoil,
     Total,
     Trap,
+    kills_of_two,
     pair,
 )
 
@@ -379,39 +380,7 @@ def test_an_evicted_reply_is_told_apart_from_an_unknown_request() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 async def test_kills_at_any_moment_lose_and_double_nothing(system: hf.ActorSystem, seed: int) -> None:
-    """A44 to A59: the primary or the backup is killed again and again while requests flow."""
-    dice = random.Random(seed)
-    driver = await pair(system)
-    sent: list[int] = []
-    backup = "r2"
-    for step in range(12):
-        for _ in range(dice.randint(1, 4)):
-            kinds: list[Any] = [Add, Add, Add, Fetch, Say, Fail]
-            sent += driver.send(*(dice.choice(kinds)(len(sent) + n) for n in range(dice.randint(1, 12))))
-        for _ in range(dice.randint(0, 60)):
-            await asyncio.sleep(0)
-        new = f"n{step}"
-        await driver.add(new)
-        if dice.random() < 0.7:
-            await driver.stop_replica(driver.primary)
-            await driver.fail_over(backup)
-        else:
-            await driver.stop_replica(backup)
-            await driver.protocol(driver.primary).ask(Peer(driver.epoch, None))
-        await driver.join(new)
-        backup = new
-    expected: list[int] = []
-    for key in sent:
-        end = await driver.until(key)
-        message = system.node.codec.decode(driver.kinds[key], driver.feeds[key].body)
-        if isinstance(message, Fetch):
-            expected += [-message.n, 2 * message.n]
-        elif not isinstance(message, Fail):
-            expected.append(message.n)
-        assert end.status == ("failed" if isinstance(message, Fail) else OK)
-    seen = await driver.ask(Read())
-    assert sorted(seen) == sorted(expected)
-    assert driver.doubled == []
+    await kills_of_two(await pair(system), system, random.Random(seed))
 
 
 def test_names_used_here_are_those_of_the_library() -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.records import OK
 from holdfast.ftm.alarms import Outvoted, ProtectionLost
 from holdfast.ftm.events import FailedOver, ReplicaJoined
 from holdfast.ftm.mechanism import MechanismRefused, find, revive
@@ -19,7 +18,7 @@ from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.voters import Median, NoMajority
 from tests.ftm.accounts import Account, Bank, Counter, Load, Tags, Transfer
 from tests.ftm.accounts import Put as Pay
-from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Put, Read, Say, Total, pair
+from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Put, Read, Say, Total, all_once, pair, traffic
 from tests.ftm.test_failover import group_of, pid_of, stop_process
 from tests.ftm.versions import FAULTY
 
@@ -119,28 +118,14 @@ async def test_kills_at_any_moment_lose_and_double_nothing(system: hf.ActorSyste
     sent: list[int] = []
     up = ["r1", "r2", "r3"]
     for _ in range(10):
-        for _ in range(dice.randint(1, 4)):
-            kinds: list[Any] = [Add, Add, Add, Fetch, Say, Fail]
-            sent += driver.send(*(dice.choice(kinds)(len(sent) + n) for n in range(dice.randint(1, 12))))
-        for _ in range(dice.randint(0, 60)):
-            await asyncio.sleep(0)
+        await traffic(driver, dice, sent)
         victim = dice.choice(up)
         await driver.stop_replica(victim)
         if victim == driver.primary:
             await driver.fail_over(dice.choice([name for name in up if name != victim]))
         await driver.add(victim)
         await driver.join(victim)
-    expected: list[int] = []
-    for key in sent:
-        end = await driver.until(key)
-        message = system.node.codec.decode(driver.kinds[key], driver.feeds[key].body)
-        if isinstance(message, Fetch):
-            expected += [-message.n, 2 * message.n]
-        elif not isinstance(message, Fail):
-            expected.append(message.n)
-        assert end.status == ("failed" if isinstance(message, Fail) else OK)
-    assert sorted(await driver.ask(Read())) == sorted(expected)
-    assert driver.doubled == []
+    await all_once(driver, system, sent)
 
 
 async def three_again(ref: hf.ActorRef[Any]) -> None:
