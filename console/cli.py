@@ -11,9 +11,10 @@ def app() -> None:
     """Run the command line; without the extra, say what to install instead of showing a traceback."""
     try:
         from .commands import commands
+
+        commands()
     except ModuleNotFoundError as missing:
         sys.exit(missing_extra(missing))
-    commands()
 
 
 def missing_extra(missing: ModuleNotFoundError) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from enum import StrEnum
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,7 +12,6 @@ from rich.console import Console
 
 from .. import HoldfastError
 from . import operate
-from .cli import missing_extra
 
 commands = typer.Typer(
     name="holdfast",
@@ -74,12 +72,10 @@ def demo(
     Exit status 0: nothing lost, nothing doubled, the maps are equal bit by bit. 1: something differs. 2: there is
     nothing to run on.
     """
-    try:
-        from .demo.log import LogError, killian_court
-        from .demo.main import run_demo
-        from .demo.run import Plan
-    except ModuleNotFoundError as missing:
-        sys.exit(missing_extra(missing))
+    from .demo.log import LogError, killian_court
+    from .demo.main import run_demo
+    from .demo.run import Plan
+
     try:
         plan = Plan(log or killian_court(), kills, seed, method.value, interval, speed)
         report = run_demo(plan, Console(), picture=picture, as_json=as_json)
