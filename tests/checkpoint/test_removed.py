@@ -135,7 +135,7 @@ CHECKS = {
     ),
     "log: who knows of none is kept out": Check(
         "checkpoint/sqlite/store.py",
-        "            db.execute(f"PRAGMA user_version = {VERSION_WITH_LOG}")\n",
+        '            db.execute(f"PRAGMA user_version = {VERSION_WITH_LOG}")\n',
         "            pass\n",
         "tests/checkpoint/sqlite/test_log.py",
         "test_a_store_that_may_have_a_log",
