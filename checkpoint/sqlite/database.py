@@ -14,7 +14,8 @@ from .files import sync
 from .rows import crc_of
 
 _APPLICATION: Final = 0x486F6C64  # "Hold", in the file header
-_VERSION: Final = 1
+VERSION: Final = 1
+VERSION_WITH_LOG: Final = 2  # while there may be a log with rows, which an older holdfast would not see
 _TABLES: Final = {
     "store": "one INTEGER PRIMARY KEY, epoch INTEGER, pid INTEGER, start TEXT, floor INTEGER, live INTEGER, "
     "crc INTEGER",
@@ -40,7 +41,7 @@ def create_database(path: str, folder: str) -> None:
     with contextlib.closing(sqlite3.connect(new, isolation_level=None)) as db:
         db.execute("PRAGMA journal_mode = WAL")
         db.execute(f"PRAGMA application_id = {_APPLICATION}")
-        db.execute(f"PRAGMA user_version = {_VERSION}")
+        db.execute(f"PRAGMA user_version = {VERSION}")
         for statement in _SCHEMA:
             db.execute(statement)
         db.execute("INSERT INTO store VALUES (1, 0, 0, '', 0, 0, ?)", (crc_of(0, 0, "", 0, 0),))
@@ -76,8 +77,9 @@ def refuse_foreign(db: sqlite3.Connection, path: str) -> None:
     (mode,) = db.execute("PRAGMA journal_mode").fetchone()
     if application != _APPLICATION or mode != "wal":
         raise DamagedStore(path, None, None, "this is not a holdfast store")
-    if version != _VERSION:
-        raise DamagedStore(path, None, None, f"its format is {version}, this holdfast reads {_VERSION}")
+    if version not in (VERSION, VERSION_WITH_LOG):
+        reason = f"its format is {version}, this holdfast reads {VERSION} and {VERSION_WITH_LOG}"
+        raise DamagedStore(path, None, None, reason)
     found = [sql for (sql,) in db.execute("SELECT sql FROM sqlite_master WHERE sql NOT NULL ORDER BY rowid")]
     if [sql for sql in found if "sqlite_sequence" not in sql] != _SCHEMA:
         raise DamagedStore(path, None, None, "its tables are not as they were created")

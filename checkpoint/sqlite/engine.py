@@ -8,11 +8,12 @@ import zlib
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Sequence
-from typing import Final, Literal, TypeAlias
+from typing import Final, Literal
 
-from ..journal import DamagedStore, Entry, Primitive, Saved, StaleEpoch, StoreFailed
+from ..journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ..segments import Segment
 from .chains import MODULUS, Chain
+from .log import Row
 from .packs import Packs
 from .reading import ChainReader
 from .rows import (
@@ -26,9 +27,10 @@ from .rows import (
     snapshot_digest,
     unpack_positions,
 )
-from .store import Store
+from .store import INSERT, Store
 
-Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]
+_FEW: Final = 32  # More entries at a time, or more bytes, are worth a transaction of their own.
+_SMALL: Final = 32 << 10
 _INLINE_BYTES: Final = 1 << 20  # SQLite reads and writes larger blobs at less than half a file's speed.
 
 
@@ -83,7 +85,7 @@ class SqliteJournal:
         self._store.close()
 
     def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
-        """Append (address, entry) pairs in one transaction; see `Journal`.
+        """Append (address, entry) pairs as one; see `Journal`. A few cost one write to the log, many a transaction.
 
         Raises:
             TypeError: an entry holds something else than primitives and tuples of them; nothing was written.
@@ -91,17 +93,24 @@ class SqliteJournal:
         """
         if not entries:
             return []
-        with self._store.lock:
+        store = self._store
+        with store.lock:
             pack = self._pack
             packed: list[bytes] = []
             for _, entry in entries:
                 if not is_plain(entry):
                     check_entry(entry)
                 packed.append(pack(entry))
-            with self._store.transaction(sum(map(len, packed))) as db:
-                first = self._store.last + 1
-                db.executemany("INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)", self._rows(entries, packed))
-                return list(range(first, self._store.last + 1))
+            size = sum(map(len, packed))
+            if len(entries) <= _FEW and size <= _SMALL and store.takes(entries, size):
+                store.in_doubt = True
+                rows = self._rows(entries, packed)
+                store.write_log(rows)
+                return [row[0] for row in rows]
+            with store.transaction(size) as db:
+                first = store.last + 1
+                db.executemany(INSERT, self._rows(entries, packed))
+                return list(range(first, store.last + 1))
 
     def sync(self) -> None:
         """Have everything appended so far survive a power loss; see `Journal`. Appends go on meanwhile.

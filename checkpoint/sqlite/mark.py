@@ -2,10 +2,12 @@
 
 SQLite takes a damaged end of its WAL for the end of the WAL, and a missing WAL for an empty one: entries that were
 acknowledged would be gone without a word. The mark knows better, and it survives the process, being in the page cache.
+It is mapped into memory: to set it is no system call.
 """
 
 from __future__ import annotations
 
+import mmap
 import os
 import struct
 from typing import Final
@@ -13,8 +15,8 @@ from typing import Final
 from ..journal import DamagedStore
 from .claim import boot_id
 
-_MARK: Final = struct.Struct("<Q?36s")  # last acknowledged position, synced at each commit?, boot
-_SYNCED: Final = struct.Struct("<Q")  # behind it: the last position that was synced
+_MARK: Final = struct.Struct("=Q?36s")  # last acknowledged position, synced at each commit?, boot
+_SYNCED: Final = struct.Struct("=Q")  # behind it: the last position that was synced
 
 
 class Mark:
@@ -24,6 +26,7 @@ class Mark:
         self.path = f"{path}-mark"
         self._store = path
         self._fd = -1
+        self._position = memoryview(bytearray(8)).cast("Q")
 
     @property
     def is_open(self) -> bool:
@@ -51,10 +54,11 @@ class Mark:
                 )
                 raise DamagedStore(self._store, None, last + 1, reason)
         os.pwrite(self._fd, _MARK.pack(last, synced, boot) + _SYNCED.pack(last if synced else 0), 0)
+        self._position = memoryview(mmap.mmap(self._fd, _MARK.size))[:8].cast("Q")
 
     def set(self, position: int) -> None:
         """Everything up to this position is acknowledged from now on."""
-        os.pwrite(self._fd, position.to_bytes(8, "little"), 0)
+        self._position[0] = position  # eight bytes at once, which a kill does not tear
 
     def set_synced(self, position: int) -> None:
         """Everything up to this position survives a power loss, too."""

@@ -11,14 +11,16 @@ from collections.abc import Generator, Sequence
 from typing import Final
 
 from ...actors.errors import HoldfastError
-from ..journal import DamagedStore, StaleEpoch, StoreFailed
+from ..journal import DamagedStore, Entry, StaleEpoch, StoreFailed
 from .chains import Chain, Scan, create_chain
 from .claim import Claim
-from .database import connect, create_database, result_code
-from .files import SnapshotFiles
+from .database import VERSION, VERSION_WITH_LOG, connect, create_database, result_code
+from .files import SnapshotFiles, sync
+from .log import FrontLog, NoRoom, Row, Sealed
 from .mark import Mark
 
 _CHECKPOINT_BYTES: Final = 4 << 20
+INSERT: Final = "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)"
 _WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
 
 
@@ -31,7 +33,9 @@ class Store:
         chains: by address.
         erased: chains whose erase an earlier owner began and did not finish.
         last: newest position handed out.
-        live: rows in `entries`.
+        live: rows in `entries`, and in the log in front of it.
+        log: rows that are not in the database yet. Each transaction brings them there.
+        in_doubt: whether memory may be behind or ahead of the file.
         failure: why everything is refused from now on.
     """
 
@@ -45,10 +49,13 @@ class Store:
         self.erased: list[Chain] = []
         self.last = self.live = 0
         self.failure: HoldfastError | None = None
+        self.log = FrontLog(path, is_used=not fsync)
         self._fsync = fsync
         self._mark = Mark(path)
         self._wal = -1  # a descriptor of the WAL, once somebody has it synced
-        self._in_doubt = False  # Is what we hold in memory behind or ahead of the file?
+        self.in_doubt = False
+        self._is_unsynced = True  # Was anything committed since the last sync?
+        self._sync_lock = threading.Lock()
         self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly
         self._checkpointer: threading.Thread | None = None
 
@@ -68,7 +75,7 @@ class Store:
                 self._configure()
                 try:
                     self._scan()
-                    self._mark.check(self.last, synced=self._fsync)
+                    self._begin_log()
                     yield
                 except BaseException:
                     with contextlib.suppress(sqlite3.Error):
@@ -86,6 +93,7 @@ class Store:
         with contextlib.suppress(FileExistsError):
             os.mkdir(self.files.folder, mode=0o700)  # not its parents: a mistyped path should not be made true
         if not os.path.exists(self.path):
+            self.log.make_folder()
             create_database(self.path, self.files.folder)
         if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
             raise DamagedStore(self.path, None, None, "the file is empty")
@@ -100,14 +108,65 @@ class Store:
         """Take into memory what is in the file."""
         found = Scan(self.db, self.path).contents()
         self.chains, self.erased, self.notes = found.chains, found.erased, found.notes
-        self.last, self.live, self._in_doubt = found.last, found.live, False
+        self.last, self.live, self.in_doubt = found.last, found.live, False
+        rows = self.log.rows
+        if rows and rows[0][0] <= self.last:  # It was only broken off when all was done.
+            self.log.restart()
+        elif rows:
+            self._take_in(rows)
+
+    def _take_in(self, rows: Sequence[Row]) -> None:
+        """Take into memory what is in the log."""
+        chains = {chain.id: chain for chain in self.chains.values()}
+        for position, key, number, *_ in rows:
+            chain = chains.get(key)
+            if chain is None:
+                raise DamagedStore(self.path, None, position, "the entry belongs to no address")
+            if number != chain.last + 1 and chain.damage is None:
+                chain.damage = DamagedStore(self.path, chain.path, position, "entries are missing")
+            chain.last = number
+            chain.positions.append(position)
+        self.last = rows[-1][0]
+        self.live += len(rows)
+
+    def _begin_log(self) -> None:
+        """Bring into the database what earlier owners have left in their logs, and begin one of our own."""
+        log = self.log
+        log.epoch = self.claim.epoch
+        (version,) = self.db.execute("PRAGMA user_version").fetchone()
+        if log.make_folder():
+            if version == VERSION_WITH_LOG:
+                os.rmdir(log.folder)
+                reason = f"its log is missing (make an empty folder {log.folder} to go on without what was in it)"
+                raise DamagedStore(self.path, None, None, reason)
+            sync(os.path.dirname(self.path))
+        left = log.left()
+        if left and version == VERSION:  # A store was closed, and its owner killed before it had removed them.
+            log.remove(left)
+            left = []
+        rows: list[Row] = []
+        for batch in log.read(left):
+            if batch[0][0] == self.last + 1:
+                self._take_in(batch)
+                rows += batch
+            elif batch[-1][0] > self.last:
+                break  # A power loss has taken what was before it: the mark knows whether it may be missing.
+        self._mark.check(self.last, synced=self._fsync)
+        log.rows = rows
+        if left:  # They are removed next.
+            self.db.execute("PRAGMA synchronous = FULL")
+        with self.transaction() as db:
+            db.execute(f"PRAGMA user_version = {VERSION_WITH_LOG}")
+        if left:
+            log.remove(left)
+            self._configure()
 
     def close(self) -> None:
         """Release the store and sync it; a second call does nothing."""
         with self.lock:
             if not self._mark.is_open:
                 return
-            clean = self.failure is None and not self._in_doubt
+            clean = self.failure is None and not self.in_doubt
             self.failure = self.failure or StoreFailed(self.path, "it is closed")
             self._mark.close()
             checkpointer = self._checkpointer
@@ -123,16 +182,21 @@ class Store:
     def _retire(self, clean: bool) -> None:
         """Leave the last word on how much there is, so that the mark is not needed, and strike ourselves out."""
         db = self.db
-        if clean and db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,):
+        is_owner = db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,)
+        if clean and is_owner:
             db.execute("PRAGMA synchronous = FULL")
             db.execute("BEGIN IMMEDIATE")
+            db.executemany(INSERT, self.log.rows)
+            db.execute(f"PRAGMA user_version = {VERSION}")
             self.claim.write(self.last, self.live)
             db.execute("COMMIT")
             self._mark.remove()
+        self.log.close(remove=clean and is_owner)
         self.claim.release()
 
     def _disconnect(self) -> None:
         self._mark.close()
+        self.log.close(remove=False)
         if self._wal >= 0:
             wal, self._wal = self._wal, -1
             os.close(wal)
@@ -146,24 +210,31 @@ class Store:
     def transaction(self, size: int = 0, *, note: bool = False) -> Generator[sqlite3.Connection, None, None]:
         """Run a write of about `size` bytes as the owner, or not at all.
 
-        With `note` the transaction takes a position of its own, so that the mark shows if it is lost, and the store
-        row is brought up to date.
+        What is in the log goes before it. With `note` the transaction takes a position of its own, so that the mark
+        shows if it is lost, and the store row is brought up to date.
         """
         with self.lock:
             self.refresh()
-            db = self.db
+            db, log = self.db, self.log
             try:
                 db.execute("BEGIN IMMEDIATE")
                 (current,) = db.execute("SELECT epoch FROM store").fetchone()
                 if current != self.claim.epoch:
                     raise StaleEpoch(self.path, self.claim.epoch, current)
-                self._in_doubt = True
+                self.in_doubt = True
+                if log.is_due:
+                    log.prepare()
+                    db.executemany(INSERT, log.rows)
                 yield db
                 if note:
                     self.last += 1
                     self.claim.write(self.last, self.live)
                 db.execute("COMMIT")
-                self._in_doubt = False
+                self._is_unsynced = True
+                if log.is_due:
+                    self._unsaved_bytes += log.size
+                    log.restart()
+                self.in_doubt = False
                 self._mark.set(self.last)
             except BaseException as error:
                 if db.in_transaction:
@@ -176,25 +247,56 @@ class Store:
             if self._unsaved_bytes > _CHECKPOINT_BYTES:
                 self._start_checkpoint()
 
-    def sync(self) -> None:
-        """Bring what was committed so far to the disk.
+    def takes(self, entries: Sequence[tuple[str, Entry]], size: int) -> bool:
+        """Whether the log takes these entries, encoded in so many bytes; else they need a transaction."""
+        if self.in_doubt or self.failure is not None or not self.log.takes(len(entries), size):
+            return False
+        for address, _ in entries:
+            chain = self.chains.get(address)
+            if chain is None or chain.damage is not None:
+                return False
+        return True
 
-        Without a lock while the disk works: the WAL only grows, or begins again when all of it is in the synced
+    def write_log(self, rows: list[Row]) -> None:
+        """Acknowledge rows that memory has already (`in_doubt`), by writing them to the log.
+
+        Raises:
+            StaleEpoch, StoreFailed: nothing was written.
+        """
+        try:
+            self.log.write(rows)
+        except Sealed as error:
+            (current,) = self.db.execute("SELECT epoch FROM store").fetchone()
+            raise StaleEpoch(self.path, self.claim.epoch, current) from error
+        except OSError as error:
+            raise self.translate(error) from error
+        self.in_doubt = False
+        self._mark.set(self.last)
+
+    def sync(self) -> None:
+        """Bring what was appended and committed so far to the disk.
+
+        Without the lock while the disk works: the WAL only grows, or begins again when all of it is in the synced
         database; and its file stays the same for as long as somebody has it open.
         """
-        with self.lock:
-            self.refuse_failed()
-            last = self.last
-            if self._wal < 0:  # It has no locks: to close it later drops none.
-                self._wal = os.open(f"{self.path}-wal", os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            os.fdatasync(self._wal)
-        except OSError as error:
+        with self._sync_lock:
             with self.lock:
-                raise self.translate(error) from error
-        with self.lock:
-            self.refuse_failed()
-            self._mark.set_synced(last)
+                self.refuse_failed()
+                last, is_unsynced, self._is_unsynced = self.last, self._is_unsynced, False
+                files, kept = self.log.promise(), self.log.kept()
+                if self._wal < 0:  # It has no locks: to close it later drops none.
+                    self._wal = os.open(f"{self.path}-wal", os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                if is_unsynced:
+                    os.fdatasync(self._wal)
+                self.log.sync(files)
+            except OSError as error:
+                with self.lock:
+                    raise self.translate(error) from error
+            with self.lock:
+                self.refuse_failed()
+                self.log.free(kept)
+                self._mark.set_synced(last)
 
     def sync_rows(self) -> None:
         """Bring what was committed to the disk, before anything is removed that it does not name any more.
@@ -230,7 +332,7 @@ class Store:
     def refresh(self) -> None:
         """Make sure that memory and file agree, after a transaction that was broken off."""
         self.refuse_failed()
-        if self._in_doubt:
+        if self.in_doubt:
             try:
                 self._scan()
             except sqlite3.Error as error:
@@ -242,6 +344,8 @@ class Store:
         # Our statements are fixed: if SQLite finds one in error, the file is no longer what they are for.
         damaged = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
         translated: HoldfastError
+        if isinstance(error, NoRoom):
+            return StoreFailed(self.path, f"{error}; nothing was written, make room and try again")
         if isinstance(error, OSError) or code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
             translated = StoreFailed(self.path, f"{error}; open it again, which verifies it")
         elif code in damaged:
@@ -270,6 +374,9 @@ class Store:
         """Freeze the file, for the reading connection, at the very state that the memory describes now."""
         db = self.reader
         with self.lock:
+            if self.log.rows:
+                with self.transaction():
+                    pass
             self.refresh()
             db.execute("BEGIN")
             (current,) = db.execute("SELECT epoch FROM store").fetchone()

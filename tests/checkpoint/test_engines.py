@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import shutil
-import sqlite3
-from contextlib import closing
 from pathlib import Path
 
 import holdfast as hf
 from holdfast.checkpoint.journal import Journal, MemoryJournal
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.sqlite.rows import crc_of
 from holdfast.testing.stores import conformance
 from tests.checkpoint.players import Doer, Note, Seen
+from tests.checkpoint.sqlite.stores import disown
 
 
 def killed(journal: Journal, folder: Path) -> Path:
     """The files as they are now, with an owner that is dead."""
     copy = folder.with_name(str(int(folder.name) + 1))
     shutil.copytree(folder, copy)
-    with closing(sqlite3.connect(copy / "app.db", isolation_level=None)) as db:
-        row = db.execute("SELECT epoch, pid, start, floor, live FROM store").fetchone()
-        dead = (row[0], 0, "", row[3], row[4])
-        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc_of(*dead),))
+    disown(copy / "app.db")
     return copy
 
 

@@ -1,10 +1,12 @@
 /* Preloaded: notes each write, truncation, sync, rename and removal below $DISK_ROOT in $DISK_LOG, in order.
- * The $DISK_FAIL-th sync (from 1; 0: none) and all after it fail with EIO. */
+ * The $DISK_FAIL-th sync (from 1; 0: none) and all after it fail with EIO. `steps_left` (0: no end) counts the steps
+ * until the process is killed; a write has two: half of it, and the rest. */
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
 #include <fcntl.h>
 #include <pthread.h>
+#include <signal.h>
 #include <stdint.h>
 #include <stdio.h>
 #include <stdlib.h>
@@ -15,6 +17,14 @@
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static int out = -1;
 static long syncs;
+long steps_left;
+
+static int is_last(void) { return steps_left > 0 && --steps_left == 0; }
+
+static void die(void) {
+    kill(getpid(), SIGKILL);
+    for (;;) pause();
+}
 
 static int inside(const char *path) {
     const char *root = getenv("DISK_ROOT");
@@ -37,6 +47,7 @@ static void note(char op, const char *path, int64_t at, const void *data, int64_
     int64_t head[3] = {(int64_t)strlen(path), at, size};
     struct iovec parts[] = {{&op, 1}, {head, sizeof head}, {(void *)path, head[0]}, {(void *)data, (size_t)size}};
     if (real_writev(out, parts, size ? 4 : 3) < 0) abort();
+    if (is_last()) die();
 }
 
 #define REAL(name, type, ...) static type (*real)(__VA_ARGS__); if (!real) real = dlsym(RTLD_NEXT, #name)
@@ -52,7 +63,11 @@ static ssize_t written(int fd, const void *data, ssize_t done, off_t at) {
 
 ssize_t pwrite(int fd, const void *data, size_t size, off_t at) {
     REAL(pwrite, ssize_t, int, const void *, size_t, off_t);
+    char path[4096];
     pthread_mutex_lock(&lock);
+    if (steps_left && named(fd, path) && is_last()) {
+        if (real(fd, data, size / 2, at) >= 0) die();
+    }
     ssize_t done = written(fd, data, real(fd, data, size, at), at);
     pthread_mutex_unlock(&lock);
     return done;

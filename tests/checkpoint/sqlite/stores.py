@@ -15,6 +15,7 @@ from holdfast.checkpoint.journal import (
     Saved,
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.sqlite.rows import crc_of
 
 A, B = "/app/bank/alice", "/app/bank/bob"
 
@@ -39,6 +40,13 @@ def edit(path: Path, *statements: str) -> None:
             db.execute(statement)
 
 
+def disown(path: Path | str) -> None:
+    """Have the owner of the store taken for dead, though it may live."""
+    with closing(sqlite3.connect(path, isolation_level=None)) as db:
+        epoch, _, _, *rest = db.execute("SELECT epoch, pid, start, floor, live FROM store").fetchone()
+        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc_of(epoch, 0, "", *rest),))
+
+
 def flip(path: Path, bit: int) -> None:
     data = bytearray(path.read_bytes())
     data[bit // 8] ^= 1 << bit % 8
@@ -48,6 +56,7 @@ def flip(path: Path, bit: int) -> None:
 CHILD = """
 import os, random, signal, sys
 from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.sqlite.rows import crc_of
 path, what, seed = sys.argv[1], sys.argv[2], int(sys.argv[3])
 journal = SqliteJournal(path, synchronous="fsync" if seed % 2 else "os")
 print("open", journal.epoch, flush=True)

@@ -24,8 +24,7 @@ from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite import store as sqlite_store
 from holdfast.checkpoint.sqlite.chains import Chain
 from holdfast.checkpoint.sqlite.claim import Claim
-from holdfast.checkpoint.sqlite.rows import crc_of
-from tests.checkpoint.sqlite.stores import A, B, inputs, numbers, reopened
+from tests.checkpoint.sqlite.stores import A, B, disown, inputs, numbers, reopened
 
 
 @pytest.mark.parametrize("size", [0, 1 << 20, (1 << 20) + 1, 5 << 20])
@@ -122,10 +121,7 @@ def abandon(journal: SqliteJournal) -> SqliteJournal:
     journal.close()
     shutil.rmtree(folder)
     shutil.copytree(copy, folder)
-    with closing(sqlite3.connect(journal.path, isolation_level=None)) as db:
-        row = db.execute("SELECT epoch, pid, start, floor, live FROM store").fetchone()
-        dead = (row[0], 0, "", row[3], row[4])
-        db.execute("UPDATE store SET pid = 0, start = '', crc = ?", (crc_of(*dead),))
+    disown(journal.path)
     return SqliteJournal(journal.path)
 
 

@@ -116,7 +116,7 @@ def test_a_hole_in_the_middle_is_located_and_leaves_others_alone(filled: Path) -
         "UPDATE store SET epoch = 0",
         "UPDATE store SET live = live + 1",
         "DELETE FROM store",
-        "PRAGMA user_version = 2",
+        "PRAGMA user_version = 3",
         "PRAGMA application_id = 2",
         "ALTER TABLE entries ADD COLUMN more",
     ],
