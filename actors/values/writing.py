@@ -157,7 +157,7 @@ class _Encoder:
             return None
         self.has_marks = True
         dtype, shape, blob = rows
-        lowered = [ARRAYS, dtype, [TUPLE, *shape], blob]
+        lowered: list[Any] = [ARRAYS, dtype, [TUPLE, *shape], blob]
         if twice:
             lowered += chain.from_iterable((at, self.lowered(x[at])) for at, key in enumerate(keys) if key in twice)
         self.walked.update(zip(keys, x, strict=True))
