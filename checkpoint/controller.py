@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+from collections.abc import Callable
 
 import msgspec
 
@@ -138,6 +139,9 @@ class LocalHome:
         switch = self._host.switch
         if switch is not None and self._is_open:
             switch.from_life(record)
+
+    def told(self, then: Callable[[], None]) -> None:
+        then()
 
     def closed(self) -> None:
         if self._is_open:

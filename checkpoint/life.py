@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+from collections.abc import Callable
 from typing import Any, Protocol
 
 from ..actors import lives, mailbox
@@ -59,6 +60,10 @@ class HomePort(Protocol):
         """Hand a record to the home; it is handled in order."""
         ...
 
+    def told(self, then: Callable[[], None]) -> None:
+        """Call this when all that was handed over is on its way."""
+        ...
+
     def closed(self) -> None:
         """The life is over."""
         ...
@@ -84,7 +89,7 @@ class Life:
         self.cancelled: set[str] = set()  # timers whose ticks may still be on their way
         self.stop_wanted: ExitReason | None = None
         self.postponed: list[Item] = []  # orders from outside that wait until it is live
-        self.is_live = False
+        self.is_live = self.is_over = False
         self.has_replayed = False
         self.begins_suspended = False
         self.in_hook = False
@@ -318,12 +323,16 @@ class Life:
             self.returned.clear()
         self.port.to_home(Live(self._restore_seconds))
         if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
-            self.cell.urge(TakeSnapshot(self))
+            self.port.told(self._snapshot_of_replay)  # The actor is released meanwhile.
         postponed, self.postponed = self.postponed, []
         for call in postponed:
             self.cell.urge(call)
         if self.stop_wanted is not None:
             self.cell.request_stop(self.stop_wanted)
+
+    def _snapshot_of_replay(self) -> None:
+        if self.cell.actor is not None and not self.is_over:
+            self.want_snapshot()
 
     def want_snapshot(self) -> None:
         """Save the state before anything else is handled."""
@@ -413,6 +422,7 @@ class Life:
 
     def close(self) -> None:
         """The life is over."""
+        self.is_over = True
         self.images.close()
         for future, _ in self.asks.values():
             future.cancel()

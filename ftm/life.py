@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
 
 from ..actors.cell import Cell
@@ -94,6 +95,9 @@ class Nowhere:
 
     def to_home(self, record: ToHome) -> None:
         """Nobody hears it."""
+
+    def told(self, then: Callable[[], None]) -> None:
+        """There is nobody to tell."""
 
     def closed(self) -> None:
         """Nobody waits for it."""

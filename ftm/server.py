@@ -8,6 +8,7 @@ from __future__ import annotations
 import inspect
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any, Final
 
 import msgspec
@@ -396,6 +397,10 @@ class Server(Points):
                 self.tell_more(record)
             case _:
                 pass
+
+    def told(self, then: Callable[[], None]) -> None:
+        """It is on its way at once."""
+        then()
 
     def closed(self) -> None:
         """The life is over; what follows from that comes when all of it has been wound down."""

@@ -6,14 +6,17 @@ import functools
 import math
 import re
 import sys
+from operator import attrgetter
 from typing import Any, Final, cast
 
 from ..errors import DamagedValue, UnsavableValue
-from .forms import ARRAY, BITS, GENERATOR, RANDOM_STATE, SEED, TEXT, Blob, Make
+from .forms import ARRAY, ARRAYS, BITS, GENERATOR, RANDOM_STATE, SEED, TEXT, Blob, Make
 
 _LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0, "SFC64": 0}
 # Of numbers, text, bytes, times. Other names mean objects, or (a time unit of 0 seconds) end the process.
 _SMALL: Final = 1024  # bytes of an array that are copied at once
+_DTYPE_OF: Final = attrgetter("dtype")
+_SHAPE_OF: Final = attrgetter("shape")
 _DTYPE: Final = re.compile(r"[<>|=]([biufcSUV]\d{1,9}|[qQ]|[mM]8(\[([1-9]\d{0,8})?[a-zA-Z]+\])?)")
 
 
@@ -32,7 +35,7 @@ def parts_of_array(x: Any, *, in_order: bool) -> tuple[Any, tuple[int, ...], str
         return known, x.shape, order, Blob(x.tobytes(order))
     np = _numpy()
     if x.dtype.names:  # What happens to be between its fields is left out.
-        x, old = np.zeros_like(x), x
+        x, old = np.zeros(x.shape, x.dtype, order), x  # `zeros_like` leaves there what it finds.
         x[...] = old
     flat = np.ascontiguousarray(x.T if is_fortran else x).reshape(-1)
     return _dtype_parts(x.dtype), x.shape, order, Blob(flat.view(np.uint8) if flat.nbytes else b"")
@@ -43,6 +46,20 @@ def _plain_dtypes() -> dict[int, str]:
     """The names of the dtypes of numbers, which exist once, by id."""
     dtypes = [_numpy().dtype(char) for char in "?bBhHiIlLqQefdgFDG"]
     return {id(dtype): _dtype_parts(dtype) for dtype in dtypes}
+
+
+def rows_of(arrays: list[Any]) -> tuple[str, tuple[int, ...], Blob] | None:
+    """dtype and shape that all of these small arrays of numbers have, and the bytes of all; else None."""
+    first = arrays[0]
+    dtype, shape = _plain_dtypes().get(id(first.dtype)), first.shape
+    if dtype is None or not shape or not 0 < first.nbytes <= _SMALL or len({*map(type, arrays)}) > 1:
+        return None
+    if len({*map(id, map(_DTYPE_OF, arrays))}) > 1 or len({*map(_SHAPE_OF, arrays)}) > 1:
+        return None
+    try:
+        return dtype, shape, Blob(b"".join(arrays))
+    except TypeError:  # Not all of them lie in C order.
+        return None
 
 
 def array_form(np: Any, kind: Any, x: Any, *, in_order: bool) -> list[Any] | None:
@@ -86,13 +103,18 @@ def _dtype_parts(dtype: Any) -> Any:
     raise UnsavableValue("", f"a numpy value of dtype {dtype}")
 
 
+@functools.lru_cache(64)
+def _named_dtype(name: str) -> Any:
+    if not _DTYPE.fullmatch(name):
+        raise DamagedValue(f"it has an array of dtype {name}")
+    return _numpy().dtype(name)
+
+
 def _make_dtype(parts: Any) -> Any:
-    np = _numpy()
     if isinstance(parts, str):
-        if not _DTYPE.fullmatch(parts):
-            raise DamagedValue(f"it has an array of dtype {parts}")
-        dtype = np.dtype(parts)
-    elif len(parts) == 2:
+        return _named_dtype(parts)
+    np = _numpy()
+    if len(parts) == 2:
         base, shape = parts
         dtype = np.dtype((_make_dtype(base), shape))
     else:
@@ -119,6 +141,19 @@ def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview) -> Any:
     if array.shape != shape:
         raise DamagedValue(f"it has an array of shape {shape}")
     return array if order else array[()]
+
+
+def _make_arrays(dtype: str, shape: tuple[int, ...], data: memoryview, *others: Any) -> list[Any]:
+    """The arrays of `rows_of`; `others` are positions, and what stands there in place of the row."""
+    made = _named_dtype(dtype)
+    size = math.prod(shape) * made.itemsize if type(shape) is tuple and min(shape, default=0) > 0 else 0
+    if not size or len(data) % size:  # Rows of no bytes could be any number.
+        raise DamagedValue(f"it has {len(data)} bytes for arrays of shape {shape} and dtype {made}")
+    numpy = _numpy()
+    arrays = [*map(numpy.ndarray.copy, numpy.ndarray((len(data) // size, *shape), made, data))]
+    for position, other in zip(others[::2], others[1::2], strict=True):
+        arrays[position] = other
+    return arrays
 
 
 def _make_text(text: str | bytes) -> Any:
@@ -159,6 +194,7 @@ def _make_random_state(state: dict[str, Any]) -> Any:
 
 MAKE_ARRAYS: Final[dict[int, Make]] = {
     ARRAY.code: lambda parts: _make_array(*parts),
+    ARRAYS.code: lambda parts: _make_arrays(*parts),
     TEXT.code: lambda parts: _make_text(*parts),
     BITS.code: lambda parts: _make_bits(*parts),
     SEED.code: lambda parts: _make_seed(*parts),

@@ -100,8 +100,8 @@ KNOWN: Final[dict[type, tuple[ExtType, Callable[[Any], Iterable[Any]]]]] = {
     kind: (ExtType(code, b""), parts) for code, kind, parts, _ in TYPES
 }
 # The marks of what is not in the table.
-SHARED, AGAIN, BUFFER, DEFAULTDICT, ENUM, DATACLASS, STRUCT, NAMED = (ExtType(n, b"") for n in range(32, 40))
-ARRAY, TEXT, BITS, SEED, GENERATOR, RANDOM_STATE = (ExtType(n, b"") for n in range(48, 54))
+SHARED, AGAIN, BUFFER, DEFAULTDICT, ENUM, DATACLASS, STRUCT, NAMED, TUPLES = (ExtType(n, b"") for n in range(32, 41))
+ARRAY, TEXT, BITS, SEED, GENERATOR, RANDOM_STATE, ARRAYS = (ExtType(n, b"") for n in range(48, 55))
 
 SCALARS: Final = frozenset({type(None), bool, int, float, str, bytes, Blob})
 are_scalars: Final = SCALARS.issuperset

@@ -23,6 +23,7 @@ from .forms import (
     NAMED,
     SHARED,
     STRUCT,
+    TUPLES,
     TYPES,
     Make,
     Mark,
@@ -37,6 +38,12 @@ def make_int(code: int, data: bytes) -> int:
     return int.from_bytes(data, "big", signed=True)
 
 
+def _make_tuples(rows: list[Any]) -> list[Any]:
+    if any(type(row) is not list for row in rows):
+        raise DamagedValue("it has a tuple that is none")
+    return [*map(tuple, rows)]
+
+
 _MARKS: Final = {code: Mark(code) for code in range(1, 64)}
 unpack: Final = cast(
     "Callable[..., Any]", partial(msgpack.unpackb, strict_map_key=False, unicode_errors="surrogatepass")
@@ -44,6 +51,7 @@ unpack: Final = cast(
 _MAKE: Final[dict[int, Make]] = {
     **{code: make for code, _, _, make in TYPES},
     **MAKE_ARRAYS,
+    TUPLES.code: _make_tuples,
 }
 
 

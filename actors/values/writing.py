@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import reprlib
 import sys
-from collections import defaultdict, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Sequence
 from datetime import date, time
+from itertools import chain
 from typing import Any, Final, cast
 
 import msgpack
@@ -14,11 +15,12 @@ import msgspec
 from msgpack import ExtType
 
 from ..errors import UnsavableValue, type_name
-from .arrays import array_form, is_array, parts_of_array
+from .arrays import array_form, is_array, parts_of_array, rows_of
 from .classes import class_mark, class_name, class_parts, factory_name, slots_of
 from .forms import (
     AGAIN,
     ARRAY,
+    ARRAYS,
     BUFFER,
     DEFAULTDICT,
     FORMAT,
@@ -26,6 +28,7 @@ from .forms import (
     KNOWN,
     SCALARS,
     SHARED,
+    TUPLES,
     Blob,
     are_scalars,
     can_change,
@@ -35,6 +38,8 @@ from .forms import (
 
 HEAD_ALONE: Final = bytes((FORMAT, 0))
 TUPLE: Final = KNOWN[tuple][0]
+MANY: Final = 8
+"""Entries from which on a list of arrays or tuples that are alike is written as a whole."""
 _PLAIN: Final = msgspec.msgpack.Encoder()
 
 
@@ -108,7 +113,7 @@ class _Encoder:
 
     def again(self, key: int, x: object) -> Any:
         """What stands where `x` is met for the second time: the first place becomes one that can be referred to."""
-        first = self.trees[key]
+        first = self.trees.get(key)
         if first is x or type(first) is not list:  # Not ours to change: one more walk, which knows that it is shared.
             self.met_again.add(key)
             return None
@@ -118,7 +123,7 @@ class _Encoder:
 
     def inside(self, kind: type, x: Any) -> Any:
         if kind is list:
-            return x if are_scalars(map(type, x)) else self.each(x, x)
+            return x if are_scalars(map(type, x)) else self.alike(x) or self.each(x, x)
         if kind is dict and are_scalars(map(type, x)):
             return x if are_scalars(map(type, x.values())) else pairs(self.each(x, [*flat(x)]))
         if kind is tuple:  # as `form` would do it, only faster
@@ -130,6 +135,33 @@ class _Encoder:
             return [ARRAY, dtype if type(dtype) is str else self.lowered(dtype), [TUPLE, *shape], order, blob]
         mark, *parts = self.form(kind, x)
         return [mark, *(parts if are_scalars(map(type, parts)) else self.each(x, parts))]
+
+    def alike(self, x: list[Any]) -> list[Any] | None:
+        """A list of tuples of scalars, or of small arrays of one dtype and shape, without a look at each; else None."""
+        if len(x) < MANY or self.canonical:
+            return None
+        first = type(x[0])
+        if first is tuple and {*map(type, x)} == {tuple} and are_scalars(map(type, chain.from_iterable(x))):
+            self.has_marks = True
+            return [TUPLES, *x]
+        return self.rows(x) if is_array(first) else None
+
+    def rows(self, x: list[Any]) -> list[Any] | None:
+        """Small arrays as the rows of one; those that are reached twice follow, with their positions."""
+        keys = [*map(id, x)]
+        once = {*keys}
+        twice = (self.walked.keys() & once) | (self.shared & once)
+        if len(once) < len(keys):
+            twice.update(key for key, times in Counter(keys).items() if times > 1)
+        if len(twice) > len(once) // MANY or (rows := rows_of(x)) is None:
+            return None
+        self.has_marks = True
+        dtype, shape, blob = rows
+        lowered: list[Any] = [ARRAYS, dtype, [TUPLE, *shape], blob]
+        if twice:
+            lowered += chain.from_iterable((at, self.lowered(x[at])) for at, key in enumerate(keys) if key in twice)
+        self.walked.update(zip(keys, x, strict=True))
+        return lowered
 
     def each(self, x: Any, parts: Sequence[Any]) -> list[Any]:
         lowered: list[Any] = []

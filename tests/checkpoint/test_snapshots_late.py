@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +72,34 @@ class Held:
         self._write(*arguments)
 
 
+class Slow(hf.Actor):
+    """Its second life cannot be saved before there is a file."""
+
+    def __init__(self, path: str) -> None:
+        self._path, self._is_second = path, False
+        self.count = 0
+
+    def on_recovered(self) -> None:
+        self._is_second = True
+
+    @hf.on(Aside)
+    def take(self, message: Aside) -> None:
+        self.count += 1
+
+    @hf.on(Words, readonly=True)
+    def read(self, message: Words) -> list[str]:
+        return [str(self.count)]
+
+    def get_state(self) -> int:
+        end = time.monotonic() + 60.0
+        while self._is_second and not Path(self._path).exists() and time.monotonic() < end:
+            time.sleep(0.001)
+        return self.count
+
+    def set_state(self, state: int) -> None:
+        self.count = state
+
+
 async def begun(system: hf.ActorSystem) -> hf.ActorRef[Door]:
     return await system.start(hf.child("door", hf.start(Door), recovery=hf.hybrid(interval=NEVER)))
 
@@ -112,3 +142,18 @@ async def test_one_that_is_late_for_a_crash_does_not_count(tmp_path: Path) -> No
         held.may_go.set()
         await wish
         assert await ref.ask(Words()) == ["one"]
+
+
+async def test_an_actor_is_released_before_the_snapshot_of_what_was_replayed(tmp_path: Path) -> None:
+    file = tmp_path / "go on"
+    async with hf.ActorSystem("app", log=False, intensity=100) as system:
+        recovery = hf.hybrid(interval=NEVER)
+        ref = await system.start(hf.child("slow", hf.start(Slow, str(file)), isolation="process", recovery=recovery))
+        ref.tell(Aside("a"))
+        assert await ref.ask(Words()) == ["1"]
+        with system.events() as events:
+            os.kill(system.pid_of(ref), 9)
+            assert (await event(events, hf.Recovered)).replayed
+            assert not file.exists()
+            file.touch()
+            assert await ref.ask(Words(), timeout=60.0) == ["1"]

@@ -93,6 +93,15 @@ FORGED = {
     "slot that is not there": mark(37, f"{HERE}:FrozenSlotted", "b", 1),
     "struct without a field": mark(38, f"{HERE}:Reading"),
     "struct with another field": mark(38, f"{HERE}:Reading", "sensor", "s", "other", 1),
+    "rows of no bytes": mark(54, "|V0", mark(1, 1), mark(34, 0)),
+    "rows without a shape": mark(54, "<f8", mark(1), mark(34, 0)),
+    "rows of a shape below zero": mark(54, "<f8", mark(1, -1), mark(34, 0)),
+    "rows of a shape without an end": mark(54, "<f8", mark(10, 0, 10**12, 1), mark(34, 0)),
+    "rows of objects": mark(54, "|O", mark(1, 1), mark(34, 0)),
+    "rows of fields": mark(54, [[["a", "<f8", 0]], 8, False], mark(1, 1), mark(34, 0)),
+    "something beside the rows": mark(54, "<f8", mark(1, 1), mark(34, 0), 0, None),
+    "something nowhere in the rows": mark(54, "<f8", mark(1, 1), mark(34, 0), 0),
+    "tuples of texts": mark(40, "ab"),
     "tuple without a field": mark(39, f"{HERE}:Size", "width", 1),
 }
 
