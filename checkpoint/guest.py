@@ -21,7 +21,7 @@ from ..actors.process import frames
 from ..actors.process.relay import send_signal
 from .life import Life
 from .method import Method
-from .records import Begin, Closed, Restore, Started, ToHome, ToLife, Wanted
+from .records import Begin, Closed, Over, Respec, Restore, Started, ToHome, ToLife, Wanted
 from .turns import StopRecorded
 
 if TYPE_CHECKING:
@@ -39,9 +39,10 @@ class RecordedGuest:
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
-        return self._port(path).take
+        return self.port_of(path).take
 
-    def _port(self, path: str) -> Port:
+    def port_of(self, path: str) -> Port:
+        """The way home from an address."""
         port = self._ports.get(path)
         if port is None:
             port = self._ports[path] = Port(self._guest, path)
@@ -53,7 +54,7 @@ class RecordedGuest:
         Raises:
             StartFailed: `__init__` or the restoring raised.
         """
-        port = self._port(cell.path)
+        port = self.port_of(cell.path)
         life = Life(cell, port, Method.of(options["method"]), self._guest.page, may_fork=True)
         cell.host = OwnHost(self._guest, life)
         if options.get("trap_exits"):  # It was moved here.
@@ -64,7 +65,7 @@ class RecordedGuest:
     def host_for(self, spec: Any) -> Host:
         """Where a child below this process's supervisor is lived: here; if it is recorded, its home is at the root."""
         if spec.recovery is not None and spec.recovery.records:
-            return InnerLifeHost(self._guest, spec.recovery, self._port)
+            return InnerLifeHost(self._guest, spec.recovery, self.port_of)
         return self._guest.node.here
 
 
@@ -127,6 +128,7 @@ class Port:
         self.on_begin: Callable[[Begin], None] | None = None
         self.on_started: Callable[[Started], None] | None = None
         self.on_closed: Callable[[], None] | None = None
+        self.on_group: Callable[[Over | Respec], None] | None = None  # of lives that are lived at the root
 
     def take(self, frame: frames.Record) -> None:
         """A record from home."""
@@ -141,6 +143,9 @@ class Port:
             case Started():
                 assert self.on_started is not None
                 self.on_started(record)
+            case Over() | Respec():
+                if self.on_group is not None:
+                    self.on_group(record)
             case _:
                 if self.life is not None:
                     self.life.from_home(record)

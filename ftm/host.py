@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ..actors import lives
@@ -93,9 +93,13 @@ class GroupHost(Steered):
             begin_afresh(switch)
         return opened
 
+    def topics(self, cell: Cell) -> Iterable[str]:
+        """Those that the class subscribes to."""
+        start = cell.extra().start
+        return start.kind._topics if start is not None else ()
+
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        start, clock = cell.extra().start, self.clock
-        assert start is not None
+        clock = self.clock
         assert clock is not None
         await self.gate("restart")
         if not self.is_gated:
@@ -106,7 +110,7 @@ class GroupHost(Steered):
         cell.state = RUNNING
         try:
             group = await self.build(cell, switch)
-            self.subscribe(cell, start.kind._topics)
+            self.subscribe(cell, self.topics(cell))
             await self.lead(group, switch)
             clock.mark("restart")
             await self.gate("replay")
@@ -186,11 +190,15 @@ class GroupHost(Steered):
         )
 
     def _replica_start(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> Start[Any]:
-        start = cell.extra().start
-        assert start is not None
         bindings = {port: target.path for port, target in cell.extra().bindings.items()}
         setting = Setting(cell.path, name, config, self.method.data(), bindings, self.detection.interval)
-        return self.replica(setting, start, tuple(layer.describe() for layer in layers))
+        return self.replica(setting, self.recipe(cell), tuple(layer.describe() for layer in layers))
+
+    def recipe(self, cell: Cell) -> Start[Any] | bytes:
+        """How the protected actor begins, or that as bytes."""
+        start = cell.extra().start
+        assert start is not None
+        return start
 
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
@@ -400,6 +408,12 @@ class GroupHost(Steered):
             return
         if failed is not None:
             reason = KILLED
+        self.life_over(cell, reason, failed, running, noticed, ordered=ordered)
+
+    def life_over(
+        self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int, noticed: float, *, ordered: bool
+    ) -> None:
+        """All replicas have ended: the life at the address is over."""
         self.over(
             cell, running, str(failed or reason), ordered=ordered or running < 0, noticed=noticed, reason=reason
         )  # fmt: skip
@@ -437,8 +451,11 @@ class GroupHost(Steered):
                 if self.group.change is not None:
                     self.group.change.close("it has stopped")
             ftm.kill()
-        start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=parent_ended(cell))
+        self.give_up(cell, self.topics(cell), restarting=self.is_restarting(cell))
+
+    def is_restarting(self, cell: Cell) -> bool:
+        """Whether a retired address may have its supervisor, and so itself, started again."""
+        return parent_ended(cell)
 
     # -- what else a host does --------------------------------------------------------------------------------------
 
@@ -453,7 +470,7 @@ class GroupHost(Steered):
         return -1 if self.group is None else self.group.only_suspect_input()
 
 
-def replica(setting: Setting, start: Start[Any], layers: tuple[Any, ...]) -> Start[Any]:
+def replica(setting: Setting, start: Start[Any] | bytes, layers: tuple[Any, ...]) -> Start[Any]:
     """The recipe of a replica."""
     from .replica import Replica
 

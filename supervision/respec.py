@@ -75,6 +75,19 @@ def rebuilt(start: Start[Any], names: list[str], change: Change) -> Start[Any]:
     return Start(start.kind, (flags, changed), start.kwargs)
 
 
+def spec_below(start: Start[Any], names: list[str]) -> ChildSpec | None:
+    """What the recipe of a supervisor says of the descendant at `names`; None if nothing."""
+    spec: ChildSpec | None = None
+    for name in names:
+        if not issubclass(start.kind, Supervisor) or len(start.args) != 2 or not isinstance(start.args[1], tuple):
+            return None
+        spec = next((one for one in start.args[1] if one.id == name), None)
+        if spec is None:
+            return None
+        start = spec.start
+    return spec
+
+
 def _changed(spec: ChildSpec, names: list[str], change: Change) -> ChildSpec:
     if spec.id != names[0]:
         return spec
