@@ -347,7 +347,11 @@ class GroupHost(Steered):
             self._stop_wanted = reason
             return
         group.is_stopping = True
-        self._ending = cell.node.loop.create_task(self._finish(cell, group, reason), name=f"stop of {cell.path}")
+        self._ending = cell.node.loop.create_task(
+            self._finish(cell, group, reason),
+            name=f"stop of {cell.path}",
+            context=cell.node.base_context.copy(),  # Not in the name of whoever happens to tell us.
+        )
         self._ending.add_done_callback(seen)
 
     async def _finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:

@@ -64,7 +64,9 @@ class SubtreeGroup(GroupHost):
         left = [task for task in (self._ending, self._starting) if task is not None and not task.done()]
         entered = None if left else self.enter(cell)  # Now: from here on what is sent is admitted by the home.
         self._starting = cell.node.loop.create_task(
-            self._begin(cell, wanted, port, left, entered), name=f"start of {cell.path}"
+            self._begin(cell, wanted, port, left, entered),
+            name=f"start of {cell.path}",
+            context=cell.node.base_context.copy(),  # Not in that of the socket, which is whoever's had the process.
         )
         self._starting.add_done_callback(seen)
 
