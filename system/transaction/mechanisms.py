@@ -38,9 +38,15 @@ class OnProtection(OnLiving):
         assert place is not None
         above = place.parent
         if above is not None and above.cell is not None and is_elsewhere(above.cell):
-            raise wrong(self.target, "its supervisor lives in another process, which cannot have processes of its own")
+            self._check_below(place)
         if place.spec is None:
             raise wrong(self.target, "nobody supervises it, so nobody would start it again")
+
+    def _check_below(self, place: Place) -> None:
+        """Whether it can be done below a supervisor that lives in another process. Raises SpecError."""
+        if place.spec is None:
+            why = "its supervisor lives in another process, and no recipe here has its spec: add it by a transaction"
+            raise wrong(self.target, why)
 
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
         """Change it; whoever is cancelled gives up waiting, the change comes to its end."""
