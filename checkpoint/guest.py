@@ -21,7 +21,21 @@ from ..actors.process import frames
 from ..actors.process.relay import send_signal
 from .life import Life
 from .method import Method
-from .records import Begin, Closed, Over, Respec, Restore, Started, ToHome, ToLife, Wanted
+from .records import (
+    Attached,
+    Begin,
+    Closed,
+    Handover,
+    Over,
+    Respec,
+    Restore,
+    Returned,
+    Returning,
+    Started,
+    ToHome,
+    ToLife,
+    Wanted,
+)
 from .turns import StopRecorded
 
 if TYPE_CHECKING:
@@ -36,6 +50,7 @@ class RecordedGuest:
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
         self._ports: dict[str, Port] = {}
+        self.on_handover: Callable[[str, Handover], None] = lambda path, record: None
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
@@ -146,6 +161,8 @@ class Port:
             case Over() | Respec():
                 if self.on_group is not None:
                     self.on_group(record)
+            case Attached() | Returning() | Returned():
+                self._guest.recovery.on_handover(self._path, record)
             case _:
                 if self.life is not None:
                     self.life.from_home(record)
@@ -228,13 +245,31 @@ class InnerLifeHost(LifeHost):
             self._bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
         self._number += 1
         self._up = cell.node.loop.create_future()
-        port = self._port = self._port_of(cell.path)
-        port.on_begin = lambda record: self._begin(cell, record)
-        port.on_started = lambda record: self._started(cell, record)
-        port.on_closed = lambda: self._closed(cell)
+        port = self._port = self._joined(cell)
         kind = message_name(start.kind)
         port.to_home(Wanted(self._number, kind, list(start.kind._topics), self._with_ports(cell), self._bound))
         return self._up
+
+    def _joined(self, cell: Cell) -> Port:
+        """The way home, on which we hear of lives here from now on."""
+        port = self._port_of(cell.path)
+        port.on_begin = lambda record: self._begin(cell, record)
+        port.on_started = lambda record: self._started(cell, record)
+        port.on_closed = lambda: self._closed(cell)
+        return port
+
+    def take_up(self, cell: Cell, life: Life, number: int) -> None:
+        """A life that has come back here is that of the address, as if it had been wanted as `number`."""
+        self._life, self._number, self._port = life, number, self._joined(cell)
+        cell.host, cell.admit = self, self._admit
+
+    def let_go(self) -> Life:
+        """The life that is lived here, which is at rest, is not that of the address any more; its home hears no more."""
+        life, self._life = self._life, None
+        assert life is not None
+        assert self._port is not None
+        self._port.life = self._port.on_closed = None
+        return life
 
     def _with_ports(self, cell: Cell) -> Method:
         """The method; where this actor's bindings lead is known here only."""

@@ -153,7 +153,34 @@ class Respec(msgspec.Struct, array_like=True, tag=10):
     layers: list[Any]
 
 
-ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec
+class Attached(msgspec.Struct, array_like=True, tag=31):
+    """The life, which is at rest, is lived by replicas at the root from now on, as that which was wanted as `number`."""
+
+    number: int
+    layers: list[Any]
+
+
+class Returning(msgspec.Struct, array_like=True, tag=32):
+    """The life that replicas have lived comes back here, with the state that came before: begin it beside the address.
+
+    `turn`, `stash`, `slot`: as of `Begin`.
+    """
+
+    number: int
+    turn: int
+    stash: list[int]
+    slot: int
+    is_suspended: bool
+
+
+class Returned(msgspec.Struct, array_like=True, tag=33):
+    """The life that was begun beside the address is the one, or (not `is_kept`) is not to be."""
+
+    is_kept: bool
+
+
+Handover = Attached | Returning | Returned
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Handover
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------

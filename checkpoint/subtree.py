@@ -48,7 +48,7 @@ class Lived(Host, Protocol):
         ...
 
 
-Protect = Callable[[Cell, Wanted, "Lived | None"], Lived]
+Protect = Callable[["SubtreeHome", Cell, Wanted, "Lived | None"], Lived]
 """Gives the host of such a child; the last one, if there was one. Raises HoldfastError: it cannot be had."""
 
 
@@ -118,6 +118,7 @@ class SubtreeHome(HomeHost):
         self.homes, self.path = homes, path
         self._protect = protect
         self._group: Lived | None = None  # has the lives of a protected child
+        self.arriving: Callable[[ToHome], None] | None = None  # hears a life that is to come back into the process
         self.switch: Switch | None = None
         self.clock = None
         self.recovery = None
@@ -140,11 +141,13 @@ class SubtreeHome(HomeHost):
             return
         if isinstance(record, Wanted):
             self._begin(record)
-        elif isinstance(record, Closed):
+        elif isinstance(record, Closed) and self.arriving is None:
             if self._group is not None:
                 self._group.closed(record)
             elif self._wanted is not None and record.number == self._wanted.number:
                 self._closed(unpack_exit(record.reason), recovers=record.recovers)
+        elif self.arriving is not None:
+            self.arriving(record)
         elif self.switch is not None and self._wanted is not None:
             self.switch.from_life(record)
 
@@ -184,11 +187,36 @@ class SubtreeHome(HomeHost):
             self._send_calls(cell, worker)
             self._run(cell, self._follow(cell, wanted, live, recovering))
 
+    # -- lives that are handed over while they are lived ------------------------------------------------------------
+
+    @property
+    def worker(self) -> Worker | None:
+        """The process of the supervisor."""
+        return self._worker
+
+    @property
+    def slot(self) -> int:
+        """The place on the page; 0 if there was none left."""
+        return self._slot
+
+    def hand_over(self, group: Lived) -> Wanted:
+        """The life that its supervisor wants is lived at the root from now on."""
+        wanted, self._wanted, self._group = self._wanted, None, group
+        assert wanted is not None
+        return wanted
+
+    def take_back(self, cell: Cell, wanted: Wanted) -> None:
+        """It is lived in the process again."""
+        self._wanted, self._group, self.clock = wanted, None, None
+        cell.spec = wanted
+
+    # -- lives at the root ------------------------------------------------------------------------------------------
+
     def _begin_protected(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
         """A life that is lived at the root."""
         self._wanted = None
         try:
-            self._group = self._protect(cell, wanted, self._group)
+            self._group = self._protect(self, cell, wanted, self._group)
         except HoldfastError as error:
             port.to_life(Started(wanted.number, str(error)))
             return

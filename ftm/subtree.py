@@ -18,12 +18,13 @@ import msgspec
 from ..actors import links, lives
 from ..actors.actor import Start
 from ..actors.cell import DOWN, RUNNING, Cell
+from ..actors.control.moving import Transit
 from ..actors.errors import HoldfastError, StartFailed, StartIgnored
 from ..actors.exits import ExitReason, pack_exit, unpack_exit
 from ..actors.process.recipe import pack_recipe
-from ..checkpoint.homes import Homes, seen
-from ..checkpoint.records import Closed, Over, Respec, Started, Wanted
-from ..supervision.respec import spec_below
+from ..checkpoint.homes import seen
+from ..checkpoint.records import Attached, Closed, Over, Respec, Started, Wanted
+from ..supervision.respec import recipe_spec
 from .adaptation import REST_WITHIN, Reconfiguration
 from .adaptation_rules import check_stack, describe
 from .host import GroupHost
@@ -33,7 +34,7 @@ from .unkept import forget_later, is_unkept
 if TYPE_CHECKING:
     from ..checkpoint.controller import RemoteLife
     from ..checkpoint.method import Method
-    from ..supervision.spec import ChildSpec
+    from ..checkpoint.subtree import SubtreeHome
 
 STOPPED_STARTING = "it was stopped while it started"
 
@@ -41,8 +42,9 @@ STOPPED_STARTING = "it was stopped while it started"
 class SubtreeGroup(GroupHost):
     """The host of one such child."""
 
-    def __init__(self, homes: Homes, method: Method, layers: tuple[Mechanism, ...]) -> None:
-        super().__init__(homes, method, layers)
+    def __init__(self, place: SubtreeHome, method: Method, layers: tuple[Mechanism, ...]) -> None:
+        super().__init__(place.homes, method, layers)
+        self.place = place  # where its supervisor is heard
         self._wanted: Wanted | None = None  # the life that is begun or lived
         self._recipe = b""
         self._topics: list[str] = []
@@ -88,6 +90,29 @@ class SubtreeGroup(GroupHost):
             if outcome.problem or outcome.is_ignored:
                 self._wanted = None
             port.to_life(outcome)
+
+    def prepare(self, recipe: bytes, topics: list[str]) -> None:
+        """A life is to be handed over, of an actor that begins so."""
+        self._recipe, self._topics = recipe, topics
+
+    def take_up(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
+        """A life that was lived in the process is lived here from now on; its supervisor wants it as before."""
+        self._wanted, self._port = wanted, port
+        port.to_life(Attached(wanted.number, self._described()))
+
+    @property
+    def number(self) -> int:
+        """That under which the supervisor wants the present life."""
+        return -1 if self._wanted is None else self._wanted.number
+
+    def hand_over(self) -> Wanted:
+        """The life is lived in the process again."""
+        wanted, self._wanted = self._wanted, None
+        assert wanted is not None
+        return wanted
+
+    def _described(self) -> list[Any]:
+        return [msgspec.to_builtins(layer.describe()) for layer in self.layers]
 
     def closed(self, record: Closed) -> None:
         """The supervisor has heard of the end of a life, or gives up its start."""
@@ -174,12 +199,12 @@ class SubtreeGroup(GroupHost):
         def also_there() -> None:
             switched()
             if self._port is not None:
-                self._port.to_life(Respec([msgspec.to_builtins(layer.describe()) for layer in self.layers]))
+                self._port.to_life(Respec(self._described()))
 
         return await super().adapt(cell, mechanism, also_there, rest_within)
 
 
-def subtree_group(homes: Homes, cell: Cell, wanted: Wanted, before: Any) -> SubtreeGroup:
+def subtree_group(place: SubtreeHome, cell: Cell, wanted: Wanted, before: Any) -> SubtreeGroup:
     """The host of the life that is wanted: that of the last one, if nothing has changed.
 
     Raises:
@@ -189,16 +214,18 @@ def subtree_group(homes: Homes, cell: Cell, wanted: Wanted, before: Any) -> Subt
     assert made is not None
     layers = tuple(map(_revived, msgspec.convert(made.layers, list[Description])))
     check_stack(layers, None, cell.path)
-    problem = homes.refuses(wanted.method)
+    problem = place.homes.refuses(wanted.method)
     if problem:
         raise StartFailed(cell.path, problem)
-    spec = _spec_of(cell, wanted, layers)
-    if spec is not None:
-        cell.spec, cell.extra().start = spec, spec.start
-    if isinstance(before, SubtreeGroup) and cell.host is before and describe(before.layers) == describe(layers):
+    spec = recipe_spec(cell)
+    if spec is not None and pack_recipe(spec.start, cell.path) == made.recipe:
+        cell.spec = dataclasses.replace(spec, mechanism=layers[0] if len(layers) == 1 else layers)
+        cell.extra().start = spec.start
+    is_there = cell.host is before or isinstance(cell.host, Transit)
+    if isinstance(before, SubtreeGroup) and is_there and describe(before.layers) == describe(layers):
         before.method = wanted.method
         return before
-    group = SubtreeGroup(homes, wanted.method, layers)
+    group = SubtreeGroup(place, wanted.method, layers)
     cell.host = group
     return group
 
@@ -215,19 +242,3 @@ def _revived(description: Description) -> Mechanism:
             why = "the root has not loaded it, and loads nothing that an actor process names: import it there"
             raise MechanismRefused(kind, why)
     return revive(description)
-
-
-def _spec_of(cell: Cell, wanted: Wanted, layers: tuple[Mechanism, ...]) -> ChildSpec | None:
-    """What the recipes above say of this child, if it is that child."""
-    names, at = [cell.name], cell.parent
-    while at is not None:
-        start = at.more.start if at.more is not None else None
-        spec = None if start is None else spec_below(start, names)
-        if spec is not None:
-            made = wanted.protected
-            assert made is not None
-            if pack_recipe(spec.start, cell.path) != made.recipe:
-                return None
-            return dataclasses.replace(spec, mechanism=layers[0] if len(layers) == 1 else layers)
-        names, at = [at.name, *names], at.parent
-    return None

@@ -34,7 +34,7 @@ def replace_place(cell: Cell, spec: ChildSpec) -> None:
 
 def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
     """The next lives at `cell` are protected as `spec` says, and live where it says."""
-    if cell.spec is not None and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
+    if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
         spec = dataclasses.replace(spec, start=cell.spec.start)
     _change(
         cell,
@@ -86,6 +86,18 @@ def spec_below(start: Start[Any], names: list[str]) -> ChildSpec | None:
             return None
         start = spec.start
     return spec
+
+
+def recipe_spec(cell: Cell) -> ChildSpec | None:
+    """What the nearest recipe above says of a child, of one whose supervisor lives elsewhere; None if nothing."""
+    names, at = [cell.name], cell.parent
+    while at is not None:
+        start = at.more.start if at.more is not None else None
+        spec = None if start is None else spec_below(start, names)
+        if spec is not None:
+            return spec
+        names, at = [at.name, *names], at.parent
+    return None
 
 
 def _changed(spec: ChildSpec, names: list[str], change: Change) -> ChildSpec:

@@ -11,6 +11,7 @@ from ..actors.cell import Cell, Host
 from ..actors.process import frames, guest
 from ..checkpoint.file import RecoveryFile
 from ..checkpoint.guest import GuestKeeper, RecordedGuest
+from ..checkpoint.records import Handover
 from ..supervision.respec import respec
 
 
@@ -23,6 +24,7 @@ def prepare(host: guest.Guest) -> None:
     """Before the root's first frame: a recorded life may get its state before it is launched."""
     host.recovery = RecordedGuest(host)
     host.node.respec = respec
+    host.recovery.on_handover = functools.partial(handed_over, host)
     host.node.host_for = functools.partial(host_for, host)
 
 
@@ -33,6 +35,13 @@ def host_for(host: guest.Guest, spec: Any) -> Host:
     from ..ftm.inner import InnerGroupHost  # Most processes protect nobody.
 
     return InnerGroupHost(host, spec, host.recovery.port_of)
+
+
+def handed_over(host: guest.Guest, path: str, record: Handover) -> None:
+    """A live child of this process's supervisor gets a mechanism, or loses it."""
+    from ..ftm.inner import take
+
+    take(host, path, record)
 
 
 def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:

@@ -7,6 +7,7 @@ dies in the middle of one leaves everything as it was. Another note says what wa
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -86,7 +87,7 @@ class Protection:
             child = spec_below(spec.start, names)
             if child is not None:
                 other = self._completed(child, path)
-                spec = dataclasses.replace(spec, start=rebuilt(spec.start, names, lambda _, other=other: other))
+                spec = dataclasses.replace(spec, start=rebuilt(spec.start, names, functools.partial(_instead, other)))
         return spec
 
     def put(self, address: str, before: Any, after: Any) -> None:
@@ -119,6 +120,10 @@ class Protection:
         """It is over, either way."""
         if UNDER_WAY + address in self._homes.notes(UNDER_WAY + address):
             self._homes.note(UNDER_WAY + address, None)
+
+
+def _instead(other: ChildSpec, spec: ChildSpec) -> ChildSpec:
+    return other
 
 
 def _data(mechanism: Any) -> Any:

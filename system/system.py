@@ -32,7 +32,7 @@ from ..checkpoint.method import Durability
 from ..checkpoint.records import Wanted
 from ..checkpoint.recovery.settings import RecoveryHooks
 from ..checkpoint.stores import check_durability, open_journal
-from ..checkpoint.subtree import Lived, SubtreeHost
+from ..checkpoint.subtree import Lived, SubtreeHome, SubtreeHost
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
@@ -246,7 +246,7 @@ class ActorSystem(Recorded, Controls):
         recovery = spec.recovery
         return GroupHost(self._homes, recovery if recovery is not None and recovery.records else None, spec.mechanism)
 
-    def _protect(self, cell: Cell, wanted: Wanted, before: Lived | None) -> Lived:
+    def _protect(self, place: SubtreeHome, cell: Cell, wanted: Wanted, before: Lived | None) -> Lived:
         """The host of a protected child whose supervisor is in another process.
 
         Raises:
@@ -255,7 +255,7 @@ class ActorSystem(Recorded, Controls):
         from ..ftm.mechanism import COMMON
         from ..ftm.subtree import subtree_group
 
-        group = subtree_group(self._homes, cell, wanted, before)
+        group = subtree_group(place, cell, wanted, before)
         for name in (REPLICA, *COMMON):
             self._workers.want(name)
         return group

@@ -11,11 +11,13 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.checkpoint.subtree import SubtreeHome
 from holdfast.ftm.adaptation import STEPS
 from holdfast.ftm.host import GroupHost
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.subtree import SubtreeGroup
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.test_failover import METHODS, group_of, pid_of, two_again
 from tests.ftm.test_subtree import RECOVERIES, at, bank, bank_pid, protected
@@ -98,6 +100,42 @@ async def test_a_dry_run_says_what_would_be_and_an_undone_one_leaves_it(system: 
     with pytest.raises(hf.TransactionRefused, match="has just that already"):
         async with system.transaction() as change:
             change.transition(alice, PBR())
+
+
+def recorded(name: str = "alice", **options: Any) -> hf.ChildSpec:
+    return hf.child(name, hf.start(Counter), recovery=hf.hybrid(interval=0.05), **options)
+
+
+async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any], mechanism: Any = None) -> None:
+    async with system.transaction(timeout=30) as change:
+        change.attach(ref, mechanism or PBR())
+
+
+async def detach(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    async with system.transaction(timeout=30) as change:
+        change.detach(ref)
+
+
+async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.ActorSystem) -> None:
+    await system.start(bank(recorded(), recorded("bob")))
+    alice = at(system, "alice")
+    load = Load(alice)
+    for _ in range(2):
+        await load.reached(30)
+        await attach(system, alice)
+        assert isinstance(alice._cell.host, SubtreeGroup)
+        await load.reached(30)
+        await two_again(alice)
+        os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+        await load.reached(30)
+        await two_again(alice)
+        await detach(system, alice)
+        assert isinstance(alice._cell.host, SubtreeHome)
+        assert not [path for path in system.tree() if path.startswith("/app/bank/alice/ftm")]
+    await load.reached(30)
+    await load.stop()
+    load.check(await alice.ask(Tags()))
+    assert alice._cell.life == 1
 
 
 class Bad(hf.Actor):
