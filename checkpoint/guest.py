@@ -21,7 +21,21 @@ from ..actors.process import frames
 from ..actors.process.relay import send_signal
 from .life import Life
 from .method import Method
-from .records import Begin, Closed, Restore, Started, ToHome, ToLife, Wanted
+from .records import (
+    Attached,
+    Begin,
+    Closed,
+    Handover,
+    Over,
+    Respec,
+    Restore,
+    Returned,
+    Returning,
+    Started,
+    ToHome,
+    ToLife,
+    Wanted,
+)
 from .turns import StopRecorded
 
 if TYPE_CHECKING:
@@ -36,12 +50,14 @@ class RecordedGuest:
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
         self._ports: dict[str, Port] = {}
+        self.on_handover: Callable[[str, Handover], None] = lambda path, record: None
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
-        return self._port(path).take
+        return self.port_of(path).take
 
-    def _port(self, path: str) -> Port:
+    def port_of(self, path: str) -> Port:
+        """The way home from an address."""
         port = self._ports.get(path)
         if port is None:
             port = self._ports[path] = Port(self._guest, path)
@@ -53,7 +69,7 @@ class RecordedGuest:
         Raises:
             StartFailed: `__init__` or the restoring raised.
         """
-        port = self._port(cell.path)
+        port = self.port_of(cell.path)
         life = Life(cell, port, Method.of(options["method"]), self._guest.page, may_fork=True)
         cell.host = OwnHost(self._guest, life)
         if options.get("trap_exits"):  # It was moved here.
@@ -64,7 +80,7 @@ class RecordedGuest:
     def host_for(self, spec: Any) -> Host:
         """Where a child below this process's supervisor is lived: here; if it is recorded, its home is at the root."""
         if spec.recovery is not None and spec.recovery.records:
-            return InnerLifeHost(self._guest, spec.recovery, self._port)
+            return InnerLifeHost(self._guest, spec.recovery, self.port_of)
         return self._guest.node.here
 
 
@@ -127,6 +143,7 @@ class Port:
         self.on_begin: Callable[[Begin], None] | None = None
         self.on_started: Callable[[Started], None] | None = None
         self.on_closed: Callable[[], None] | None = None
+        self.on_group: Callable[[Over | Respec], None] | None = None  # of lives that are lived at the root
 
     def take(self, frame: frames.Record) -> None:
         """A record from home."""
@@ -141,6 +158,11 @@ class Port:
             case Started():
                 assert self.on_started is not None
                 self.on_started(record)
+            case Over() | Respec():
+                if self.on_group is not None:
+                    self.on_group(record)
+            case Attached() | Returning() | Returned():
+                self._guest.recovery.on_handover(self._path, record)
             case _:
                 if self.life is not None:
                     self.life.from_home(record)
@@ -226,13 +248,31 @@ class InnerLifeHost(LifeHost):
             self._bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
         self._number += 1
         self._up = cell.node.loop.create_future()
-        port = self._port = self._port_of(cell.path)
-        port.on_begin = lambda record: self._begin(cell, record)
-        port.on_started = lambda record: self._started(cell, record)
-        port.on_closed = lambda: self._closed(cell)
+        port = self._port = self._joined(cell)
         kind = message_name(start.kind)
         port.to_home(Wanted(self._number, kind, list(start.kind._topics), self._with_ports(cell), self._bound))
         return self._up
+
+    def _joined(self, cell: Cell) -> Port:
+        """The way home, on which we hear of lives here from now on."""
+        port = self._port_of(cell.path)
+        port.on_begin = lambda record: self._begin(cell, record)
+        port.on_started = lambda record: self._started(cell, record)
+        port.on_closed = lambda: self._closed(cell)
+        return port
+
+    def take_up(self, cell: Cell, life: Life, number: int) -> None:
+        """A life that has come back here is that of the address, as if it had been wanted as `number`."""
+        self._life, self._number, self._port = life, number, self._joined(cell)
+        cell.host, cell.admit = self, self._admit
+
+    def let_go(self) -> Life:
+        """The life that is lived here, which is at rest, is not that of the address any more; its home hears no more."""
+        life, self._life = self._life, None
+        assert life is not None
+        assert self._port is not None
+        self._port.life = self._port.on_closed = None
+        return life
 
     def _with_ports(self, cell: Cell) -> Method:
         """The method; where this actor's bindings lead is known here only."""

@@ -122,10 +122,11 @@ class Begin(msgspec.Struct, array_like=True, tag=6):
 
 
 class Started(msgspec.Struct, array_like=True, tag=7):
-    """The start that was wanted as `number` has come to its end: a good one, or (`problem`) not."""
+    """The start that was wanted as `number` has come to its end: a good one, or (`problem`) not, or it is not wanted."""
 
     number: int
     problem: str = ""
+    is_ignored: bool = False
 
 
 class Kept(msgspec.Struct, array_like=True, tag=8):
@@ -139,7 +140,47 @@ class Kept(msgspec.Struct, array_like=True, tag=8):
     is_full: bool = False
 
 
-ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept
+class Over(msgspec.Struct, array_like=True, tag=9):
+    """The life that was wanted as `number`, which replicas have lived at the root, is over. `Closed` is the answer."""
+
+    number: int
+    reason: dict[str, Any]
+
+
+class Respec(msgspec.Struct, array_like=True, tag=10):
+    """The child has other mechanisms from now on, also in its next lives: the layers as data, none if there are none."""
+
+    layers: list[Any]
+
+
+class Attached(msgspec.Struct, array_like=True, tag=31):
+    """The life, which is at rest, is lived by replicas at the root from now on, as that which was wanted as `number`."""
+
+    number: int
+    layers: list[Any]
+
+
+class Returning(msgspec.Struct, array_like=True, tag=32):
+    """The life that replicas have lived comes back here, with the state that came before: begin it beside the address.
+
+    `turn`, `stash`, `slot`: as of `Begin`.
+    """
+
+    number: int
+    turn: int
+    stash: list[int]
+    slot: int
+    is_suspended: bool
+
+
+class Returned(msgspec.Struct, array_like=True, tag=33):
+    """The life that was begun beside the address is the one, or (not `is_kept`) is not to be."""
+
+    is_kept: bool
+
+
+Handover = Attached | Returning | Returned
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Handover
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------
@@ -220,14 +261,23 @@ class Unsaved(msgspec.Struct, array_like=True, tag=16):
     problem: str
 
 
+class Protected(msgspec.Struct, array_like=True):
+    """What a wanted child that a mechanism protects is made of: its recipe, the layers as data, and its bindings."""
+
+    recipe: bytes
+    layers: list[Any]
+    bindings: dict[str, str]
+
+
 class Wanted(msgspec.Struct, array_like=True, tag=17):
-    """A supervisor in another process wants to start a recorded child, whose home is at the root."""
+    """A supervisor in another process wants to start a recorded or protected child, whose home is at the root."""
 
     number: int
     kind: str
     topics: list[str]
     method: Method
     bound: Bounded | None
+    protected: Protected | None = None
 
 
 class Closed(msgspec.Struct, array_like=True, tag=18):

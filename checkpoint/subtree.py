@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections.abc import Coroutine
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ..actors import links, lives
-from ..actors.cell import DOWN, GONE, RUNNING, Cell
+from ..actors.cell import DOWN, GONE, RUNNING, Cell, Host
 from ..actors.control.calls import Call, send_call
 from ..actors.errors import HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
@@ -32,12 +32,32 @@ if TYPE_CHECKING:
     from .switch import Switch
 
 
+class Lived(Host, Protocol):
+    """The host of a child whose lives are lived at the root, though its supervisor is in another process."""
+
+    def begin(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
+        """Begin the life that its supervisor wants, who hears of it by `port`."""
+        ...
+
+    def closed(self, record: Closed) -> None:
+        """Its supervisor has heard of the end of a life, or gives up its start."""
+        ...
+
+    def lost(self, cell: Cell, reason: ExitReason) -> None:
+        """Its supervisor has died with its process."""
+        ...
+
+
+Protect = Callable[["SubtreeHome", Cell, Wanted, "Lived | None"], Lived]
+"""Gives the host of such a child; the last one, if there was one. Raises HoldfastError: it cannot be had."""
+
+
 class SubtreeHost(ProcessHost):
     """The host of a supervisor with a process of its own, and the keeper of the homes below it."""
 
-    def __init__(self, workers: Workers, limits: Limits | None, homes: Homes) -> None:
+    def __init__(self, workers: Workers, limits: Limits | None, homes: Homes, protect: Protect) -> None:
         super().__init__(workers, limits)
-        self._homes = homes
+        self._homes, self._protect = homes, protect
         self._below: dict[str, SubtreeHome] = {}
 
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
@@ -51,7 +71,7 @@ class SubtreeHost(ProcessHost):
         def taker(path: str) -> frames.TakeRecord:
             home = self._below.get(path)
             if home is None:
-                home = self._below[path] = SubtreeHome(self._homes, path)
+                home = self._below[path] = SubtreeHome(self._homes, path, self._protect)
             return home.joined(cell, worker, slots.of(path))
 
         worker.record_taker = taker
@@ -68,7 +88,7 @@ class SubtreeHost(ProcessHost):
         super().retired(cell)
         for home in reversed(self._below.values()):
             if home.cell is not None:
-                home.restarting = True
+                home.cell.host.told(home.cell, "gone", {"with_parent": True})
                 lives.retire(home.cell, "its supervisor has stopped")
         self._below.clear()
 
@@ -88,10 +108,17 @@ class Slots:
 
 
 class SubtreeHome(HomeHost):
-    """The host of one recorded address below a supervisor in another process."""
+    """The host of one recorded address below a supervisor in another process.
 
-    def __init__(self, homes: Homes, path: str) -> None:
+    Of a child that a mechanism protects the lives are lived at the root: its host is another one, and this only hands
+    it what the supervisor says.
+    """
+
+    def __init__(self, homes: Homes, path: str, protect: Protect) -> None:
         self.homes, self.path = homes, path
+        self._protect = protect
+        self._group: Lived | None = None  # has the lives of a protected child
+        self.arriving: Callable[[ToHome], None] | None = None  # hears a life that is to come back into the process
         self.switch: Switch | None = None
         self.clock = None
         self.recovery = None
@@ -114,9 +141,13 @@ class SubtreeHome(HomeHost):
             return
         if isinstance(record, Wanted):
             self._begin(record)
-        elif isinstance(record, Closed):
-            if self._wanted is not None and record.number == self._wanted.number:
+        elif isinstance(record, Closed) and self.arriving is None:
+            if self._group is not None:
+                self._group.closed(record)
+            elif self._wanted is not None and record.number == self._wanted.number:
                 self._closed(unpack_exit(record.reason), recovers=record.recovers)
+        elif self.arriving is not None:
+            self.arriving(record)
         elif self.switch is not None and self._wanted is not None:
             self.switch.from_life(record)
 
@@ -135,6 +166,10 @@ class SubtreeHome(HomeHost):
         if wanted.bound is not None:
             cell.extra().bound = Bound(wanted.bound.capacity, wanted.bound.overflow)
         port = RemoteLife(self.path, worker)
+        if wanted.protected is not None:
+            self._begin_protected(cell, wanted, port)
+            return
+        self._group, cell.host = None, self
         if not self._slot:
             port.to_life(Started(wanted.number, "its process holds as many recorded actors as it can"))
             return
@@ -151,6 +186,41 @@ class SubtreeHome(HomeHost):
             switch.attach(port)
             self._send_calls(cell, worker)
             self._run(cell, self._follow(cell, wanted, live, recovering))
+
+    # -- lives that are handed over while they are lived ------------------------------------------------------------
+
+    @property
+    def worker(self) -> Worker | None:
+        """The process of the supervisor."""
+        return self._worker
+
+    @property
+    def slot(self) -> int:
+        """The place on the page; 0 if there was none left."""
+        return self._slot
+
+    def hand_over(self, group: Lived) -> Wanted:
+        """The life that its supervisor wants is lived at the root from now on."""
+        wanted, self._wanted, self._group = self._wanted, None, group
+        assert wanted is not None
+        return wanted
+
+    def take_back(self, cell: Cell, wanted: Wanted) -> None:
+        """It is lived in the process again."""
+        self._wanted, self._group, self.clock = wanted, None, None
+        cell.spec = wanted
+
+    # -- lives at the root ------------------------------------------------------------------------------------------
+
+    def _begin_protected(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
+        """A life that is lived at the root."""
+        self._wanted = None
+        try:
+            self._group = self._protect(self, cell, wanted, self._group)
+        except HoldfastError as error:
+            port.to_life(Started(wanted.number, str(error)))
+            return
+        self._group.begin(cell, wanted, port)
 
     def _run(self, cell: Cell, start: Coroutine[Any, Any, None]) -> None:
         self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
@@ -228,7 +298,9 @@ class SubtreeHome(HomeHost):
 
     def lost(self, worker: Worker, reason: ExitReason) -> None:
         """The process is gone, and the life with it."""
-        if worker is self._worker and self._wanted is not None:
+        if worker is self._worker and self._group is not None and self.cell is not None:
+            self._group.lost(self.cell, reason)
+        elif worker is self._worker and self._wanted is not None:
             running = int(worker.page[self._slot]) - 1
             self._closed(reason, running, ordered=reason == KILLED, noticed=worker.noticed_at)
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ..actors import lives
 from ..actors.actor import Start
 from ..actors.cell import DOWN, GONE, RUNNING, Cell
-from ..actors.errors import HoldfastError, StartFailed
+from ..actors.errors import ActorStopped, HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
 from ..checkpoint.homes import Homes, parent_ended, seen
@@ -46,6 +46,8 @@ LED_WITHIN = 60.0
 """Seconds that the first replica may take to take up its state."""
 JOINED_WITHIN = 10.0
 """Seconds that a start waits for another replica to catch up; after that the first one goes on alone."""
+TOLD_WITHIN = 1.0
+"""Seconds until the end of a replica that has said so is known with its reason."""
 FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
 BRICKS_INTENSITY = 100
@@ -93,9 +95,13 @@ class GroupHost(Steered):
             begin_afresh(switch)
         return opened
 
+    def topics(self, cell: Cell) -> Iterable[str]:
+        """Those that the class subscribes to."""
+        start = cell.extra().start
+        return start.kind._topics if start is not None else ()
+
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        start, clock = cell.extra().start, self.clock
-        assert start is not None
+        clock = self.clock
         assert clock is not None
         await self.gate("restart")
         if not self.is_gated:
@@ -106,7 +112,7 @@ class GroupHost(Steered):
         cell.state = RUNNING
         try:
             group = await self.build(cell, switch)
-            self.subscribe(cell, start.kind._topics)
+            self.subscribe(cell, self.topics(cell))
             await self.lead(group, switch)
             clock.mark("restart")
             await self.gate("replay")
@@ -186,11 +192,15 @@ class GroupHost(Steered):
         )
 
     def _replica_start(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> Start[Any]:
-        start = cell.extra().start
-        assert start is not None
         bindings = {port: target.path for port, target in cell.extra().bindings.items()}
         setting = Setting(cell.path, name, config, self.method.data(), bindings, self.detection.interval)
-        return self.replica(setting, start, tuple(layer.describe() for layer in layers))
+        return self.replica(setting, self.recipe(cell), tuple(layer.describe() for layer in layers))
+
+    def recipe(self, cell: Cell) -> Start[Any] | bytes:
+        """How the protected actor begins, or that as bytes."""
+        start = cell.extra().start
+        assert start is not None
+        return start
 
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
@@ -264,7 +274,7 @@ class GroupHost(Steered):
                 )
             await protocol.ask(Lead(group.epoch, group.config), LED_WITHIN)
         except HoldfastError as error:
-            raise StartFailed(group.path, f"{first} cannot lead: {error}") from error
+            raise StartFailed(group.path, f"{first} cannot lead: {await _why(group, first, life, error)}") from error
         group.members[first] = life
         group.primary, group.is_begun = first, True
         group.bind_proxy()
@@ -339,7 +349,11 @@ class GroupHost(Steered):
             self._stop_wanted = reason
             return
         group.is_stopping = True
-        self._ending = cell.node.loop.create_task(self._finish(cell, group, reason), name=f"stop of {cell.path}")
+        self._ending = cell.node.loop.create_task(
+            self._finish(cell, group, reason),
+            name=f"stop of {cell.path}",
+            context=cell.node.base_context.copy(),  # Not in the name of whoever happens to tell us.
+        )
         self._ending.add_done_callback(seen)
 
     async def _finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:
@@ -400,6 +414,12 @@ class GroupHost(Steered):
             return
         if failed is not None:
             reason = KILLED
+        self.life_over(cell, reason, failed, running, noticed, ordered=ordered)
+
+    def life_over(
+        self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int, noticed: float, *, ordered: bool
+    ) -> None:
+        """All replicas have ended: the life at the address is over."""
         self.over(
             cell, running, str(failed or reason), ordered=ordered or running < 0, noticed=noticed, reason=reason
         )  # fmt: skip
@@ -437,8 +457,11 @@ class GroupHost(Steered):
                 if self.group.change is not None:
                     self.group.change.close("it has stopped")
             ftm.kill()
-        start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=parent_ended(cell))
+        self.give_up(cell, self.topics(cell), restarting=self.is_restarting(cell))
+
+    def is_restarting(self, cell: Cell) -> bool:
+        """Whether a retired address may have its supervisor, and so itself, started again."""
+        return parent_ended(cell)
 
     # -- what else a host does --------------------------------------------------------------------------------------
 
@@ -453,7 +476,17 @@ class GroupHost(Steered):
         return -1 if self.group is None else self.group.only_suspect_input()
 
 
-def replica(setting: Setting, start: Start[Any], layers: tuple[Any, ...]) -> Start[Any]:
+async def _why(group: Group, name: str, life: int, error: HoldfastError) -> str:
+    """Why a replica has not done as it was told: if it has ended, it says soon of what."""
+    cell = group.cell_of(name)
+    if not isinstance(error, ActorStopped) or cell is None:
+        return str(error)
+    if group.life_of(name) == life:
+        await asyncio.wait((cell.ended(),), timeout=TOLD_WITHIN)
+    return str(cell.extra().reason)
+
+
+def replica(setting: Setting, start: Start[Any] | bytes, layers: tuple[Any, ...]) -> Start[Any]:
     """The recipe of a replica."""
     from .replica import Replica
 

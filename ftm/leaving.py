@@ -40,6 +40,7 @@ from ..checkpoint.switch import Switch
 from .host import GroupHost
 from .orders import Export
 from .steering import AGAIN_AFTER
+from .subtree import SubtreeGroup
 from .unkept import is_unkept
 
 EXPORTED_WITHIN = 5.0
@@ -328,6 +329,13 @@ def from_group(cell: Cell, host: Host, timeout: float) -> FromGroup:
         CannotMove: it is being recovered.
     """
     old = cell.host
+    if isinstance(old, SubtreeGroup):
+        if is_unkept(old.method):
+            why = "its supervisor lives in another process, and it is not recorded: its life cannot go back there"
+            raise CannotMove(cell.path, f"{why}; stop it, and start it without mechanism=...")
+        from .handing_over import IntoSubtree
+
+        return IntoSubtree(cell, timeout)
     if isinstance(old, GroupHost) and is_unkept(old.method):
         return ToPlainTask(cell, host, timeout)
     return ToRecordedTask(cell, host, timeout)

@@ -86,6 +86,8 @@ class Description(msgspec.Struct, array_like=True, frozen=True):
 class Mechanism:
     """Base of all mechanisms. Derive a frozen dataclass, and set the class attributes."""
 
+    revived_by: ClassVar[str] = f"{__name__}:revive"
+    """In the recipe of a subtree it travels as its description."""
     name: ClassVar[str] = ""
     replicas: ClassVar[int] = 1
     tolerates: ClassVar[frozenset[str]] = frozenset()

@@ -31,11 +31,13 @@ from ..actors.mail import Item
 from ..actors.mailbox import Bound
 from ..actors.message import message_name
 from ..actors.process.mover import Move
+from ..actors.process.relay import OutsideHost
 from ..checkpoint.controller import TaskHost
 from ..checkpoint.keys import save_state
 from ..checkpoint.moving import Detached, refuse_unsaved
 from ..checkpoint.records import MESSAGE, TICK, Live
 from ..checkpoint.saved import meta_now
+from ..checkpoint.subtree import SubtreeHome
 from ..checkpoint.switch import Switch
 from ..checkpoint.turns import StopRecorded
 from .group import Group, Look
@@ -253,6 +255,15 @@ def to_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> ToGrou
     old = cell.host
     if isinstance(old, TaskHost):
         return ToGroup(cell, GroupHost(homes, old.method, mechanism), timeout)
+    if isinstance(old, SubtreeHome):
+        from .handing_over import OutOfSubtree
+
+        return OutOfSubtree(cell, old, mechanism, timeout)
+    if isinstance(old, OutsideHost):
+        why = (
+            "it lives in the process of its supervisor, and is not recorded: give it recovery=..., or stop it and start"
+        )
+        raise CannotMove(cell.path, f"{why} it with mechanism=...")
     if old is not LOCAL:
         raise CannotMove(cell.path, "only an actor that lives as a task can be given a mechanism")
     return ToGroup(cell, GroupHost(homes, None, mechanism), timeout)

@@ -17,6 +17,7 @@ from ..actors.errors import HoldfastError, type_name
 from ..actors.events import ActorStarted
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.message import Message
+from ..actors.process.recipe import unpack_recipe
 from ..checkpoint.method import Method
 from ..supervision.children import Child, new_cell
 from ..supervision.spec import Flags, Plan, child
@@ -172,8 +173,12 @@ class Woven:
 class Replica(Supervisor):
     """One of the lives of a protected actor, with the bricks around it. The crash of any brick is its end."""
 
-    def __init__(self, setting: Setting, start: Start[Any], layers: tuple[Mechanism | Description, ...]) -> None:
+    def __init__(
+        self, setting: Setting, start: Start[Any] | bytes, layers: tuple[Mechanism | Description, ...]
+    ) -> None:
         super().__init__(Flags("one_for_all", intensity=0), ())
+        if isinstance(start, bytes):  # The root has not looked into it: it is from an actor process.
+            start = unpack_recipe(start)
         self._setting, self._recipe = setting, start
         made = tuple(one if isinstance(one, Mechanism) else revive(one) for one in layers)
         for one in made:

@@ -108,8 +108,6 @@ def check_subtree(where: str, specs: Iterable[ChildSpec]) -> None:
     for spec in everything(specs):
         if spec.isolation == "process":
             raise SpecError(where, "a subtree in a process cannot hold process children: its own is theirs")
-        if spec.mechanism is not None:
-            raise SpecError(where, "a subtree in a process cannot hold protected children: replicas have processes")
 
 
 def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:

@@ -34,7 +34,7 @@ def replace_place(cell: Cell, spec: ChildSpec) -> None:
 
 def replace_mechanism(cell: Cell, spec: ChildSpec) -> None:
     """The next lives at `cell` are protected as `spec` says, and live where it says."""
-    if cell.spec is not None and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
+    if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
         spec = dataclasses.replace(spec, start=cell.spec.start)
     _change(
         cell,
@@ -73,6 +73,31 @@ def rebuilt(start: Start[Any], names: list[str], change: Change) -> Start[Any]:
     flags, specs = start.args
     changed = tuple(_changed(spec, names, change) for spec in specs)
     return Start(start.kind, (flags, changed), start.kwargs)
+
+
+def spec_below(start: Start[Any], names: list[str]) -> ChildSpec | None:
+    """What the recipe of a supervisor says of the descendant at `names`; None if nothing."""
+    spec: ChildSpec | None = None
+    for name in names:
+        if not issubclass(start.kind, Supervisor) or len(start.args) != 2 or not isinstance(start.args[1], tuple):
+            return None
+        spec = next((one for one in start.args[1] if one.id == name), None)
+        if spec is None:
+            return None
+        start = spec.start
+    return spec
+
+
+def recipe_spec(cell: Cell) -> ChildSpec | None:
+    """What the nearest recipe above says of a child, of one whose supervisor lives elsewhere; None if nothing."""
+    names, at = [cell.name], cell.parent
+    while at is not None:
+        start = at.more.start if at.more is not None else None
+        spec = None if start is None else spec_below(start, names)
+        if spec is not None:
+            return spec
+        names, at = [at.name, *names], at.parent
+    return None
 
 
 def _changed(spec: ChildSpec, names: list[str], change: Change) -> ChildSpec:

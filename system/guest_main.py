@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import asyncio
+import functools
 import socket
+from typing import Any, cast
 
-from ..actors.cell import Cell
+from ..actors.cell import Cell, Host
 from ..actors.process import frames, guest
 from ..checkpoint.file import RecoveryFile
 from ..checkpoint.guest import GuestKeeper, RecordedGuest
+from ..checkpoint.records import Handover
 from ..supervision.respec import respec
 
 
@@ -21,7 +24,24 @@ def prepare(host: guest.Guest) -> None:
     """Before the root's first frame: a recorded life may get its state before it is launched."""
     host.recovery = RecordedGuest(host)
     host.node.respec = respec
-    host.node.host_for = host.recovery.host_for
+    host.recovery.on_handover = functools.partial(handed_over, host)
+    host.node.host_for = functools.partial(host_for, host)
+
+
+def host_for(host: guest.Guest, spec: Any) -> Host:
+    """Where a child below this process's supervisor is lived."""
+    if spec.mechanism is None:
+        return cast("Host", host.recovery.host_for(spec))
+    from ..ftm.inner import InnerGroupHost  # Most processes protect nobody.
+
+    return InnerGroupHost(host, spec, host.recovery.port_of)
+
+
+def handed_over(host: guest.Guest, path: str, record: Handover) -> None:
+    """A live child of this process's supervisor gets a mechanism, or loses it."""
+    from ..ftm.inner import take
+
+    take(host, path, record)
 
 
 def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:

@@ -24,7 +24,7 @@ from ..actors.process.workers import Workers
 from ..actors.ref import current
 from ..checkpoint.controller import RecordedProcessHost, TaskHost
 from ..checkpoint.moving import RecordedToProcess, RecordedToTask
-from ..supervision.respec import replace_mechanism, replace_place
+from ..supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
 
@@ -106,7 +106,7 @@ class Moves:
         from ..ftm.events import MechanismAttached
         from ..ftm.moving import to_group
 
-        before: ChildSpec = cell.spec
+        before = _spec_of(cell)
         wanted = dataclasses.replace(before, mechanism=mechanism)
         if place_of(cell) == "process":
             await self._settle_in(cell, "task", before.limits, timeout)
@@ -252,6 +252,14 @@ def check_isolation(isolation: object, limits: object, timeout: object) -> None:
         raise SpecError("set_isolation", f"limits must be Limits(...), of a process, or left out, not {limits!r}")
     if not isinstance(timeout, (int, float)) or isinstance(timeout, bool) or not 0 < timeout < float("inf"):
         raise SpecError("set_isolation", f"timeout must be a number of seconds > 0, not {timeout!r}")
+
+
+def _spec_of(cell: Cell) -> ChildSpec:
+    """The spec of a child, also if its supervisor lives in another process. Raises CannotMove: it is not known."""
+    spec = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
+    if spec is None:
+        raise CannotMove(cell.path, "nobody restarts it, so nobody knows how; start it as a child of a supervisor")
+    return spec
 
 
 def place_of(cell: Cell) -> Isolation:

@@ -7,6 +7,7 @@ dies in the middle of one leaves everything as it was. Another note says what wa
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ import msgspec
 
 from ..actors.errors import SpecError
 from ..actors.events import Event
+from ..supervision.respec import rebuilt, spec_below
 
 if TYPE_CHECKING:
     from ..checkpoint.homes import Homes
@@ -59,6 +61,8 @@ class Protection:
         Raises:
             SpecError: that mechanism cannot be had any more.
         """
+        if spec.is_supervisor and spec.isolation == "process":
+            spec = self._completed_below(spec, address)
         if address not in self._loaded:
             return spec
         from ..ftm.mechanism import Description, MechanismRefused, revive
@@ -74,6 +78,17 @@ class Protection:
             raise SpecError(address, f"the mechanism that it had cannot be had any more: {error}") from error
         mechanism = None if not layers else layers[0] if len(layers) == 1 else layers
         return dataclasses.replace(spec, mechanism=mechanism)
+
+    def _completed_below(self, spec: ChildSpec, address: str) -> ChildSpec:
+        """The same for all that its process will start, which does not ask here."""
+        above = f"{address}/"
+        for path in [path for path in self._loaded if path.startswith(above)]:
+            names = path.removeprefix(above).split("/")
+            child = spec_below(spec.start, names)
+            if child is not None:
+                other = self._completed(child, path)
+                spec = dataclasses.replace(spec, start=rebuilt(spec.start, names, functools.partial(_instead, other)))
+        return spec
 
     def put(self, address: str, before: Any, after: Any) -> None:
         """The address has another mechanism from now on; kept with all others by the next `flush`."""
@@ -105,6 +120,10 @@ class Protection:
         """It is over, either way."""
         if UNDER_WAY + address in self._homes.notes(UNDER_WAY + address):
             self._homes.note(UNDER_WAY + address, None)
+
+
+def _instead(other: ChildSpec, spec: ChildSpec) -> ChildSpec:
+    return other
 
 
 def _data(mechanism: Any) -> Any:

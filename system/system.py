@@ -29,9 +29,10 @@ from ..checkpoint.file import RecoveryFile, load_recovery
 from ..checkpoint.homes import Homes
 from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
+from ..checkpoint.records import Wanted
 from ..checkpoint.recovery.settings import RecoveryHooks
 from ..checkpoint.stores import check_durability, open_journal
-from ..checkpoint.subtree import SubtreeHost
+from ..checkpoint.subtree import Lived, SubtreeHome, SubtreeHost
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
@@ -221,7 +222,7 @@ class ActorSystem(Recorded, Controls):
             if spec.recovery is not None and spec.recovery.records:
                 return RecordedProcessHost(self._workers, spec.limits, self._homes, spec.recovery)
             if spec.is_supervisor:
-                return SubtreeHost(self._workers, spec.limits, self._homes)
+                return SubtreeHost(self._workers, spec.limits, self._homes, self._protect)
             return ProcessHost(self._workers, spec.limits)
         if spec.recovery is not None and spec.recovery.records:
             return TaskHost(self._homes, spec.recovery)
@@ -244,6 +245,20 @@ class ActorSystem(Recorded, Controls):
             self._workers.want(name)
         recovery = spec.recovery
         return GroupHost(self._homes, recovery if recovery is not None and recovery.records else None, spec.mechanism)
+
+    def _protect(self, place: SubtreeHome, cell: Cell, wanted: Wanted, before: Lived | None) -> Lived:
+        """The host of a protected child whose supervisor is in another process.
+
+        Raises:
+            MechanismRefused: its mechanisms cannot be had here, or do not go together.
+        """
+        from ..ftm.mechanism import COMMON
+        from ..ftm.subtree import subtree_group
+
+        group = subtree_group(place, cell, wanted, before)
+        for name in (REPLICA, *COMMON):
+            self._workers.want(name)
+        return group
 
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""

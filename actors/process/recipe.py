@@ -32,6 +32,14 @@ class _PackedData:
     fields: dict[str, Any]
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Described:
+    """An object that describes itself: what makes it again, and from what."""
+
+    by: str
+    description: Any
+
+
 def pack_recipe(start: Start[Any], where: str) -> bytes:
     """The recipe as bytes.
 
@@ -83,6 +91,9 @@ def _lower(value: Any, where: str) -> Any:
         return type(value)(_lower(inner, where) for inner in value)
     if type(value) is dict:
         return {key: _lower(inner, where) for key, inner in value.items()}
+    by = getattr(type(value), "revived_by", None)
+    if by is not None:
+        return _Described(by, value.describe())
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
         if any(isinstance(inner, Start) for inner in fields.values()):
@@ -97,6 +108,8 @@ def _raise_up(value: Any) -> Any:
         return Start(_find(value.kind, Actor), _raise_up(value.args), _raise_up(value.kwargs))
     if isinstance(value, _PackedData):
         return _find(value.kind, object)(**_raise_up(value.fields))
+    if isinstance(value, _Described):
+        return _named(value.by)(value.description)
     if type(value) in (list, tuple):
         return type(value)(_raise_up(inner) for inner in value)
     if type(value) is dict:
@@ -115,6 +128,16 @@ def loaded(name: str, base: type[T]) -> type[T] | None:
 
 def _find(name: str, base: type) -> type[Any]:
     """The class with this name, if it is of the expected kind."""
+    found = _named(name)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise SpecError("recipe", f"{name} is no {base.__name__}")
+    if base is object and not dataclasses.is_dataclass(found):
+        raise SpecError("recipe", f"{name} is no dataclass")
+    return found
+
+
+def _named(name: str) -> Any:
+    """What has this name."""
     module_name, _, path = name.partition(":")
     try:
         found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)
@@ -122,8 +145,4 @@ def _find(name: str, base: type) -> type[Any]:
             found = getattr(found, part)
     except Exception as error:  # Importing a module runs it: it may raise anything.
         raise SpecError("recipe", f"{name} cannot be imported: {error}") from error
-    if not (isinstance(found, type) and issubclass(found, base)):
-        raise SpecError("recipe", f"{name} is no {base.__name__}")
-    if base is object and not dataclasses.is_dataclass(found):
-        raise SpecError("recipe", f"{name} is no dataclass")
     return found

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.cell import Cell
 from ...supervision.arbiter import Grant, Hand, arbiter_of
+from ...supervision.respec import recipe_spec
 from .draft import Draft, Place, Target, is_elsewhere, rules
 from .living import OnLiving
 from .operation import wrong
@@ -21,6 +22,8 @@ PROTECT_TIMEOUT = 60.0
 
 class OnProtection(OnLiving):
     """Base: the way in and the way out, each of which undoes the other."""
+
+    _carries: ClassVar[bool] = True  # the life goes to another place
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)
@@ -38,9 +41,22 @@ class OnProtection(OnLiving):
         assert place is not None
         above = place.parent
         if above is not None and above.cell is not None and is_elsewhere(above.cell):
-            raise wrong(self.target, "its supervisor lives in another process, which cannot have processes of its own")
+            self._check_below(place)
         if place.spec is None:
             raise wrong(self.target, "nobody supervises it, so nobody would start it again")
+
+    def _check_below(self, place: Place) -> None:
+        """Whether it can be done below a supervisor that lives in another process. Raises SpecError."""
+        cell = place.cell
+        if place.spec is None and cell is not None:
+            place.spec = recipe_spec(cell)
+        if place.spec is None:
+            why = "its supervisor lives in another process, and no recipe here has its spec: add it by a transaction"
+            raise wrong(self.target, why)
+        recovery = place.spec.recovery
+        if self._carries and (recovery is None or not recovery.records):
+            why = "its supervisor lives in another process, and it is not recorded: give it recovery=..., or stop it"
+            raise wrong(self.target, f"{why} and add it again with the mechanism that it is to have")
 
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
         """Change it; whoever is cancelled gives up waiting, the change comes to its end."""
@@ -63,7 +79,7 @@ class OnProtection(OnLiving):
                 if not self._under_way.cancelled():
                     self._under_way.exception()
             cell = self.cell(system)
-            if described(cell.spec.mechanism) != described(self._before):  # Else it stayed as it was.
+            if described(mechanism_of(cell)) != described(self._before):  # Else it stayed as it was.
                 await self._run(system, cell, self._before)
             system.protection.over(self.target)
         finally:
@@ -81,7 +97,7 @@ class OnProtection(OnLiving):
     async def do(self, system: ActorSystem) -> None:
         cell = self.cell(system)
         self._grant = arbiter_of(system.node).claim(self.target, Hand.ADAPTATION, self.text)
-        self._before, self._has_begun = cell.spec.mechanism, True
+        self._before, self._has_begun = mechanism_of(cell), True
         system.protection.begun(self.target, self.text)
         await self._run(system, cell, self._after)
 
@@ -89,7 +105,7 @@ class OnProtection(OnLiving):
         place = self._place  # With what all steps have made of it.
         assert place is not None
         assert place.spec is not None
-        if described(self.cell(system).spec.mechanism) != described(place.spec.mechanism):
+        if described(mechanism_of(self.cell(system))) != described(place.spec.mechanism):
             raise wrong(self.target, "its mechanism is another one again")
 
     def seal(self, system: ActorSystem) -> None:
@@ -152,6 +168,8 @@ class Detach(OnProtection):
 
 class Adapt(OnProtection):
     """Base: a protected actor goes on with another stack of mechanisms; its replicas live on."""
+
+    _carries: ClassVar[bool] = False
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)
@@ -272,6 +290,11 @@ class Update(Adapt):
     def _wanted(self, before: Any) -> tuple[Any, ...]:
         layers: tuple[Any, ...] = rules().updated(before, self._brick, self._new, mechanism=self._of, role=self._role)
         return layers
+
+
+def mechanism_of(cell: Cell) -> Any:
+    """The mechanism that a live child has; None if it has none."""
+    return getattr(cell.spec, "mechanism", None)  # One that lives elsewhere has no spec here.
 
 
 def described(mechanism: Any) -> Any:

@@ -227,11 +227,11 @@ async def all_again(ref: hf.ActorRef[Any]) -> Stack:
 # -- elsewhere --------------------------------------------------------------------------------------------------------
 
 
-async def test_in_a_subtree_with_a_process_of_its_own_it_is_refused_with_the_reason(system: hf.ActorSystem) -> None:
-    """Its replicas would need processes, and a process there is the child of another one."""
+async def test_in_a_subtree_without_recovery_it_is_refused_with_the_reason(system: hf.ActorSystem) -> None:
+    """Its state is not at home, and does not come out of the process of its supervisor."""
     far = hf.supervisor("far", isolation="process", children=[hf.child("alice", hf.start(Counter))])
     await system.start(far)
-    why = "its supervisor lives in another process, which cannot have processes of its own"
+    why = "its supervisor lives in another process, and it is not recorded: give it recovery="
     with pytest.raises(hf.TransactionRefused, match=why):
         async with system.transaction() as change:
             change.attach("/app/far/alice", hf.PBR())
