@@ -292,7 +292,14 @@ class ActorContext:
         return cast("ActorRef[A]", self.cell.node.spawn(start, name, parent=self.cell).ref)
 
     def find(self, path: str, kind: type[A]) -> ActorRef[A]:
-        """A ref to the actor at `path`. Raises NoSuchActor or WrongActor."""
+        """A ref to the actor at `path`.
+
+        In a turn of a recorded actor it is one to the address, whether somebody lives there or not: a replay must go
+        the same way again, when perhaps nobody does.
+
+        Raises:
+            NoSuchActor: nobody lives there. WrongActor: another class does.
+        """
         return self.cell.node.find_ref(path, kind)
 
     @property

@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..actors import mailbox
+from ..actors.actor import Actor
 from ..actors.cell import Cell
 from ..actors.context import ActorContext, StashError
 from ..actors.errors import ControlFailed, HoldfastError, remote_crash
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 R = TypeVar("R")
+A = TypeVar("A", bound=Actor)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,6 +106,14 @@ class RecordedContext(ActorContext):
             when = 0.0 if life.feed is None else life.feed.time
             self._random = random.Random(f"{self.path}|{life.turn}|{when}")
         return self._random
+
+    def find(self, path: str, kind: type[A]) -> ActorRef[A]:
+        """A ref to the address, whoever lives there: under replay somebody else, or nobody yet (T21)."""
+        if not self.in_turn():
+            return super().find(path, kind)
+        node = self.cell.node
+        cell = node.cell_at(path)
+        return ActorRef(cell) if cell.is_dead else node.find_ref(path, kind)
 
     # -- sending ----------------------------------------------------------------------------------------------------
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from ..actors.errors import HoldfastError, SpecError
 from ..actors.ref import ActorRef
 from ..checkpoint.homes import Homes
 from ..checkpoint.quarantine import QuarantinedMessage
-from ..supervision.admin import RestartChild, TerminateChild
+from ..supervision.admin import RestartChild, TerminateChild, WhichChildren
 from ..supervision.supervisor import Supervisor
 
 
@@ -47,17 +48,24 @@ class Recorded:
         """
         self.homes.quarantine.drop(message)
 
-    async def checkpoint_group(self, actors: Sequence[ActorRef[Any]], *, name: str) -> None:
+    async def checkpoint_group(self, actors: Sequence[ActorRef[Any] | str], *, name: str) -> None:
         """Keep one consistent cut of several recorded actors: their states, and the messages between them (R78).
 
         It takes the place of an older one of that name. With a store it is kept over restarts of the root, and as safe
         as its `durability` says when this returns.
 
+        Args:
+            actors: refs or paths.
+            name: of the snapshot.
+
         Raises:
-            HoldfastError: one of them is not recorded, or the store refused.
+            SpecError: there is no actor, or no name. HoldfastError: one of them is not recorded, or the store refused.
         """
         homes = self.homes
-        homes.groups.take(name, [actor.path for actor in actors])
+        paths = list(dict.fromkeys(actor.path if isinstance(actor, ActorRef) else actor for actor in actors))
+        if not paths or not isinstance(name, str) or not name:
+            raise SpecError("checkpoint_group", f"needs actors and a name, not {paths} and {name!r}")
+        homes.groups.take(name, paths)
         await homes.synced()
 
     def group_snapshots(self) -> list[str]:
@@ -76,30 +84,56 @@ class Recorded:
     async def restore_group(self, name: str, *, timeout: float = 60.0) -> None:
         """Bring all actors of a group snapshot back to it, with the messages that were under way between them.
 
-        They are stopped, last named first, and started again, first named first; messages to them meanwhile, and all
-        that they did since the cut, do not count: asks that wait fail with ActorStopped. What they have sent to others
-        since is not called back.
+        They are stopped and started again in the order of their supervisors; messages to them meanwhile, and all that
+        they did since the cut, do not count: asks that wait fail with ActorStopped. What they have sent to others since
+        is not called back.
 
         Raises:
             NoSuchGroup: there is none of that name. HoldfastError: an actor could not be stopped or started by its
-                supervisor, or the store refused.
+                supervisor (the others are started all the same), or the store refused.
         """
         groups = self.homes.groups
+        members = groups.members(name)
         living: list[tuple[ActorRef[Supervisor], str]] = []
-        for path in groups.members(name):
-            home = self.homes.at(path)
-            cell = None if home is None else home.cell
-            if cell is None or cell.is_dead:
-                continue  # Whoever starts it finds it as it was.
+        for path in await self._in_start_order([path for path in members if self._is_living(path)], timeout):
             above, _, child = path.rpartition("/")
-            living.append((ActorRef[Supervisor](cell.node.cell_at(above)), child))
+            living.append((ActorRef[Supervisor](self.homes.node.cell_at(above)), child))
         for supervisor, child in reversed(living):
             await supervisor.ask(TerminateChild(child), timeout)
         groups.replace(name)
-        members = groups.members(name)
         groups.wait(members)
+        problems: list[HoldfastError] = []
         try:
             for supervisor, child in living:
-                await supervisor.ask(RestartChild(child), timeout)
+                try:
+                    await supervisor.ask(RestartChild(child), timeout)
+                except HoldfastError as error:
+                    problems.append(error)
         finally:
             groups.let_go(members)
+        if problems:
+            raise problems[0]
+
+    def _is_living(self, path: str) -> bool:
+        """Whether it has to be stopped; else whoever starts it finds it as it was."""
+        home = self.homes.at(path)
+        return home is not None and home.cell is not None and not home.cell.is_dead
+
+    async def _in_start_order(self, paths: Sequence[str], timeout: float) -> list[str]:
+        """As their supervisors would start them: a binding wants its target to be there."""
+        places: dict[str, int] = {}
+        for above in {above for path in paths for above in _ancestors(path)}:
+            supervisor = ActorRef[Supervisor](self.homes.node.cell_at(above))
+            children = await supervisor.ask(WhichChildren(), timeout)
+            places.update((f"{above}/{child.id}", place) for place, child in enumerate(children))
+        return sorted(paths, key=lambda path: [places[one] for one in (*_ancestors(path)[1:], path)])
+
+
+def _ancestors(path: str) -> list[str]:
+    """The addresses above one, from the root down.
+
+    >>> _ancestors("/app/lab/cell")
+    ['/app', '/app/lab']
+    """
+    names = path.split("/")
+    return ["/".join(names[:length]) for length in range(2, len(names))]

@@ -178,6 +178,33 @@ async def test_what_is_not_wanted_any_more_is_forgotten_for_good(store: str | No
             await system.restore_group("a")
 
 
+class Left(hf.Actor):
+    right: hf.Binding[Doer]
+
+    @hf.on(Note)
+    def note(self, message: Note) -> int:
+        self.right.tell(message)
+        return 0
+
+
+async def test_members_with_bindings_are_started_as_their_supervisors_do(
+    system: hf.ActorSystem, isolation: str
+) -> None:
+    right = await start(system, isolation, "right", hf.start(Doer), recovery=RECOVERY)
+    left = await system.start(
+        hf.child("left", hf.start(Left), bindings={"right": right.path}, recovery=RECOVERY),
+    )
+    await left.ask(Note("a"))
+    assert await right.ask(Seen()) == ["a"]
+    await system.checkpoint_group([left, right.path, left], name="cut")
+    await left.ask(Note("b"))
+    assert await right.ask(Seen()) == ["a", "b"]
+    await system.restore_group("cut")
+    assert await right.ask(Seen(), timeout=20.0) == ["a"]
+    await left.ask(Note("c"), timeout=20.0)
+    assert await right.ask(Seen()) == ["a", "c"]
+
+
 class Mortal:
     """An engine whose process dies before its n-th writing call."""
 
@@ -205,3 +232,6 @@ async def test_what_cannot_be_done_is_said(system: hf.ActorSystem) -> None:
         await system.checkpoint_group([plain], name="x")
     with pytest.raises(hf.NoSuchGroup, match="'x'"):
         await system.restore_group("x")
+    for actors, name in (([], "x"), ([plain], "")):
+        with pytest.raises(hf.SpecError, match="needs actors and a name"):
+            await system.checkpoint_group(actors, name=name)
