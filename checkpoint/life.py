@@ -28,6 +28,7 @@ from .records import (
     FAILED,
     OK,
     REPLY,
+    START,
     STASHED,
     Answer,
     Begin,
@@ -254,8 +255,8 @@ class Life:
             return
         self.outs = []
         self.in_hook = True  # What is left is `on_stop`.
-        crash = remote_crash(error)
-        self.close_turn(FAILED, self.answer_error(crash) if feed.is_ask else Answer())
+        is_heard = feed.is_ask or feed.kind == START  # The start of a protected actor tells it.
+        self.close_turn(FAILED, self.answer_error(remote_crash(error)) if is_heard else Answer())
 
     def answer_error(self, error: BaseException) -> Answer:
         """An error as the asker will get it."""

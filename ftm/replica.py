@@ -15,7 +15,7 @@ from ..actors.bindings import Binding
 from ..actors.cell import Cell
 from ..actors.errors import HoldfastError, type_name
 from ..actors.events import ActorStarted
-from ..actors.exits import SHUTDOWN, ExitReason
+from ..actors.exits import SHUTDOWN, ExitReason, Shutdown
 from ..actors.message import Message
 from ..actors.process.recipe import unpack_recipe
 from ..checkpoint.method import Method
@@ -229,6 +229,9 @@ class Replica(Supervisor):
         if cell.name == SERVER or isinstance(cell.host, Server):
             return None
         return super().child_exited(cell, life, reason)
+
+    def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
+        super()._give_up(one, reason, Shutdown(f"its {one.spec.id} has ended: {reason}"))
 
     def _cell(self, name: str) -> Cell:
         cell = self._children[name].cell

@@ -17,7 +17,7 @@ import msgspec
 from ..actors import lives
 from ..actors.actor import Actor, Start
 from ..actors.cell import Cell
-from ..actors.errors import HoldfastError
+from ..actors.errors import HoldfastError, type_name
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.values import decode_value, state_digest
 from ..checkpoint.records import (
@@ -165,8 +165,8 @@ class Shadow(Server):
                 ends, state = await self._run(before, requests)
         except TimeoutError:
             self._why = f"it has not come to an end within {self._within} s"
-        except HoldfastError as error:
-            self._why = str(error)
+        except Exception as error:  # What the user's own values and methods raise when the state is captured.
+            self._why = str(error) or type_name(type(error))
         if self._why:
             await self.drop_life()
             self.point = None

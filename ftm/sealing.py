@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections import deque
 from typing import TYPE_CHECKING
 
-from ..checkpoint.records import FAILED, Answer, TurnEnd
 from .alarms import ProtectionLost
 
 if TYPE_CHECKING:
+    from ..checkpoint.records import TurnEnd
     from .messages import Request
     from .server import Server
 
@@ -51,8 +51,5 @@ async def _find(server: Server, ends: list[TurnEnd], error: Exception) -> None:
     """If only one turn can have done it, that one fails; else they are run again, one by one."""
     begun, life = server.begun, server.life
     if len(begun) == 1 and life is not None and life.cell.actor is not None:
-        end = ends[-1]
-        codec = life.cell.node.codec
-        answer = Answer(*codec.encode_error(error)) if begun[0].feed.is_ask else Answer()
-        server._skips[end.id] = TurnEnd(end.turn, end.id, FAILED, [], answer)
+        server.fail(begun[0], ends[-1], error)
     await server.drop_life()

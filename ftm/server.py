@@ -22,6 +22,7 @@ from ..checkpoint.keys import save_state
 from ..checkpoint.records import (
     FAILED,
     START,
+    Answer,
     Closed,
     Feed,
     Go,
@@ -349,10 +350,24 @@ class Server(Points):
             self._is_again = False
         if self.life is None and not self.is_over:
             await self._begin()
+        skips = dict(self._skips)
         self._skips.clear()
-        state = self.capture()
+        try:
+            state = self.capture()
+        except Exception as error:  # What the user's own values and methods raise: as in `sealed`.
+            if len(requests) != 1 or len(ends) != 1 or skips:
+                raise
+            self.fail(requests[0], ends[0], error)
+            await self.drop_life()
+            return await self.again(before, requests)
         self.previous = previous
         return ends, state
+
+    def fail(self, request: Request, end: TurnEnd, error: Exception) -> None:
+        """This turn has left what is no state: run again, it fails."""
+        codec = self.standing.node.codec
+        answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()
+        self._skips[end.id] = TurnEnd(end.turn, end.id, FAILED, [], answer)
 
     async def adopt(self, state: State) -> None:
         """Go on from this state, with a life of its own; what led to it has happened elsewhere."""

@@ -30,7 +30,8 @@ def tree_from(mapping: Mapping[str, Any], where: str = "tree") -> ChildSpec:
     A table is a child (`id`, `start = "package.module:Class"`, `args`, `kwargs`, and the options of `child`), or a
     supervisor (`name`, `children` and the options of `supervisor`; with `kind = "dynamic"` or `"partitions"` those of
     `dynamic` and `partitions`, whose `template` and `copy` are tables too). `recovery` is a table with `use`, the name
-    of a method such as `"holdfast:hybrid"`, and its options.
+    of a method such as `"holdfast:hybrid"`, and its options; `mechanism` is one with `use` = `"holdfast:PBR"`, or a
+    list of such, outermost first.
 
     Args:
         mapping: the table of the top supervisor.
@@ -107,15 +108,23 @@ def _options(table: dict[str, Any], where: str) -> dict[str, Any]:
         "backoff": lambda value, at: _call(Backoff, _table(value, at), at),
         "limits": lambda value, at: _call(Limits, _table(value, at), at),
         "mailbox": lambda value, at: _call(bounded, _table(value, at), at),
-        "recovery": _recovery,
+        "mechanism": _mechanism,
+        "recovery": _used,
         "rules": _rules,
     }
     return {key: made[key](value, f"{where}.{key}") if key in made else value for key, value in table.items()}
 
 
-def _recovery(value: object, where: str) -> Any:
+def _used(value: object, where: str) -> Any:
+    """What `use` names, made with the other options."""
     table = _table(value, where)
     return _call(_named(table.pop("use", None), f"{where}.use"), table, where)
+
+
+def _mechanism(value: object, where: str) -> Any:
+    if isinstance(value, Mapping):
+        return _used(value, where)
+    return tuple(_used(one, f"{where}[{index}]") for index, one in enumerate(_list(value, where)))
 
 
 def _rules(value: object, where: str) -> list[Any]:

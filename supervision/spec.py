@@ -318,7 +318,9 @@ def check_mechanism(where: str, mechanism: Any, kind: type[Actor], *, is_supervi
     layers = mechanism if isinstance(mechanism, tuple) else (mechanism,)
     for layer in layers:
         if isinstance(layer, type) or not hasattr(layer, "check") or not hasattr(layer, "replicas"):
-            raise SpecError(where, f"mechanism must be one such as PBR(), a tuple of them or left out, not {layer!r}")
+            hint = "; a class by its name is `find(name)` of `holdfast.ftm.mechanism`" if isinstance(layer, str) else ""
+            problem = f"mechanism must be one such as PBR(), a tuple of them or left out, not {layer!r}{hint}"
+            raise SpecError(where, problem)
         layer.check(kind, where)
     if not layers:
         raise SpecError(where, "mechanism must not be empty: leave it out")

@@ -18,6 +18,7 @@ from ..actors.events import Event
 from ..supervision.respec import rebuilt, spec_below
 
 if TYPE_CHECKING:
+    from ..actors.cell import Cell
     from ..checkpoint.homes import Homes
     from ..supervision.spec import ChildSpec
 
@@ -25,6 +26,21 @@ KEPT = "mechanisms"
 """The note with what there is."""
 UNDER_WAY = "adapting "
 """How the notes begin that say at which address a change was under way."""
+
+
+def part_of(address: str) -> str:
+    """Why something is not done to what the mechanism of this address has below it."""
+    how = "attach, detach, compose, transition or update"
+    return f"it is a part of the mechanism of {address}, whose replicas must stay alike: change that by {how}"
+
+
+def check_no_part(cell: Cell) -> None:
+    """Whether an actor is not what a mechanism has below the address that it protects. Raises SpecError."""
+    above = cell.parent
+    while above is not None:
+        if getattr(above.spec, "mechanism", None) is not None:
+            raise SpecError(cell.path, part_of(above.path))
+        above = above.parent
 
 
 class AdaptationUndone(Event, frozen=True, eq=False):

@@ -40,7 +40,7 @@ from ..supervision.supervisor import Supervisor
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
-from .protection import Protection
+from .protection import Protection, check_no_part
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
@@ -315,7 +315,11 @@ class ActorSystem(Recorded, Controls):
             deadline: seconds that draining may take.
 
         Called by the actor itself, or by one below it, this returns at once: the end comes after the turn.
+
+        Raises:
+            SpecError: it is a part of a mechanism, which would go on without it: `terminate` ends its life alone.
         """
+        check_no_part(ref._cell)
         caller = current.get(None)
         if caller is None or not is_below(caller.cell, ref._cell):
             await self._stop(ref._cell, reason, deadline if drain else None)

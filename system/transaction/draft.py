@@ -18,6 +18,7 @@ from ...supervision.dynamic import DynamicSupervisor
 from ...supervision.partition import PartitionSupervisor
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
+from ..protection import part_of
 from .lasting import recipe_flags
 from .operation import wrong
 
@@ -168,11 +169,15 @@ class Draft:
             place.children[child.name] = self._survey(child, child.name, place, own)
         return place
 
-    def find(self, target: Target) -> Place:
+    def find(self, target: Target, *, parts: bool = False) -> Place:
         """The place a step is about.
 
+        Args:
+            target: who.
+            parts: whether it may be a part of a mechanism, which the step does not change.
+
         Raises:
-            NoSuchActor: there will be nobody at that point. SpecError: a step before removes it.
+            NoSuchActor: there will be nobody at that point. SpecError: a step before removes it, or it is such a part.
         """
         place = self.by_cell.get(target._cell) if isinstance(target, ActorRef) else None
         if place is None:
@@ -182,7 +187,16 @@ class Draft:
             if at.is_leaving:
                 raise wrong(place.path, f"{at.path} is removed by this very transaction")
             at = at.parent
+        if not parts:
+            self._check_no_part(place.path, place.parent)
         return place
+
+    def _check_no_part(self, path: str, above: Place | None) -> None:
+        """Whether what is below `above` is nobody's mechanism. Raises SpecError."""
+        while above is not None:
+            if above.spec is not None and above.spec.mechanism is not None:
+                raise wrong(path, part_of(above.path))
+            above = above.parent
 
     def _at(self, path: str) -> Place:
         top = self.root.path
@@ -194,6 +208,7 @@ class Draft:
                 moved = self.node.find(path)  # It may have had this address before.
                 if moved is not None and moved in self.by_cell:
                     return self.by_cell[moved]
+                self._check_no_part(path, place)
                 raise NoSuchActor(path)
             place = place.children[name]
         return place

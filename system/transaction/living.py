@@ -24,13 +24,16 @@ if TYPE_CHECKING:
 class OnLiving(Operation):
     """Base of operations on one live actor."""
 
+    on_parts: ClassVar[bool] = False
+    """Whether it may be a part of a mechanism."""
+
     def __init__(self, target: Target) -> None:
         super().__init__(text_of(target))
         self._at = target
         self._place: Place | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = draft.find(self._at)
+        place = self._place = draft.find(self._at, parts=self.on_parts)
         self.target, self.between_turns_of = place.path, (place,)
         place.check_lived_in(system.node)
 
@@ -44,6 +47,7 @@ class Suspend(OnLiving):
     """Have an actor handle no message until it is resumed."""
 
     verb: ClassVar[str] = "suspend"
+    on_parts: ClassVar[bool] = True
     _done = False
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
@@ -67,6 +71,7 @@ class Resume(OnLiving):
     """Have it handle messages again."""
 
     verb: ClassVar[str] = "resume"
+    on_parts: ClassVar[bool] = True
     _done = False
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:

@@ -144,6 +144,9 @@ class Attach(OnProtection):
             raise wrong(self.target, f"it has {mechanism_text(place.spec.mechanism)} already: detach that first")
         self._after = self._layers()
         check_layers(place, self._after)
+        if not place.is_planned and not getattr(place.kind, "state_access", True):
+            why = "its class says state_access = False, so its state cannot go along"
+            raise wrong(self.target, f"{why}: name the mechanism in its spec, and it begins with it")
         place.spec = dataclasses.replace(place.spec, mechanism=self._after)
 
 

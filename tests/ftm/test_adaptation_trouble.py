@@ -6,6 +6,7 @@ import asyncio
 import os
 import random
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.system.protection import UNDER_WAY, AdaptationUndone, Protection
+from holdfast.system.transaction.change import Change
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.test_adaptation import protected, stack, transition
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
@@ -219,3 +221,29 @@ class Bound(hf.Actor):
 class Failing(hf.Actor):
     def on_start(self, restored: bool) -> None:
         raise RuntimeError("no")
+
+
+async def test_parts_of_a_mechanism_are_not_changed_one_by_one(system: hf.ActorSystem) -> None:
+    """T39, T41: without its proxy, or with bricks that are others in one replica, it would be none any more."""
+    ref = await protected(system)
+    ftm = f"{ref.path}/ftm"
+    steps: list[Callable[[Change], Any]] = [
+        lambda change: change.remove(f"{ftm}/proxy"),
+        lambda change: change.stop(f"{ftm}/r2"),
+        lambda change: change.stop(f"{ftm}/r1/before"),
+        lambda change: change.add(f"{ftm}/r1", hf.child("more", hf.start(Counter))),
+        lambda change: change.bind(f"{ftm}/proxy", "protocol", f"{ftm}/r2/protocol"),
+        lambda change: change.strategy(ftm, "one_for_all"),
+        lambda change: change.replace_code(f"{ftm}/r1/before", Counter),
+        lambda change: change.replace_state(f"{ftm}/r1/server", dict),
+    ]
+    for step in steps:
+        with pytest.raises(hf.TransactionRefused, match=r"part of the mechanism of /app/alice.*transition or update"):
+            async with system.transaction() as change:
+                step(change)
+    with pytest.raises(hf.SpecError, match="part of the mechanism"):
+        await system.stop(system.ref(f"{ftm}/proxy", hf.Actor))
+    async with system.transaction(timeout=20) as change:  # These two change nothing.
+        change.suspend(f"{ftm}/r1/before")
+        change.resume(f"{ftm}/r1/before")
+    assert await ref.ask(Add(1)) == 1

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import os
 import signal
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 import holdfast as hf
 from holdfast.actors.process.remote import ProcessHost
+from holdfast.ftm.bricks import After
 from holdfast.ftm.events import MechanismAttached, MechanismDetached
 from holdfast.ftm.host import GroupHost
-from holdfast.ftm.mechanism import MechanismRefused
+from holdfast.ftm.mechanism import MechanismRefused, Role
+from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.messages import Done
 from tests.ftm.accounts import Account, Add, Closed, Counter, Fussy, Later, Load, Pay, Purse, Tags, Total
 from tests.ftm.test_failover import METHODS, group_of, pid_of, two_again
 
 # A refused or failed transaction ends with its block.
 # ruff: noqa: PT012
+
+
+class FaultyAfter(After):
+    async def after(self, done: Done) -> Done:
+        raise ValueError("a bug")
 
 
 async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any], mechanism: Any = None) -> None:
@@ -243,7 +252,9 @@ async def test_what_a_mechanism_needs_is_checked_before_anything_is_done(system:
         await attach(system, ref)
     with pytest.raises(MechanismRefused, match="state_access"):
         hf.child("bob", hf.start(Closed), mechanism=PBR())
-    with pytest.raises(hf.SpecError, match="mechanism must be"):
+    with pytest.raises(hf.TransactionRefused, match=r"cannot go along.*in its spec"):
+        await attach(system, ref, LFR())
+    with pytest.raises(hf.SpecError, match=r"mechanism must be .*find\(name\)"):
         hf.child("bob", hf.start(Counter), mechanism="pbr")
     with pytest.raises(hf.SpecError, match="supervisor"):
         hf.child("bob", hf.start(hf.Supervisor), mechanism=PBR())
@@ -357,3 +368,30 @@ async def test_those_that_wait_for_room_come_along(system: hf.ActorSystem, metho
     await held
     assert sorted(await asyncio.gather(*asks)) == list(range(1, 9))
     assert sorted(await ref.ask(Tags())) == list(range(8))
+
+
+class Bare(Counter):
+    """Its state cannot be saved, from the beginning."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lock = asyncio.Lock()
+
+
+@dataclasses.dataclass(frozen=True)
+class Faulty(PBR):
+    """Has a brick with a bug."""
+
+    roles: ClassVar[dict[str, Role]] = {"primary": Role(after=FaultyAfter), "backup": Role()}
+
+
+async def test_what_has_ended_a_replica_is_told(system: hf.ActorSystem) -> None:
+    """Not only that its process has ended: what the brick has raised, and which it was."""
+    with pytest.raises(hf.StartFailed, match=r"its proceed has ended: .*Bare\.lock.* cannot be saved; make it a key"):
+        await system.start(hf.child("bare", hf.start(Bare), mechanism=PBR()))
+    with pytest.raises(hf.StartFailed, match=r"on_start raised .*Bare\.lock.* cannot be saved"):
+        await system.start(hf.child("bare", hf.start(Bare), mechanism=LFR()))
+    ref = await system.start(hf.child("alice", hf.start(Counter)))
+    with pytest.raises(hf.TransactionFailed, match=r"its after has ended: ValueError: a bug"):
+        await attach(system, ref, Faulty())
+    assert await ref.ask(Total()) == 0

@@ -7,12 +7,13 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.errors import UnsavableValue
 from holdfast.ftm.alarms import Masked
 from holdfast.ftm.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.voters import NoMajority
-from tests.ftm.replicated import Add, Closed, Fail, Fetch, Large, Other, Read, Say, Total, pair
+from tests.ftm.replicated import Add, Closed, Fail, Fetch, Large, Other, Read, Say, Spoil, Total, pair
 
 STRIKES: list[Any] = []
 """What goes wrong in the next runs of `Struck.add`, one entry for each run."""
@@ -124,3 +125,18 @@ def test_it_is_refused_without_state_access_or_determinism() -> None:
     with pytest.raises(MechanismRefused, match="deterministic = False"):
         TR().check(Random)
     TR().check(Total)
+
+
+@pytest.mark.parametrize("together", [False, True])
+@pytest.mark.parametrize("layers", [(TR(),), (PBR(), TR())], ids=["tr", "pbr+tr"])
+async def test_a_turn_that_leaves_an_unsavable_state_fails(
+    system: hf.ActorSystem, layers: tuple[Any, ...], together: bool
+) -> None:
+    """In the second run as in the first: the replica must not die of it, for its successor would too."""
+    driver = await pair(system, Total, *layers, others=("r2",) if len(layers) > 1 else ())
+    said = (Add(1), Spoil(2), Add(3))
+    keys = driver.send(*said) if together else [driver.send(one)[0] for one in said]
+    assert [await driver.reply(keys[at]) for at in (0, 2)] == [1, 4]
+    with pytest.raises(UnsavableValue, match="spoilt"):
+        await driver.reply(keys[1])
+    assert await driver.ask(Read()) == [1, 3]

@@ -138,6 +138,10 @@ GOOD: dict[str, Any] = {
         (("children", 0, "mailbox"), {"capacity": 0}, r"tree\.children\[0\]\.mailbox: "),
         (("children", 0, "rules"), [{"reason": "X"}], r"tree\.children\[0\]\.rules\[0\]: .*'action'"),
         (("children", 0, "recovery"), {"interval": 1.0}, r"tree\.children\[0\]\.recovery\.use: must be a name"),
+        (("children", 0, "mechanism"), {"window": 3}, r"tree\.children\[0\]\.mechanism\.use: must be a name"),
+        (("children", 0, "mechanism"), [{"use": "holdfast:hybrid"}], r"tree\.children\[0\]: .*mechanism must be one"),
+        (("children", 0, "mechanism"), [{"use": "holdfast:PBR", "windw": 3}], r"mechanism\[0\]: .*'windw'"),
+        (("children", 0, "mechanism"), "pbr", r"tree\.children\[0\]\.mechanism: must be a list"),
         (("children", 0, "significant"), True, r"tree\.children\[0\]: child 'a': a permanent child cannot be"),
         (("children", 1, "name"), None, r"tree\.children\[1\]: "),
         (("children", 1, "children", 0, "id"), "x/y", r"tree\.children\[1\]\.children\[0\]: child 'x/y': the id"),
@@ -153,6 +157,16 @@ def test_errors_say_where(place: tuple[Any, ...], value: Any, error: str) -> Non
     at[place[-1]] = value
     with pytest.raises(hf.SpecError, match=error):
         hf.tree_from(mapping)
+
+
+def test_mechanisms_are_tables_too() -> None:
+    one = {"id": "one", "start": COUNTER, "mechanism": {"use": "holdfast:PBR", "window": 3}}
+    two = {"id": "two", "start": COUNTER, "mechanism": [{"use": "holdfast:LFR"}, {"use": "holdfast:TR"}]}
+    children = [
+        hf.child("one", hf.start(Counter), mechanism=hf.PBR(window=3)),
+        hf.child("two", hf.start(Counter), mechanism=(hf.LFR(), hf.TR())),
+    ]
+    assert hf.tree_from({"name": "top", "children": [one, two]}) == hf.supervisor("top", children=children)
 
 
 def test_the_top_is_a_supervisor_and_what_is_given_stays_as_it_is() -> None:
