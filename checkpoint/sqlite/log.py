@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import mmap
 import os
 import struct
 import zlib
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Final, TypeAlias
 
 from ..journal import Primitive
-from .files import sync
+from .files import Word, sync
 from .rows import decode_entry
 
 Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]
@@ -51,7 +50,7 @@ class NoRoom(OSError):
 @dataclass(slots=True)
 class _File:
     fd: int
-    seal: memoryview
+    seal: Word
     is_named: bool = False  # Is its name on the disk?
     is_promised: bool = False  # Has what it holds to survive a power loss?
 
@@ -63,12 +62,14 @@ class FrontLog:
         rows: what is in the log and not in the database yet.
         size: their bytes.
         is_used: without it nothing is written to the log.
+        is_broken_off: nobody knows where it ends, so that another generation has to begin.
     """
 
     def __init__(self, path: str, *, is_used: bool) -> None:
         self.folder = f"{path}-log"
         self.rows: list[Row] = []
         self.is_used = is_used
+        self.is_broken_off = False
         self.epoch = 0
         self.size = 0
         self._files: list[_File] = []  # all of them
@@ -126,7 +127,9 @@ class FrontLog:
 
     def takes(self, count: int, size: int) -> bool:
         """Whether there is room for so many more rows of so many bytes."""
-        return self._file is not None and len(self.rows) + count <= MOST_ROWS and self.size + size <= MOST_BYTES
+        if self._file is None or self.is_broken_off:
+            return False
+        return len(self.rows) + count <= MOST_ROWS and self.size + size <= MOST_BYTES
 
     def write(self, rows: list[Row]) -> None:
         """Append these rows, all or none.
@@ -152,7 +155,7 @@ class FrontLog:
             raise
         if done != size:
             raise NoRoom(errno.ENOSPC, os.strerror(errno.ENOSPC))  # The next one is written over it.
-        if file.seal[0]:
+        if file.seal.at[0]:
             os.pwrite(file.fd, bytes(len(self._head) + _RECORD.size), at)
             raise Sealed
         self._at, self._crc, self._head = at + size, crc, b""
@@ -162,7 +165,7 @@ class FrontLog:
     @property
     def is_due(self) -> bool:
         """Whether the next transaction is to begin another generation."""
-        return bool(self.rows) or self._file is None
+        return bool(self.rows) or self._file is None or self.is_broken_off
 
     def prepare(self) -> None:
         """Have a file for the next generation.
@@ -176,7 +179,7 @@ class FrontLog:
             fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             try:
                 os.pwrite(fd, _SEAL.pack(0), 0)
-                seal = memoryview(mmap.mmap(fd, _SEAL.size)).cast("Q")
+                seal = Word(fd)
             except BaseException:
                 os.close(fd)
                 os.unlink(name)
@@ -189,7 +192,7 @@ class FrontLog:
 
     def restart(self) -> None:
         """The rows are in the database: begin the next generation."""
-        self.rows, self.size = [], 0
+        self.rows, self.size, self.is_broken_off = [], 0, False
         file = self._file
         if file is None or file.is_promised:
             if file is not None:
@@ -234,6 +237,7 @@ class FrontLog:
         self._file = None
         files, self._files, self._free, self._kept = self._files, [], [], []
         for number, file in enumerate(files):
+            file.seal.close()
             os.close(file.fd)
             if remove:
                 with contextlib.suppress(OSError):  # The database says that they do not count.

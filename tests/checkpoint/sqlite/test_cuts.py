@@ -83,28 +83,30 @@ def test_the_store_agrees_with_a_naive_model(path: Path, data: st.DataObject) ->
     path.parent.mkdir()
     journal = SqliteJournal(path)
     model: dict[str, tuple[bytes | None, int, dict[int, Entry]]] = {}
-    for step in range(data.draw(st.integers(1, 12))):
-        address = data.draw(st.sampled_from([A, B]))
-        action = data.draw(st.sampled_from(["append", "append", "cut", "cut", "erase", "reopen", "kill"]))
-        snapshot, turn, entries = model.get(address, (None, 0, {}))
-        if action == "append":
-            batch = inputs(data.draw(st.integers(1, 4)), address, 10 * step)
-            entries |= dict(zip(journal.append(batch), [entry for _, entry in batch], strict=True))
-            model[address] = snapshot, turn, entries
-        elif action == "cut":
-            drop = [position for position in entries if data.draw(st.booleans())]
-            journal.cut(address, b"%d" % step, drop, turn=step)
-            left = {position: entry for position, entry in entries.items() if position not in drop}
-            model[address] = b"%d" % step, step, left
-        elif action == "erase":
-            journal.erase(address)
-            model.pop(address, None)
-        else:
-            journal = abandon(journal) if action == "kill" else closed(journal)
-        assert journal.addresses() == sorted(model)
-        for known, (snapshot, turn, entries) in model.items():
-            assert journal.load(known) == (snapshot, turn, list(entries.items()), "")
-    journal.close()
+    try:
+        for step in range(data.draw(st.integers(1, 12))):
+            address = data.draw(st.sampled_from([A, B]))
+            action = data.draw(st.sampled_from(["append", "append", "cut", "cut", "erase", "reopen", "kill"]))
+            snapshot, turn, entries = model.get(address, (None, 0, {}))
+            if action == "append":
+                batch = inputs(data.draw(st.integers(1, 4)), address, 10 * step)
+                entries |= dict(zip(journal.append(batch), [entry for _, entry in batch], strict=True))
+                model[address] = snapshot, turn, entries
+            elif action == "cut":
+                drop = [position for position in entries if data.draw(st.booleans())]
+                journal.cut(address, b"%d" % step, drop, turn=step)
+                left = {position: entry for position, entry in entries.items() if position not in drop}
+                model[address] = b"%d" % step, step, left
+            elif action == "erase":
+                journal.erase(address)
+                model.pop(address, None)
+            else:
+                journal = abandon(journal) if action == "kill" else closed(journal)
+            assert journal.addresses() == sorted(model)
+            for known, (snapshot, turn, entries) in model.items():
+                assert journal.load(known) == (snapshot, turn, list(entries.items()), "")
+    finally:  # Hypothesis may give up within.
+        journal.close()
 
 
 def closed(journal: SqliteJournal) -> SqliteJournal:

@@ -358,6 +358,29 @@ def test_a_transaction_that_is_broken_off_after_its_end_moves_nothing_twice(
     assert numbers(reopened(left(store))) == [0, 1, 2, 3, 4]
 
 
+def test_an_append_that_is_broken_off_after_its_write_is_not_there_twice(
+    store: SqliteJournal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log has it, and memory has not."""
+    store.append(inputs(2))
+    store.append(inputs(1, start=2))
+    write = FrontLog.write
+
+    def interrupted(front: FrontLog, rows: list[log.Row]) -> None:
+        write(front, rows)
+        del front.rows[-len(rows) :]
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FrontLog, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            store.append(inputs(1, start=99))
+    assert store.noted("key") is None
+    for start in (3, 4):
+        store.append(inputs(1, start=start))
+    assert numbers(reopened(left(store))) == [0, 1, 2, 3, 4]
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_any_mixture_comes_back_in_order(path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
     monkeypatch.setattr(log, "MOST_ROWS", 9)
