@@ -40,7 +40,10 @@ _CRC: Final = struct.Struct("<I")
 
 
 class Sealed(Exception):
-    """Somebody else owns the store now: nothing was written."""
+    """Somebody else owns the store now: nothing is acknowledged.
+
+    Nothing was written either, except that a new owner that reads at this very moment may have seen it.
+    """
 
 
 class NoRoom(OSError):
@@ -135,7 +138,7 @@ class FrontLog:
         """Append these rows, all or none.
 
         Raises:
-            Sealed, NoRoom: nothing was written.
+            Sealed, NoRoom: it is not acknowledged.
             OSError: nobody knows.
         """
         file = self._file
@@ -155,7 +158,7 @@ class FrontLog:
             raise
         if done != size:
             raise NoRoom(errno.ENOSPC, os.strerror(errno.ENOSPC))  # The next one is written over it.
-        if file.seal.at[0]:
+        if file.seal.at[0]:  # The file is still ours alone to write to: a new owner makes files of its own.
             os.pwrite(file.fd, bytes(len(self._head) + _RECORD.size), at)
             raise Sealed
         self._at, self._crc, self._head = at + size, crc, b""

@@ -263,7 +263,7 @@ class Store:
         """Acknowledge rows that memory has already (`in_doubt`), by writing them to the log.
 
         Raises:
-            StaleEpoch, StoreFailed: nothing was written.
+            StaleEpoch, StoreFailed: they are not.
         """
         try:
             self.log.write(rows)
