@@ -4,7 +4,7 @@ Beside `app.db` live SQLite's `-wal` and `-shm`, the directory `app.db-snapshots
 a crash, `app.db-mark`: the last acknowledged position; and what lies in `app.db-log`.
 
 Log        A few entries are one write to a log, and go to the database with whatever is written there next, at the
-           latest when they are 256. A new owner seals the log, so that nobody else writes to it unnoticed, and brings
+           latest when they are 512. A new owner seals the log, so that nobody else writes to it unnoticed, and brings
            it into the database before anything else. `log.py` says how a power loss is survived.
 
 Exclusion  The `store` row names the owning process (pid and start time) and an epoch that rises at each opening; every

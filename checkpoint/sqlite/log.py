@@ -18,6 +18,7 @@ import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Final, TypeAlias
 
@@ -28,9 +29,9 @@ from .rows import decode_entry
 Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]
 """Of the table `entries`: position, address, chain, kind, data, crc."""
 
-MOST_ROWS: Final = 256
-"""Rows the log takes, before they go to the database: about half a millisecond's work."""
-MOST_BYTES: Final = 256 << 10
+MOST_ROWS: Final = 512
+"""Rows the log takes, before they go to the database: about a millisecond's work."""
+MOST_BYTES: Final = 512 << 10
 _MAGIC: Final = b"HFLOG\x01\0\0"
 _SEAL: Final = struct.Struct("=Q")  # 0: open
 _HEAD: Final = struct.Struct("<8sQQ")  # magic, epoch, generation
@@ -52,6 +53,7 @@ class NoRoom(OSError):
 
 @dataclass(slots=True)
 class _File:
+    name: str
     fd: int
     seal: Word
     is_named: bool = False  # Is its name on the disk?
@@ -128,11 +130,11 @@ class FrontLog:
 
     # ---- writing
 
-    def takes(self, count: int, size: int) -> bool:
+    def takes(self, number: int, size: int) -> bool:
         """Whether there is room for so many more rows of so many bytes."""
         if self._file is None or self.is_broken_off:
             return False
-        return len(self.rows) + count <= MOST_ROWS and self.size + size <= MOST_BYTES
+        return len(self.rows) + number <= MOST_ROWS and self.size + size <= MOST_BYTES
 
     def write(self, rows: list[Row]) -> None:
         """Append these rows, all or none.
@@ -177,7 +179,9 @@ class FrontLog:
         """
         if not self.is_used or self._free or (self._file is not None and not self._file.is_promised):
             return
-        name = os.path.join(self.folder, f"{self.epoch}-{len(self._files)}.log")
+        # Somebody may have brought back an older database, and left the logs: then the first names are taken.
+        names = (os.path.join(self.folder, f"{self.epoch}-{number}.log") for number in count(1))
+        name = next(name for name in names if not os.path.exists(name))
         try:
             fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             try:
@@ -189,7 +193,7 @@ class FrontLog:
                 raise
         except OSError as error:
             raise NoRoom(*error.args) from error
-        file = _File(fd, seal)
+        file = _File(name, fd, seal)
         self._files.append(file)
         self._free.append(file)
 
@@ -239,12 +243,12 @@ class FrontLog:
         """Let go of the files, and remove them when the database has all."""
         self._file = None
         files, self._files, self._free, self._kept = self._files, [], [], []
-        for number, file in enumerate(files):
+        for file in files:
             file.seal.close()
             os.close(file.fd)
             if remove:
                 with contextlib.suppress(OSError):  # The database says that they do not count.
-                    os.unlink(os.path.join(self.folder, f"{self.epoch}-{number}.log"))
+                    os.unlink(file.name)
 
 
 def _records(data: bytes) -> Iterator[list[Row]]:
