@@ -39,7 +39,7 @@ class StoreInUse(StoreError):
 
 
 class StaleEpoch(StoreError):
-    """The store was opened by somebody else since: nothing was written; stop, for you are no longer its owner."""
+    """The store was opened by somebody else since: nothing is acknowledged; stop, for you are no longer its owner."""
 
     def __init__(self, path: str, epoch: int, current: int) -> None:
         super().__init__(path, epoch, current)
@@ -48,7 +48,7 @@ class StaleEpoch(StoreError):
     def __str__(self) -> str:
         return (
             f"store {self.path} was opened with epoch {self.epoch} and now has epoch {self.current}: "
-            "another opening owns it, nothing was written; stop this one"
+            "another opening owns it, this one acknowledges nothing any more; stop it"
         )
 
 

@@ -1,7 +1,11 @@
 """The durable journal: one SQLite file (WAL), large snapshots in files beside it.
 
 Beside `app.db` live SQLite's `-wal` and `-shm`, the directory `app.db-snapshots` and, while the store is open or after
-a crash, `app.db-mark`: the last acknowledged position.
+a crash, `app.db-mark`: the last acknowledged position; and what lies in `app.db-log`.
+
+Log        A few entries are one write to a log, and go to the database with whatever is written there next, at the
+           latest when they are 512. A new owner seals the log, so that nobody else writes to it unnoticed, and brings
+           it into the database before anything else. `log.py` says how a power loss is survived.
 
 Exclusion  The `store` row names the owning process (pid and start time) and an epoch that rises at each opening; every
            write checks the epoch inside its transaction. SQLite's locks are held for one short transaction only, so
@@ -15,8 +19,8 @@ Layout     Entries are clustered by position and have no index by address: it wo
            and found again by one scan at the opening.
 
 Read `engine.py` first: it has the journal, as far as it is not about the file. `store.py` opens, writes and closes the
-file, `claim.py` decides who owns it, `chains.py` finds what is in it, `reading.py` reads an address back, `mark.py` and
-`files.py` keep what is beside it, and `rows.py` has the bytes.
+file, `log.py` is in front of it, `claim.py` decides who owns it, `chains.py` finds what is in it, `reading.py` reads an
+address back, `mark.py` and `files.py` keep what is beside it, and `rows.py` has the bytes.
 """
 
 from __future__ import annotations

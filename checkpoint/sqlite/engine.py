@@ -29,8 +29,8 @@ from .rows import (
 )
 from .store import INSERT, Store
 
-_FEW: Final = 32  # More entries at a time, or more bytes, are worth a transaction of their own.
-_SMALL: Final = 32 << 10
+_FEW: Final = 256  # More entries at a time, or more bytes, are worth a transaction of their own.
+_SMALL: Final = 64 << 10
 _INLINE_BYTES: Final = 1 << 20  # SQLite reads and writes larger blobs at less than half a file's speed.
 
 
@@ -89,7 +89,8 @@ class SqliteJournal:
 
         Raises:
             TypeError: an entry holds something else than primitives and tuples of them; nothing was written.
-            StaleEpoch, DamagedStore, StoreFailed: nothing was written.
+            StaleEpoch: nothing counts as written; a new owner that looked at this very moment may have it all the same.
+            DamagedStore, StoreFailed: nothing was written.
         """
         if not entries:
             return []
@@ -145,8 +146,8 @@ class SqliteJournal:
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """Keep the snapshot, then forget what it contains; see `Journal`.
 
-        A snapshot of more than 1 MiB becomes a file, synced before the row that names it is written. Takes as long as
-        the disk does and removes rows in small transactions: call it in a worker thread.
+        A snapshot of more than 1 MiB becomes a file, synced before the row that names it is written. All else is one
+        transaction, if there is little to remove; to remove much takes more, and long: call it in a worker thread.
         """
         self._store.refuse_failed()
         digest = snapshot_digest(address, turn, self.epoch, snapshot)
@@ -159,17 +160,43 @@ class SqliteJournal:
                 number = db.execute("INSERT INTO snapshots VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)", row).lastrowid
                 chain.kept.append(number or 0)
                 chain.floor = chain.last
+                files = self._clean_at_once(chain, db, keep)
                 chain.write(db)
         except (StaleEpoch, StoreFailed):
             if file is not None and self._store.failure is None:  # After a failed sync nobody knows if the row exists.
                 os.unlink(os.path.join(self._store.files.folder, file))
             raise
         try:
-            self._clean(chain, keep)
+            if files is None:
+                self._clean(chain, keep)
+            else:
+                self._store.remove_files(files)
         except StoreFailed:
             if self._store.failure is not None:
                 raise
             # The snapshot is kept, which is what we promised; the next cut cleans up.
+
+    def _clean_at_once(self, chain: Chain, db: sqlite3.Connection, keep: int) -> list[str] | None:
+        """Remove what only outdated snapshots need, in the transaction of the cut, if it is little.
+
+        Returns the files to be removed when that is committed; `None` if nothing was done, because it is much or
+        damaged.
+        """
+        if len(chain.kept) < keep:
+            return []
+        *outdated, heir = chain.kept[: len(chain.kept) - keep + 1]
+        try:
+            drops = self._drops(chain, db, [*outdated, heir])
+            if len(drops) > CHUNK:
+                return None
+            if drops:
+                self._remove_rows(chain, db, array("q", sorted(drops)))
+        except DamagedStore:
+            return None
+        if drops:
+            db.execute("UPDATE snapshots SET drops = x'' WHERE id = ?", (heir,))
+        del chain.kept[: len(outdated)]
+        return self._delete_snapshots(db, outdated)
 
     def _clean(self, chain: Chain, keep: int) -> None:
         """Remove what only outdated snapshots need. A crash in between is made good by the next cut.
@@ -179,8 +206,12 @@ class SqliteJournal:
         """
         outdated = chain.kept[:-keep]
         if outdated:
+            heir = chain.kept[-keep]
             with self._store.transaction(note=True) as db:
-                self._hand_on_drops(chain, db, outdated, chain.kept[-keep])
+                drops = self._drops(chain, db, [*outdated, heir])
+                db.execute(
+                    "UPDATE snapshots SET drops = ? WHERE id = ?", (pack_positions(list(drops)) if drops else b"", heir)
+                )
                 files = self._delete_snapshots(db, outdated)
                 del chain.kept[: len(outdated)]
                 chain.write(db)
@@ -188,26 +219,23 @@ class SqliteJournal:
         if len(chain.kept) >= keep:
             self._remove_dropped(chain, chain.kept[0])
 
-    def _hand_on_drops(self, chain: Chain, db: sqlite3.Connection, outdated: Sequence[int], heir: int) -> None:
-        drops = array("q")
-        for number in (*outdated, heir):
+    def _drops(self, chain: Chain, db: sqlite3.Connection, numbers: Sequence[int]) -> set[int]:
+        """What these snapshots have still to remove."""
+        drops: set[int] = set()
+        for number in numbers:
             row = db.execute("SELECT drops FROM snapshots WHERE id = ?", (number,)).fetchone()
             try:
-                drops += unpack_positions(row[0])
+                drops.update(unpack_positions(row[0]))
             except (TypeError, ValueError, zlib.error) as error:
                 reason = f"the drop list of snapshot {number} is damaged"
                 raise DamagedStore(self.path, chain.path, None, reason) from error
-        db.execute("UPDATE snapshots SET drops = ? WHERE id = ?", (pack_positions(drops) if drops else b"", heir))
+        return drops
 
     def _remove_dropped(self, chain: Chain, number: int) -> None:
         """Physically remove the entries that a snapshot made superfluous, then forget which they were."""
         with self._store.transaction() as db:
-            row = db.execute("SELECT drops FROM snapshots WHERE id = ?", (number,)).fetchone()
-        try:
-            positions = unpack_positions(row[0])
-        except (TypeError, ValueError, zlib.error) as error:
-            raise DamagedStore(self.path, chain.path, None, f"the drop list of snapshot {number} is damaged") from error
-        if row[0]:
+            positions = array("q", sorted(self._drops(chain, db, [number])))
+        if positions:
             for start in range(0, len(positions), CHUNK):
                 self._remove(chain, positions[start : start + CHUNK])
             with self._store.transaction() as db:
@@ -216,22 +244,30 @@ class SqliteJournal:
     def _remove(self, chain: Chain, positions: array[int]) -> None:
         """Remove those of the sorted positions that the chain has, in one transaction."""
         with self._store.transaction(note=True) as db:
-            low, high = bisect_left(chain.positions, positions[0]), bisect_right(chain.positions, positions[-1])
-            doomed = set(positions)
-            window = chain.positions[low:high]
-            gone = [position for position in window if position in doomed]
-            marks = ",".join("?" * len(gone))
-            number, total = db.execute(
-                f"SELECT count(*), sum(chain) FROM entries WHERE position IN ({marks})", gone
-            ).fetchone()
-            if number != len(gone):
-                raise DamagedStore(self.path, chain.path, gone[0], "entries have vanished")
-            db.execute(f"DELETE FROM entries WHERE position IN ({marks})", gone)
-            chain.positions[low:high] = array("q", (position for position in window if position not in doomed))
-            chain.removed += number
-            chain.removed_sum = (chain.removed_sum + (total or 0)) % MODULUS
-            self._store.live -= number
+            self._remove_rows(chain, db, positions)
             chain.write(db)
+
+    def _remove_rows(self, chain: Chain, db: sqlite3.Connection, positions: array[int]) -> None:
+        """Remove those of the sorted positions that the chain has.
+
+        Raises:
+            DamagedStore: some of them are not there; nothing was removed.
+        """
+        low, high = bisect_left(chain.positions, positions[0]), bisect_right(chain.positions, positions[-1])
+        doomed = set(positions)
+        window = chain.positions[low:high]
+        gone = [position for position in window if position in doomed]
+        marks = ",".join("?" * len(gone))
+        number, total = db.execute(
+            f"SELECT count(*), sum(chain) FROM entries WHERE position IN ({marks})", gone
+        ).fetchone()
+        if number != len(gone):
+            raise DamagedStore(self.path, chain.path, gone[0], "entries have vanished")
+        db.execute(f"DELETE FROM entries WHERE position IN ({marks})", gone)
+        chain.positions[low:high] = array("q", (position for position in window if position not in doomed))
+        chain.removed += number
+        chain.removed_sum = (chain.removed_sum + (total or 0)) % MODULUS
+        self._store.live -= number
 
     def _delete_snapshots(self, db: sqlite3.Connection, numbers: Sequence[int]) -> list[str]:
         """Delete the rows; return the files to be removed once that is committed."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import mmap
 import os
 from collections.abc import Collection, Sequence
 from itertools import count
@@ -58,6 +59,21 @@ class SnapshotFiles:
         if unknown:
             self.sync_rows()
             self.remove(unknown)
+
+
+class Word:
+    """The first eight bytes of a file, seen and set as `at[0]` without a system call."""
+
+    __slots__ = ("_map", "at")
+
+    def __init__(self, fd: int) -> None:
+        self._map = mmap.mmap(fd, 8)
+        self.at = memoryview(self._map).cast("Q")
+
+    def close(self) -> None:
+        """Let go of the file."""
+        self.at.release()
+        self._map.close()
 
 
 def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:

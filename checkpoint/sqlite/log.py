@@ -13,25 +13,25 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import mmap
 import os
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 from typing import Final, TypeAlias
 
 from ..journal import Primitive
-from .files import sync
+from .files import Word, sync
 from .rows import decode_entry
 
 Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]
 """Of the table `entries`: position, address, chain, kind, data, crc."""
 
-MOST_ROWS: Final = 256
-"""Rows the log takes, before they go to the database: about half a millisecond's work."""
-MOST_BYTES: Final = 256 << 10
+MOST_ROWS: Final = 512
+"""Rows the log takes, before they go to the database: about a millisecond's work."""
+MOST_BYTES: Final = 512 << 10
 _MAGIC: Final = b"HFLOG\x01\0\0"
 _SEAL: Final = struct.Struct("=Q")  # 0: open
 _HEAD: Final = struct.Struct("<8sQQ")  # magic, epoch, generation
@@ -41,7 +41,10 @@ _CRC: Final = struct.Struct("<I")
 
 
 class Sealed(Exception):
-    """Somebody else owns the store now: nothing was written."""
+    """Somebody else owns the store now: nothing is acknowledged.
+
+    Nothing was written either, except that a new owner that reads at this very moment may have seen it.
+    """
 
 
 class NoRoom(OSError):
@@ -50,8 +53,9 @@ class NoRoom(OSError):
 
 @dataclass(slots=True)
 class _File:
+    name: str
     fd: int
-    seal: memoryview
+    seal: Word
     is_named: bool = False  # Is its name on the disk?
     is_promised: bool = False  # Has what it holds to survive a power loss?
 
@@ -63,12 +67,14 @@ class FrontLog:
         rows: what is in the log and not in the database yet.
         size: their bytes.
         is_used: without it nothing is written to the log.
+        is_broken_off: nobody knows where it ends, so that another generation has to begin.
     """
 
     def __init__(self, path: str, *, is_used: bool) -> None:
         self.folder = f"{path}-log"
         self.rows: list[Row] = []
         self.is_used = is_used
+        self.is_broken_off = False
         self.epoch = 0
         self.size = 0
         self._files: list[_File] = []  # all of them
@@ -124,15 +130,17 @@ class FrontLog:
 
     # ---- writing
 
-    def takes(self, count: int, size: int) -> bool:
+    def takes(self, number: int, size: int) -> bool:
         """Whether there is room for so many more rows of so many bytes."""
-        return self._file is not None and len(self.rows) + count <= MOST_ROWS and self.size + size <= MOST_BYTES
+        if self._file is None or self.is_broken_off:
+            return False
+        return len(self.rows) + number <= MOST_ROWS and self.size + size <= MOST_BYTES
 
     def write(self, rows: list[Row]) -> None:
         """Append these rows, all or none.
 
         Raises:
-            Sealed, NoRoom: nothing was written.
+            Sealed, NoRoom: it is not acknowledged.
             OSError: nobody knows.
         """
         file = self._file
@@ -152,7 +160,7 @@ class FrontLog:
             raise
         if done != size:
             raise NoRoom(errno.ENOSPC, os.strerror(errno.ENOSPC))  # The next one is written over it.
-        if file.seal[0]:
+        if file.seal.at[0]:  # The file is still ours alone to write to: a new owner makes files of its own.
             os.pwrite(file.fd, bytes(len(self._head) + _RECORD.size), at)
             raise Sealed
         self._at, self._crc, self._head = at + size, crc, b""
@@ -162,7 +170,7 @@ class FrontLog:
     @property
     def is_due(self) -> bool:
         """Whether the next transaction is to begin another generation."""
-        return bool(self.rows) or self._file is None
+        return bool(self.rows) or self._file is None or self.is_broken_off
 
     def prepare(self) -> None:
         """Have a file for the next generation.
@@ -171,25 +179,27 @@ class FrontLog:
         """
         if not self.is_used or self._free or (self._file is not None and not self._file.is_promised):
             return
-        name = os.path.join(self.folder, f"{self.epoch}-{len(self._files)}.log")
+        # Somebody may have brought back an older database, and left the logs: then the first names are taken.
+        names = (os.path.join(self.folder, f"{self.epoch}-{number}.log") for number in count(1))
+        name = next(name for name in names if not os.path.exists(name))
         try:
             fd = os.open(name, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
             try:
                 os.pwrite(fd, _SEAL.pack(0), 0)
-                seal = memoryview(mmap.mmap(fd, _SEAL.size)).cast("Q")
+                seal = Word(fd)
             except BaseException:
                 os.close(fd)
                 os.unlink(name)
                 raise
         except OSError as error:
             raise NoRoom(*error.args) from error
-        file = _File(fd, seal)
+        file = _File(name, fd, seal)
         self._files.append(file)
         self._free.append(file)
 
     def restart(self) -> None:
         """The rows are in the database: begin the next generation."""
-        self.rows, self.size = [], 0
+        self.rows, self.size, self.is_broken_off = [], 0, False
         file = self._file
         if file is None or file.is_promised:
             if file is not None:
@@ -233,11 +243,12 @@ class FrontLog:
         """Let go of the files, and remove them when the database has all."""
         self._file = None
         files, self._files, self._free, self._kept = self._files, [], [], []
-        for number, file in enumerate(files):
+        for file in files:
+            file.seal.close()
             os.close(file.fd)
             if remove:
                 with contextlib.suppress(OSError):  # The database says that they do not count.
-                    os.unlink(os.path.join(self.folder, f"{self.epoch}-{number}.log"))
+                    os.unlink(file.name)
 
 
 def _records(data: bytes) -> Iterator[list[Row]]:

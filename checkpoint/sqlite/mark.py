@@ -7,13 +7,13 @@ It is mapped into memory: to set it is no system call.
 
 from __future__ import annotations
 
-import mmap
 import os
 import struct
 from typing import Final
 
 from ..journal import DamagedStore
 from .claim import boot_id
+from .files import Word
 
 _MARK: Final = struct.Struct("=Q?36s")  # last acknowledged position, synced at each commit?, boot
 _SYNCED: Final = struct.Struct("=Q")  # behind it: the last position that was synced
@@ -26,7 +26,7 @@ class Mark:
         self.path = f"{path}-mark"
         self._store = path
         self._fd = -1
-        self._position = memoryview(bytearray(8)).cast("Q")
+        self._word: Word | None = None
 
     @property
     def is_open(self) -> bool:
@@ -54,11 +54,12 @@ class Mark:
                 )
                 raise DamagedStore(self._store, None, last + 1, reason)
         os.pwrite(self._fd, _MARK.pack(last, synced, boot) + _SYNCED.pack(last if synced else 0), 0)
-        self._position = memoryview(mmap.mmap(self._fd, _MARK.size))[:8].cast("Q")
+        self._word = Word(self._fd)
 
     def set(self, position: int) -> None:
         """Everything up to this position is acknowledged from now on."""
-        self._position[0] = position  # eight bytes at once, which a kill does not tear
+        assert self._word is not None
+        self._word.at[0] = position  # eight bytes at once, which a kill does not tear
 
     def set_synced(self, position: int) -> None:
         """Everything up to this position survives a power loss, too."""
@@ -70,6 +71,9 @@ class Mark:
         if self._fd >= 0:
             fd, self._fd = self._fd, -1
             os.close(fd)
+        if self._word is not None:
+            self._word.close()
+            self._word = None
 
     def remove(self) -> None:
         """Remove the file: the row of the store says all now."""

@@ -182,16 +182,18 @@ class Store:
     def _retire(self, clean: bool) -> None:
         """Leave the last word on how much there is, so that the mark is not needed, and strike ourselves out."""
         db = self.db
-        is_owner = db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,)
-        if clean and is_owner:
+        if clean:
             db.execute("PRAGMA synchronous = FULL")
             db.execute("BEGIN IMMEDIATE")
-            db.executemany(INSERT, self.log.rows)
-            db.execute(f"PRAGMA user_version = {VERSION}")
-            self.claim.write(self.last, self.live)
+            clean = db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,)
+            if clean:
+                db.executemany(INSERT, self.log.rows)
+                db.execute(f"PRAGMA user_version = {VERSION}")
+                self.claim.write(self.last, self.live)
             db.execute("COMMIT")
+        if clean:
             self._mark.remove()
-        self.log.close(remove=clean and is_owner)
+        self.log.close(remove=clean)
         self.claim.release()
 
     def _disconnect(self) -> None:
@@ -261,7 +263,7 @@ class Store:
         """Acknowledge rows that memory has already (`in_doubt`), by writing them to the log.
 
         Raises:
-            StaleEpoch, StoreFailed: nothing was written.
+            StaleEpoch, StoreFailed: they are not.
         """
         try:
             self.log.write(rows)
@@ -333,6 +335,7 @@ class Store:
         """Make sure that memory and file agree, after a transaction that was broken off."""
         self.refuse_failed()
         if self.in_doubt:
+            self.log.is_broken_off = True
             try:
                 self._scan()
             except sqlite3.Error as error:

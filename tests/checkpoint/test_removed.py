@@ -93,8 +93,8 @@ CHECKS = {
     ),
     "log: who writes looks at the seal": Check(
         "checkpoint/sqlite/log.py",
-        "        if file.seal[0]:\n",
-        "        if False:\n",
+        "        if file.seal.at[0]:",
+        "        if False:",
         "tests/checkpoint/sqlite/test_log.py",
         "test_what_is_written_before_the_new_owner",
     ),

@@ -16,15 +16,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from holdfast.checkpoint.journal import (
-    Entry,
-    StoreFailed,
-)
+from holdfast.checkpoint.journal import DamagedStore, Entry, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite import store as sqlite_store
 from holdfast.checkpoint.sqlite.chains import Chain
 from holdfast.checkpoint.sqlite.claim import Claim
-from tests.checkpoint.sqlite.stores import A, B, disown, inputs, numbers, reopened
+from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, numbers, reopened
 
 
 @pytest.mark.parametrize("size", [0, 1 << 20, (1 << 20) + 1, 5 << 20])
@@ -55,6 +52,39 @@ def test_dropped_entries_are_removed_by_the_next_cut(path: Path) -> None:
     assert reopened(path).turn == 5
 
 
+@pytest.mark.parametrize("keep", [1, 2, 3])
+def test_a_cut_with_little_to_remove_is_one_transaction(path: Path, keep: int) -> None:
+    statements: list[str] = []
+    with closing(SqliteJournal(path)) as journal:
+        journal._store.db.set_trace_callback(statements.append)
+        for turn in range(1, 8):
+            positions = [journal.append(inputs(1, start=start))[0] for start in range(5 * turn, 5 * turn + 5)]
+            statements.clear()
+            journal.cut(A, b"%d" % turn, positions[:4], turn=turn, keep=keep)
+            assert statements.count("COMMIT") == 1
+            rows = sqlite3.connect(path)
+            assert rows.execute("SELECT count(*) FROM snapshots").fetchone() == (min(turn, keep),)
+            removed = 4 * max(0, turn - keep + 1)  # What the oldest of them contains is gone.
+            assert rows.execute("SELECT count(*) FROM entries").fetchone() == (5 * turn - removed,)
+            rows.close()
+        assert numbers(journal.load(A)) == list(range(9, 40, 5))
+    assert numbers(reopened(path)) == list(range(9, 40, 5))
+
+
+@pytest.mark.parametrize(
+    "damage", ["UPDATE snapshots SET drops = x'00' WHERE turn = 1", "DELETE FROM entries WHERE position = 1"]
+)
+def test_what_a_cut_finds_damaged_when_it_cleans_up_is_told_and_its_snapshot_kept(path: Path, damage: str) -> None:
+    with closing(SqliteJournal(path)) as journal:
+        first = journal.append(inputs(3))
+        journal.cut(A, b"1", first[:2], turn=1, keep=3)
+        edit(path, damage)
+        with pytest.raises(DamagedStore):
+            journal.cut(A, b"2", [], turn=2)
+        with closing(sqlite3.connect(path)) as db:
+            assert db.execute("SELECT max(turn) FROM snapshots").fetchone() == (2,)
+
+
 def test_many_interleaved_entries_are_dropped(path: Path) -> None:
     with closing(SqliteJournal(path)) as journal:
         mine = journal.append([(A if n % 3 else B, ("in", n)) for n in range(5000)])
@@ -83,28 +113,30 @@ def test_the_store_agrees_with_a_naive_model(path: Path, data: st.DataObject) ->
     path.parent.mkdir()
     journal = SqliteJournal(path)
     model: dict[str, tuple[bytes | None, int, dict[int, Entry]]] = {}
-    for step in range(data.draw(st.integers(1, 12))):
-        address = data.draw(st.sampled_from([A, B]))
-        action = data.draw(st.sampled_from(["append", "append", "cut", "cut", "erase", "reopen", "kill"]))
-        snapshot, turn, entries = model.get(address, (None, 0, {}))
-        if action == "append":
-            batch = inputs(data.draw(st.integers(1, 4)), address, 10 * step)
-            entries |= dict(zip(journal.append(batch), [entry for _, entry in batch], strict=True))
-            model[address] = snapshot, turn, entries
-        elif action == "cut":
-            drop = [position for position in entries if data.draw(st.booleans())]
-            journal.cut(address, b"%d" % step, drop, turn=step)
-            left = {position: entry for position, entry in entries.items() if position not in drop}
-            model[address] = b"%d" % step, step, left
-        elif action == "erase":
-            journal.erase(address)
-            model.pop(address, None)
-        else:
-            journal = abandon(journal) if action == "kill" else closed(journal)
-        assert journal.addresses() == sorted(model)
-        for known, (snapshot, turn, entries) in model.items():
-            assert journal.load(known) == (snapshot, turn, list(entries.items()), "")
-    journal.close()
+    try:
+        for step in range(data.draw(st.integers(1, 12))):
+            address = data.draw(st.sampled_from([A, B]))
+            action = data.draw(st.sampled_from(["append", "append", "cut", "cut", "erase", "reopen", "kill"]))
+            snapshot, turn, entries = model.get(address, (None, 0, {}))
+            if action == "append":
+                batch = inputs(data.draw(st.integers(1, 4)), address, 10 * step)
+                entries |= dict(zip(journal.append(batch), [entry for _, entry in batch], strict=True))
+                model[address] = snapshot, turn, entries
+            elif action == "cut":
+                drop = [position for position in entries if data.draw(st.booleans())]
+                journal.cut(address, b"%d" % step, drop, turn=step)
+                left = {position: entry for position, entry in entries.items() if position not in drop}
+                model[address] = b"%d" % step, step, left
+            elif action == "erase":
+                journal.erase(address)
+                model.pop(address, None)
+            else:
+                journal = abandon(journal) if action == "kill" else closed(journal)
+            assert journal.addresses() == sorted(model)
+            for known, (snapshot, turn, entries) in model.items():
+                assert journal.load(known) == (snapshot, turn, list(entries.items()), "")
+    finally:  # Hypothesis may give up within.
+        journal.close()
 
 
 def closed(journal: SqliteJournal) -> SqliteJournal:

@@ -70,24 +70,24 @@ def test_few_entries_go_to_the_log_and_then_in_order_to_the_database(path: Path)
         for start in range(1, 11):
             journal.append(inputs(1, start=start))
         assert rows(path) == 1
-        journal.append(inputs(100, start=11))
-        assert rows(path) == 111
-        journal.append(inputs(3, start=111))
-        assert rows(path) == 111
+        journal.append(inputs(400, start=11))
+        assert rows(path) == 411
+        journal.append(inputs(3, start=411))
+        assert rows(path) == 411
         journal.append(inputs(1, B))  # Its address needs a row.
-        journal.append([(A, ("in", 114, b"x" * 100_000))])
-        assert rows(path) == 116
-        for start in range(115, 115 + 2 * log.MOST_ROWS):
+        journal.append([(A, ("in", 414, b"x" * 100_000))])
+        assert rows(path) == 416
+        for start in range(415, 415 + 2 * log.MOST_ROWS):
             journal.append(inputs(1, start=start))
-        assert rows(path) >= 116 + log.MOST_ROWS
+        assert rows(path) >= 416 + log.MOST_ROWS
         (file,) = logs(path)
         assert file.stat().st_size < 100 * log.MOST_ROWS  # It is written over.
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
         assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
-        assert numbers(journal.load(A)) == list(range(115 + 2 * log.MOST_ROWS))
-        assert numbers(reopened(left(journal))) == list(range(115 + 2 * log.MOST_ROWS))
+        assert numbers(journal.load(A)) == list(range(415 + 2 * log.MOST_ROWS))
+        assert numbers(reopened(left(journal))) == list(range(415 + 2 * log.MOST_ROWS))
     assert logs(path) == []
-    assert numbers(reopened(path)) == list(range(115 + 2 * log.MOST_ROWS))
+    assert numbers(reopened(path)) == list(range(415 + 2 * log.MOST_ROWS))
 
 
 def test_what_a_killed_owner_had_in_the_log_is_there(killed: Path) -> None:
@@ -172,6 +172,22 @@ def test_a_log_that_is_gone_is_missed(killed: Path) -> None:
             SqliteJournal(killed)
     file.parent.mkdir()
     assert both(killed) == ([0, 1], [0])
+
+
+def test_logs_of_a_later_life_than_the_database_do_no_harm(path: Path) -> None:
+    """Somebody has brought back an older copy of the database alone."""
+    with closing(SqliteJournal(path)) as journal:
+        journal.append(inputs(1))
+        old = left(journal, "old")
+    with closing(SqliteJournal(path)) as journal:
+        journal.append(inputs(300, start=1))
+        journal.append(inputs(1, start=301))
+        late = left(journal, "late")
+    shutil.copy(logs(late)[0], f"{old}-log")
+    with closing(SqliteJournal(old)) as journal:
+        journal.append(inputs(1, start=1))
+        assert len(logs(old)) == 1
+        assert numbers(reopened(left(journal))) == [0, 1]
 
 
 def test_after_a_power_loss_what_lies_behind_a_gap_is_cut(path: Path) -> None:
@@ -355,6 +371,29 @@ def test_a_transaction_that_is_broken_off_after_its_end_moves_nothing_twice(
     for start in (3, 4):
         store.append(inputs(1, start=start))
     assert numbers(store.load(A)) == [0, 1, 2, 3, 4]
+    assert numbers(reopened(left(store))) == [0, 1, 2, 3, 4]
+
+
+def test_an_append_that_is_broken_off_after_its_write_is_not_there_twice(
+    store: SqliteJournal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The log has it, and memory has not."""
+    store.append(inputs(2))
+    store.append(inputs(1, start=2))
+    write = FrontLog.write
+
+    def interrupted(front: FrontLog, rows: list[log.Row]) -> None:
+        write(front, rows)
+        del front.rows[-len(rows) :]
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(FrontLog, "write", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            store.append(inputs(1, start=99))
+    assert store.noted("key") is None
+    for start in (3, 4):
+        store.append(inputs(1, start=start))
     assert numbers(reopened(left(store))) == [0, 1, 2, 3, 4]
 
 

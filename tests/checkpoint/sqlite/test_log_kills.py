@@ -39,7 +39,7 @@ def live(say):
             journal.note("key", b"value")
             say(b"n ")
         if step in (8, 13):
-            journal.cut("/a", b"%d" % number, positions, turn=number, keep=1)
+            journal.cut("/a", b"%d" % number, positions, turn=number, keep=1 + step % 2)
             say(b"c%d " % number)
     journal.close()
     say(b"end ")

@@ -116,7 +116,7 @@ def test_an_owner_whose_epoch_is_stale_writes_nothing(store: SqliteJournal, path
     big = b"x" * (2 << 20)
     attempts: list[Callable[[], object]] = [
         lambda: store.append(inputs(1)),
-        lambda: store.append(inputs(100)),
+        lambda: store.append(inputs(400)),
         lambda: store.cut(A, b"2", positions, turn=2),
         lambda: store.cut(A, big, positions, turn=2),
         lambda: store.erase(A),
