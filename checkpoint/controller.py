@@ -140,7 +140,7 @@ class LocalHome:
         if switch is not None and self._is_open:
             switch.from_life(record)
 
-    def told(self, then: Callable[[], None]) -> None:
+    def when_told(self, then: Callable[[], None]) -> None:
         then()
 
     def closed(self) -> None:

@@ -185,7 +185,7 @@ class Port:
         connection = self._guest.connection
         connection.send(frames.Record(connection.name_out(self._path), cast("Any", record)), self._path)
 
-    def told(self, then: Callable[[], None]) -> None:
+    def when_told(self, then: Callable[[], None]) -> None:
         self._guest.node.loop.call_soon(then)  # Behind the flush, which was called for before.
 
     def closed(self) -> None:

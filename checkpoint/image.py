@@ -43,7 +43,7 @@ class Head(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Section:
-    """Some variables, encoded together."""
+    """Some variables, encoded together; the first two of `pieces` are head and tree, the others buffers."""
 
     __slots__ = ("names", "pieces", "seen", "size", "value")
 
@@ -106,7 +106,9 @@ def pieces_of(
     pieces: list[tuple[Key, Any]] = [(("", 0), b"".join(first))]
     for one in large:
         name = one.names[0] if one.names else ""
-        pieces += [((name, number), piece) for number, piece in enumerate(joined(one.pieces), 1)]
+        # Apart from the buffers: where one was added, those before it lie where they lay.
+        parts = (*joined(one.pieces[:2]), *joined(one.pieces[2:]))
+        pieces += [((name, number), piece) for number, piece in enumerate(parts, 1)]
     return pieces
 
 

@@ -61,7 +61,7 @@ class HomePort(Protocol):
         """Hand a record to the home; it is handled in order."""
         ...
 
-    def told(self, then: Callable[[], None]) -> None:
+    def when_told(self, then: Callable[[], None]) -> None:
         """Call this when all that was handed over is on its way."""
         ...
 
@@ -324,7 +324,7 @@ class Life:
             self.returned.clear()
         self.port.to_home(Live(self._restore_seconds))
         if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
-            self.port.told(self._snapshot_of_replay)  # The actor is released meanwhile.
+            self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.
         postponed, self.postponed = self.postponed, []
         for call in postponed:
             self.cell.urge(call)

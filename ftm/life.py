@@ -96,7 +96,7 @@ class Nowhere:
     def to_home(self, record: ToHome) -> None:
         """Nobody hears it."""
 
-    def told(self, then: Callable[[], None]) -> None:
+    def when_told(self, then: Callable[[], None]) -> None:
         """There is nobody to tell."""
 
     def closed(self) -> None:

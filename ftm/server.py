@@ -413,7 +413,7 @@ class Server(Points):
             case _:
                 pass
 
-    def told(self, then: Callable[[], None]) -> None:
+    def when_told(self, then: Callable[[], None]) -> None:
         """It is on its way at once."""
         then()
 

@@ -6,8 +6,9 @@ import functools
 import math
 import re
 import sys
+from itertools import accumulate
 from operator import attrgetter
-from typing import Any, Final, cast
+from typing import Any, Final, TypeAlias, cast
 
 from ..errors import DamagedValue, UnsavableValue
 from .forms import ARRAY, ARRAYS, BITS, GENERATOR, RANDOM_STATE, SEED, TEXT, Blob, Make
@@ -17,6 +18,7 @@ _LAST_POSITION: Final = {"MT19937": 624, "Philox": 4, "PCG64": 0, "PCG64DXSM": 0
 _SMALL: Final = 1024  # bytes of an array that are copied at once
 _DTYPE_OF: Final = attrgetter("dtype")
 _SHAPE_OF: Final = attrgetter("shape")
+_SIZE_OF: Final = attrgetter("nbytes")
 _DTYPE: Final = re.compile(r"[<>|=]([biufcSUV]\d{1,9}|[qQ]|[mM]8(\[([1-9]\d{0,8})?[a-zA-Z]+\])?)")
 
 
@@ -48,18 +50,29 @@ def _plain_dtypes() -> dict[int, str]:
     return {id(dtype): _dtype_parts(dtype) for dtype in dtypes}
 
 
-def rows_of(arrays: list[Any]) -> tuple[str, tuple[int, ...], Blob] | None:
-    """dtype and shape that all of these small arrays of numbers have, and the bytes of all; else None."""
+Shapes: TypeAlias = tuple[int, ...] | list[tuple[int, ...]]
+"""Of some arrays: the one that all of them have, or a list of those of each."""
+
+
+def arrays_parts(arrays: list[Any]) -> tuple[str, Shapes, Blob] | None:
+    """dtype, shapes and bytes of arrays of numbers that have one dtype and lie in C order; None of others."""
     first = arrays[0]
-    dtype, shape = _plain_dtypes().get(id(first.dtype)), first.shape
-    if dtype is None or not shape or not 0 < first.nbytes <= _SMALL or len({*map(type, arrays)}) > 1:
+    dtype = _plain_dtypes().get(id(first.dtype))
+    if dtype is None or len({*map(type, arrays)}) > 1 or len({*map(id, map(_DTYPE_OF, arrays))}) > 1:
         return None
-    if len({*map(id, map(_DTYPE_OF, arrays))}) > 1 or len({*map(_SHAPE_OF, arrays)}) > 1:
+    if sum(map(_SIZE_OF, arrays)) <= len(arrays) * _SMALL:
+        try:
+            blob = Blob(b"".join(arrays))
+        except TypeError:  # Not all of them lie in C order.
+            return None
+    elif all(array.flags.c_contiguous for array in arrays):
+        uint8 = _numpy().uint8
+        blob = Blob(*(array.reshape(-1).view(uint8) for array in arrays if array.nbytes))
+    else:
         return None
-    try:
-        return dtype, shape, Blob(b"".join(arrays))
-    except TypeError:  # Not all of them lie in C order.
-        return None
+    shapes = [*map(_SHAPE_OF, arrays)]
+    is_one = first.ndim and first.size and shapes.count(first.shape) == len(shapes)
+    return dtype, first.shape if is_one else shapes, blob
 
 
 def array_form(np: Any, kind: Any, x: Any, *, in_order: bool) -> list[Any] | None:
@@ -133,9 +146,7 @@ def _make_dtype(parts: Any) -> Any:
 
 def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview) -> Any:
     made = _make_dtype(dtype)
-    sizes = cast("tuple[int, ...]", shape if type(shape) is tuple else (-1,))
-    # Numpy would take a size of -1 for "as many as there are", and divide by the size of an item.
-    if min(sizes, default=0) < 0 or math.prod(sizes) * made.itemsize != len(data):
+    if _size(shape, made) != len(data):
         raise DamagedValue(f"it has {len(data)} bytes for an array of shape {shape} and dtype {made}")
     array = _numpy().ndarray(shape, made, data, order=order or "C").copy(order or "C")
     if array.shape != shape:
@@ -143,14 +154,27 @@ def _make_array(dtype: Any, shape: Any, order: Any, data: memoryview) -> Any:
     return array if order else array[()]
 
 
-def _make_arrays(dtype: str, shape: tuple[int, ...], data: memoryview, *others: Any) -> list[Any]:
-    """The arrays of `rows_of`; `others` are positions, and what stands there in place of the row."""
-    made = _named_dtype(dtype)
-    size = math.prod(shape) * made.itemsize if type(shape) is tuple and min(shape, default=0) > 0 else 0
-    if not size or len(data) % size:  # Rows of no bytes could be any number.
-        raise DamagedValue(f"it has {len(data)} bytes for arrays of shape {shape} and dtype {made}")
-    numpy = _numpy()
-    arrays = [*map(numpy.ndarray.copy, numpy.ndarray((len(data) // size, *shape), made, data))]
+def _size(shape: Any, dtype: Any) -> int:
+    """Bytes of an array."""
+    sizes = cast("tuple[int, ...]", shape if type(shape) is tuple else (-1,))
+    if min(sizes, default=0) < 0:  # Numpy would take -1 for "as many as there are", and divide by the size of an item.
+        raise DamagedValue(f"it has an array of shape {shape}")
+    return math.prod(sizes) * int(dtype.itemsize)
+
+
+def _make_arrays(dtype: str, shapes: Shapes, data: memoryview, *others: Any) -> list[Any]:
+    """The arrays of `arrays_parts`; `others` are positions, and what stands there instead."""
+    made, ndarray = _named_dtype(dtype), _numpy().ndarray
+    if type(shapes) is list:
+        ends = [*accumulate((_size(shape, made) for shape in shapes), initial=0)]
+        if ends[-1] != len(data):
+            raise DamagedValue(f"it has {len(data)} bytes for arrays of {ends[-1]}")
+        arrays = [ndarray(shape, made, data, begin).copy() for shape, begin in zip(shapes, ends, strict=False)]
+    else:
+        size = _size(shapes, made)
+        if not shapes or not size or len(data) % size:  # Arrays of no bytes could be any number.
+            raise DamagedValue(f"it has {len(data)} bytes for arrays of shape {shapes} and dtype {made}")
+        arrays = [*map(ndarray.copy, ndarray((len(data) // size, *shapes), made, data))]
     for position, other in zip(others[::2], others[1::2], strict=True):
         arrays[position] = other
     return arrays

@@ -26,10 +26,10 @@ HEAD: Final = struct.Struct(">BBQ")  # format, flag, length of the tree
 
 
 class Blob:
-    """A buffer that goes behind the tree: it is copied once, when the pieces are joined."""
+    """Bytes in one or more buffers that go behind the tree: they are copied once, when the pieces are joined."""
 
-    def __init__(self, buffer: Any) -> None:
-        self.buffer = buffer  # no memoryview: as long as one lives, a bytearray cannot grow
+    def __init__(self, *buffers: Any) -> None:
+        self.buffers = buffers  # no memoryviews: as long as one lives, a bytearray cannot grow
 
 
 class Mark(int):

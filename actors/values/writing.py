@@ -15,7 +15,7 @@ import msgspec
 from msgpack import ExtType
 
 from ..errors import UnsavableValue, type_name
-from .arrays import array_form, is_array, parts_of_array, rows_of
+from .arrays import array_form, arrays_parts, is_array, parts_of_array
 from .classes import class_mark, class_name, class_parts, factory_name, slots_of
 from .forms import (
     AGAIN,
@@ -137,27 +137,27 @@ class _Encoder:
         return [mark, *(parts if are_scalars(map(type, parts)) else self.each(x, parts))]
 
     def alike(self, x: list[Any]) -> list[Any] | None:
-        """A list of tuples of scalars, or of small arrays of one dtype and shape, without a look at each; else None."""
+        """A list of tuples of scalars, or of arrays of one dtype, in a few steps for all of it; None of others."""
         if len(x) < MANY or self.canonical:
             return None
         first = type(x[0])
         if first is tuple and {*map(type, x)} == {tuple} and are_scalars(map(type, chain.from_iterable(x))):
             self.has_marks = True
             return [TUPLES, *x]
-        return self.rows(x) if is_array(first) else None
+        return self.arrays(x) if is_array(first) else None
 
-    def rows(self, x: list[Any]) -> list[Any] | None:
-        """Small arrays as the rows of one; those that are reached twice follow, with their positions."""
+    def arrays(self, x: list[Any]) -> list[Any] | None:
+        """Arrays one behind the other in one buffer; those that are reached twice follow, with their positions."""
         keys = [*map(id, x)]
         once = {*keys}
         twice = (self.walked.keys() & once) | (self.shared & once)
         if len(once) < len(keys):
             twice.update(key for key, times in Counter(keys).items() if times > 1)
-        if len(twice) > len(once) // MANY or (rows := rows_of(x)) is None:
+        if len(twice) > len(once) // MANY or (parts := arrays_parts(x)) is None:
             return None
         self.has_marks = True
-        dtype, shape, blob = rows
-        lowered: list[Any] = [ARRAYS, dtype, [TUPLE, *shape], blob]
+        dtype, shapes, blob = parts
+        lowered: list[Any] = [ARRAYS, dtype, [TUPLE if type(shapes) is tuple else TUPLES, *shapes], blob]
         if twice:
             lowered += chain.from_iterable((at, self.lowered(x[at])) for at, key in enumerate(keys) if key in twice)
         self.walked.update(zip(keys, x, strict=True))
@@ -213,8 +213,8 @@ class _Encoder:
     def default(self, x: Any) -> Any:
         """What the packer packs in place of `x`, for which msgpack has no type."""
         if type(x) is Blob:
-            self.blobs.append(x.buffer)
-            return [BUFFER, len(x.buffer)]
+            self.blobs += x.buffers
+            return [BUFFER, sum(map(len, x.buffers))]
         return ExtType(0, x.to_bytes(x.bit_length() // 8 + 1, "big", signed=True))
 
 

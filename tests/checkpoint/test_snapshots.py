@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.image import Imager, read_image
+from holdfast.checkpoint.image import LARGE, Imager, read_image
 from tests.checkpoint.image_player import MANY, Canvas, Digest, Paint, Spoil, Write
 from tests.checkpoint.players import start, until
 from tests.checkpoint.strikes import NEVER, event, strike
@@ -181,6 +181,16 @@ def test_variables_that_share_something_come_back_sharing_it() -> None:
     assert back["f"] is not back["a"]
     assert {name: back[name] for name in "abef"} == {name: state[name] for name in "abef"}
     assert (back["c"] == array).all()
+
+
+@pytest.mark.parametrize("other", [[], [np.zeros(3)]], ids=["alike", "unlike"])
+def test_buffers_lie_where_they_lay_when_one_more_has_come(other: list[Any]) -> None:
+    photos = [*other, *(np.full(2000 + number, number, np.uint8) for number in range(100))]
+    before = dict(Imager().image(0, "keys", {"photos": photos}, "/map"))
+    photos.append(np.ones(2000, np.uint8))
+    after = dict(Imager().image(0, "keys", {"photos": photos}, "/map"))
+    assert len(bytes(before["photos", 2])) > LARGE
+    assert bytes(after["photos", 2]).startswith(bytes(before["photos", 2]))
 
 
 def test_an_image_with_any_byte_of_its_head_damaged_is_refused_or_reads_the_same_arrays() -> None:

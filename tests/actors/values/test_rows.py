@@ -42,6 +42,14 @@ def test_arrays_that_are_alike_take_hardly_more_than_their_bytes() -> None:
     assert is_same(result[4], trail[4])
 
 
+def test_arrays_of_one_dtype_and_many_shapes_take_hardly_more_than_their_bytes() -> None:
+    scans = [np.arange(number % 40).reshape(-1, *[1] * (number % 3)) for number in range(100)] + [np.array(5)]
+    assert len(encode_value(scans)) < sum(scan.nbytes for scan in scans) + 100 * 12
+    result = again(scans)
+    assert is_same(result, scans)
+    assert all(scan.flags.owndata and scan.flags.writeable for scan in result)
+
+
 def test_an_array_that_is_in_the_list_and_elsewhere_is_one_object_again() -> None:
     trail = poses(100)
     for state in ({"pose": trail[99], "trail": trail}, {"trail": trail, "pose": trail[99]}):
@@ -82,11 +90,17 @@ def test_refusal_names_the_entry() -> None:
 
 def test_what_was_saved_so_can_be_read_for_ever() -> None:
     shared = np.array([3, 4], "<i2")
-    value = [shared, [np.array([number, 1], "<i2") for number in range(8)] + [shared], [(1, "a")] * 8]
+    value = [
+        shared,
+        [np.array([number, 1], "<i2") for number in range(8)] + [shared],
+        [np.zeros((number % 2, 1), "<i2") for number in range(8)],
+        [(1, "a")] * 8,
+    ]
     data = bytes.fromhex(
-        "010100000000000000569393c700200095c70030a33c693292c7000102a14392c700220496c70036a33c693292c700010292c700"
-        "22240892c700210099c700289201a1619201a1619201a1619201a1619201a1619201a1619201a1619201a1610300040000000100"
-        "0100010002000100030001000400010005000100060001000700010003000400"
+        "0101000000000000007f9493c700200095c70030a33c693292c7000102a14392c700220496c70036a33c693292c700010292c700"
+        "22240892c700210094c70036a33c693299c7002892000192010192000192010192000192010192000192010192c700220899c700"
+        "289201a1619201a1619201a1619201a1619201a1619201a1619201a1619201a16103000400000001000100010002000100030001"
+        "0004000100050001000600010007000100030004000000000000000000"
     )
     assert is_same(decode_value(data), value)
 
@@ -96,7 +110,8 @@ READ_ONLY.flags.writeable = False
 NUMBERS = np.arange(40.0).reshape(4, 10)
 ENTRIES: list[Any] = [
     *ARRAYS, READ_ONLY, NUMBERS[0, :3], NUMBERS[1, ::4], NUMBERS[:3, 0], NUMBERS[0, :3].astype(">f8"), np.zeros((0,)),
-    np.zeros((3, 1)), np.zeros((1, 3)), np.zeros((3, 2), order="F"), np.zeros((3, 2)), np.zeros(200), np.arange(3),
+    np.zeros((3, 1)), np.zeros((1, 3)), np.zeros((3, 2), order="F"), np.zeros((3, 2)), np.zeros(200),
+    np.zeros((20, 20), order="F"), np.zeros(400)[::2], np.zeros(100, "G"), np.arange(3),
     np.arange(3, dtype="q"), (1, 2.5), (3, "x"), (), [1], None, 5,
 ]  # fmt: skip
 like = st.sampled_from(
