@@ -1,4 +1,4 @@
-"""Protected actors below a supervisor with a process of its own: the replicas are the root's, the decisions are there."""
+"""Protected actors below a supervisor with a process of its own: it decides, and the replicas are the root's."""
 
 from __future__ import annotations
 
