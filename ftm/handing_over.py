@@ -42,8 +42,6 @@ def worker_of(place: SubtreeHome, cell: Cell) -> Worker:
 class OutOfSubtree(ToGroup):
     """A recorded life goes from the process of its supervisor to a group at the root."""
 
-    host: SubtreeGroup
-
     def __init__(self, cell: Cell, place: SubtreeHome, mechanism: Any, timeout: float) -> None:
         spec = recipe_spec(cell)
         if spec is None:
@@ -51,6 +49,7 @@ class OutOfSubtree(ToGroup):
         host = SubtreeGroup(place, place.method, compose(mechanism))
         host.prepare(pack_recipe(spec.start, cell.path), list(spec.start.kind._topics))
         super().__init__(cell, host, timeout)
+        self._new_host = host
         self._place, self._spec, self._worker = place, spec, worker_of(place, cell)
         self._switch = place.switch
 
@@ -89,7 +88,7 @@ class OutOfSubtree(ToGroup):
 
     def _switch_over(self, live: Live) -> None:
         """From here on the group is the one."""
-        cell, host, group, switch, more = self.cell, self.host, self._group, self._switch, self.cell.extra()
+        cell, host, group, switch, more = self.cell, self._new_host, self._group, self._switch, self.cell.extra()
         assert self.transit is not None
         assert group is not None
         assert switch is not None

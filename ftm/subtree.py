@@ -209,7 +209,7 @@ def subtree_group(place: SubtreeHome, cell: Cell, wanted: Wanted, before: Any) -
     """
     made = wanted.protected
     assert made is not None
-    layers = tuple(map(_revived, msgspec.convert(made.layers, list[Description])))
+    layers = tuple(map(known, msgspec.convert(made.layers, list[Description])))
     check_stack(layers, None, cell.path)
     problem = place.homes.refuses(wanted.method)
     if problem:
@@ -224,7 +224,7 @@ def subtree_group(place: SubtreeHome, cell: Cell, wanted: Wanted, before: Any) -
     return SubtreeGroup(place, wanted.method, layers)
 
 
-def _revived(description: Description) -> Mechanism:
+def known(description: Description) -> Mechanism:
     """The mechanism that is meant, if its code is here already: nothing is imported for an actor process.
 
     Raises:
