@@ -267,7 +267,7 @@ class InnerLifeHost(LifeHost):
         cell.host, cell.admit = self, self._admit
 
     def let_go(self) -> Life:
-        """The life that is lived here, which is at rest, is not that of the address any more; its home hears no more."""
+        """The life that is lived here, which is at rest, is not the address's any more; its home hears no more."""
         life, self._life = self._life, None
         assert life is not None
         assert self._port is not None

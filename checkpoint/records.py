@@ -122,7 +122,10 @@ class Begin(msgspec.Struct, array_like=True, tag=6):
 
 
 class Started(msgspec.Struct, array_like=True, tag=7):
-    """The start that was wanted as `number` has come to its end: a good one, or (`problem`) not, or it is not wanted."""
+    """The start that was wanted as `number` has come to its end: a good one, or (`problem`) not.
+
+    `is_ignored`: it does not want to be started.
+    """
 
     number: int
     problem: str = ""
@@ -148,13 +151,13 @@ class Over(msgspec.Struct, array_like=True, tag=9):
 
 
 class Respec(msgspec.Struct, array_like=True, tag=10):
-    """The child has other mechanisms from now on, also in its next lives: the layers as data, none if there are none."""
+    """The child has other mechanisms from now on, also in its next lives: layers as data, none if there are none."""
 
     layers: list[Any]
 
 
 class Attached(msgspec.Struct, array_like=True, tag=31):
-    """The life, which is at rest, is lived by replicas at the root from now on, as that which was wanted as `number`."""
+    """The life, which is at rest, is lived by replicas at the root from now on, as the one wanted as `number`."""
 
     number: int
     layers: list[Any]

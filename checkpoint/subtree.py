@@ -47,6 +47,10 @@ class Lived(Host, Protocol):
         """Its supervisor has died with its process."""
         ...
 
+    def left(self) -> list[asyncio.Task[None]]:
+        """What has to come to its end before another life may begin."""
+        ...
+
 
 Protect = Callable[["SubtreeHome", Cell, Wanted, "Lived | None"], Lived]
 """Gives the host of such a child; the last one, if there was one. Raises HoldfastError: it cannot be had."""
@@ -118,6 +122,7 @@ class SubtreeHome(HomeHost):
         self.homes, self.path = homes, path
         self._protect = protect
         self._group: Lived | None = None  # has the lives of a protected child
+        self._next: Wanted | None = None  # begins when nothing is left of a group
         self.arriving: Callable[[ToHome], None] | None = None  # hears a life that is to come back into the process
         self.switch: Switch | None = None
         self.clock = None
@@ -142,7 +147,9 @@ class SubtreeHome(HomeHost):
         if isinstance(record, Wanted):
             self._begin(record)
         elif isinstance(record, Closed) and self.arriving is None:
-            if self._group is not None:
+            if self._next is not None:
+                self._next = None  # There was none yet.
+            elif self._group is not None:
                 self._group.closed(record)
             elif self._wanted is not None and record.number == self._wanted.number:
                 self._closed(unpack_exit(record.reason), recovers=record.recovers)
@@ -156,6 +163,11 @@ class SubtreeHome(HomeHost):
         worker, top = self._worker, self._top
         assert worker is not None
         assert top is not None
+        left = [] if self._group is None else self._group.left()
+        if left:
+            self._next = wanted
+            asyncio.gather(*left, return_exceptions=True).add_done_callback(lambda _: self._begin_next(wanted))
+            return
         self._wanted = wanted
         self.method, self.restarting = wanted.method, False
         if self.cell is not None and self.cell.state is GONE:
@@ -186,6 +198,11 @@ class SubtreeHome(HomeHost):
             switch.attach(port)
             self._send_calls(cell, worker)
             self._run(cell, self._follow(cell, wanted, live, recovering))
+
+    def _begin_next(self, wanted: Wanted) -> None:
+        if self._next is wanted:
+            self._next = None
+            self._begin(wanted)
 
     # -- lives that are handed over while they are lived ------------------------------------------------------------
 
@@ -220,6 +237,7 @@ class SubtreeHome(HomeHost):
         except HoldfastError as error:
             port.to_life(Started(wanted.number, str(error)))
             return
+        cell.host = self._group
         self._group.begin(cell, wanted, port)
 
     def _run(self, cell: Cell, start: Coroutine[Any, Any, None]) -> None:
@@ -298,6 +316,8 @@ class SubtreeHome(HomeHost):
 
     def lost(self, worker: Worker, reason: ExitReason) -> None:
         """The process is gone, and the life with it."""
+        if worker is self._worker:
+            self._next = None
         if worker is self._worker and self._group is not None and self.cell is not None:
             self._group.lost(self.cell, reason)
         elif worker is self._worker and self._wanted is not None:

@@ -387,6 +387,7 @@ class AdaptationEngine(Actor):
                 if cell is None:
                     raise CannotAdapt(group.place(name), "it has ended")
                 asked[name] = cell.ref.ask(message, timeout=seconds)
+                asked[name].add_done_callback(_heard)  # If this actor is killed, nobody looks at it.
             except HoldfastError as error:
                 errors[name] = error
         if asked:

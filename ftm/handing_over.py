@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..actors.cell import Cell
-from ..actors.control.moving import now
+from ..actors.control.moving import Transit, now
 from ..actors.errors import CannotMove, StartFailed
 from ..actors.exits import unpack_exit
 from ..actors.process import frames
@@ -42,8 +42,6 @@ def worker_of(place: SubtreeHome, cell: Cell) -> Worker:
 class OutOfSubtree(ToGroup):
     """A recorded life goes from the process of its supervisor to a group at the root."""
 
-    host: SubtreeGroup
-
     def __init__(self, cell: Cell, place: SubtreeHome, mechanism: Any, timeout: float) -> None:
         spec = recipe_spec(cell)
         if spec is None:
@@ -51,6 +49,7 @@ class OutOfSubtree(ToGroup):
         host = SubtreeGroup(place, place.method, compose(mechanism))
         host.prepare(pack_recipe(spec.start, cell.path), list(spec.start.kind._topics))
         super().__init__(cell, host, timeout)
+        self._new_host = host
         self._place, self._spec, self._worker = place, spec, worker_of(place, cell)
         self._switch = place.switch
 
@@ -89,7 +88,7 @@ class OutOfSubtree(ToGroup):
 
     def _switch_over(self, live: Live) -> None:
         """From here on the group is the one."""
-        cell, host, group, switch, more = self.cell, self.host, self._group, self._switch, self.cell.extra()
+        cell, host, group, switch, more = self.cell, self._new_host, self._group, self._switch, self.cell.extra()
         assert self.transit is not None
         assert group is not None
         assert switch is not None
@@ -109,14 +108,16 @@ class OutOfSubtree(ToGroup):
         self.moved()
 
     def undo(self) -> None:
+        cell = self.cell
         self._worker.on_move = lambda data: None
-        self.cell.extra().trap_exits = False
+        cell.extra().trap_exits = False
         if self.is_late:
-            self._home = None  # There is no life to go on with.
-        else:
-            self._say("back")
+            self.ending = asyncio.ensure_future(self.host.dismantle(cell))
+            settle_in(cell, self.transit)
+            return
+        self._say("back")
         super().undo()
-        self.cell.scheduled = True  # Nothing of it runs here.
+        cell.scheduled = True  # Nothing of it runs here.
 
 
 class IntoSubtree(ToRecordedTask):
@@ -183,7 +184,14 @@ class IntoSubtree(ToRecordedTask):
     def undo(self) -> None:
         self._place.arriving = None
         if self.is_late:
-            self._home = None  # The next life begins as its spec says.
-        elif self.transit is not None:
+            settle_in(self.cell, self.transit)
+            return
+        if self.transit is not None:
             self._port.to_life(Returned(is_kept=False))
         super().undo()
+
+
+def settle_in(cell: Cell, transit: Transit | None) -> None:
+    """The life that was on its way has ended: the next one, if it has begun already, has its own place."""
+    if transit is not None:
+        transit.over(cell, transit.old if cell.host is transit else cell.host)

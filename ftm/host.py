@@ -314,6 +314,8 @@ class GroupHost(Steered):
 
     def _fell(self, cell: Cell, group: Group) -> None:
         """No replica is left that could lead: the life is over, and whose fault it was may be known."""
+        if cell.host is not self:
+            return  # It has never been its life: another one goes on.
         self._has_joined()
         suspect = group.only_suspect_input()
         self._careful = {one.feed.id for one in group.out.requests} if group.out is not None else set()
@@ -335,7 +337,7 @@ class GroupHost(Steered):
         """The mechanism's supervisor has given up."""
         if group is self.group and not group.is_over:
             group.is_over, group.why = True, "the supervisor of its mechanism has given up"
-            self._fell(cell, group)
+            group.on_over(group.why)
 
     def _ended_itself(self, cell: Cell, reason: ExitReason) -> None:
         if cell.state is RUNNING and self._ending is None:

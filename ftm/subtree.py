@@ -18,7 +18,6 @@ import msgspec
 from ..actors import links, lives
 from ..actors.actor import Start
 from ..actors.cell import DOWN, RUNNING, Cell
-from ..actors.control.moving import Transit
 from ..actors.errors import HoldfastError, StartFailed, StartIgnored
 from ..actors.exits import ExitReason, pack_exit, unpack_exit
 from ..actors.process.recipe import pack_recipe
@@ -55,7 +54,7 @@ class SubtreeGroup(GroupHost):
     # -- what the supervisor says -----------------------------------------------------------------------------------
 
     def begin(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
-        """Begin the life that is wanted, as soon as nothing is left of the last one."""
+        """Begin the life that is wanted; nothing is left of the last one."""
         made = wanted.protected
         assert made is not None
         self._wanted, self._port = wanted, port
@@ -63,24 +62,18 @@ class SubtreeGroup(GroupHost):
         self._stop_wanted, self._is_restarting, self._last = None, False, None
         for name, path in made.bindings.items():
             cell.extra().bindings.setdefault(name, cell.node.cell_at(path))
-        left = [task for task in (self._ending, self._starting) if task is not None and not task.done()]
-        entered = None if left else self.enter(cell)  # Now: from here on what is sent is admitted by the home.
+        entered = self.enter(cell)  # Now: from here on what is sent is admitted by the home.
         self._starting = cell.node.loop.create_task(
-            self._begin(cell, wanted, port, left, entered),
+            self._begin(cell, wanted, port, entered),
             name=f"start of {cell.path}",
             context=cell.node.base_context.copy(),  # Not in that of the socket, which is whoever's had the process.
         )
         self._starting.add_done_callback(seen)
 
-    async def _begin(
-        self, cell: Cell, wanted: Wanted, port: RemoteLife, left: list[asyncio.Task[None]], entered: Any
-    ) -> None:
+    async def _begin(self, cell: Cell, wanted: Wanted, port: RemoteLife, entered: Any) -> None:
         outcome = Started(wanted.number)
         try:
-            if left:
-                await asyncio.wait(left)
-            if self._wanted is wanted:
-                await self._recover(cell, *(entered or self.enter(cell)))
+            await self._recover(cell, *entered)
         except asyncio.CancelledError:
             outcome.problem = STOPPED_STARTING
         except HoldfastError as error:
@@ -113,6 +106,10 @@ class SubtreeGroup(GroupHost):
 
     def _described(self) -> list[Any]:
         return [msgspec.to_builtins(layer.describe()) for layer in self.layers]
+
+    def left(self) -> list[asyncio.Task[None]]:
+        """What has to come to its end before another life may begin."""
+        return [task for task in (self._ending, self._starting) if task is not None and not task.done()]
 
     def closed(self, record: Closed) -> None:
         """The supervisor has heard of the end of a life, or gives up its start."""
@@ -212,7 +209,7 @@ def subtree_group(place: SubtreeHome, cell: Cell, wanted: Wanted, before: Any) -
     """
     made = wanted.protected
     assert made is not None
-    layers = tuple(map(_revived, msgspec.convert(made.layers, list[Description])))
+    layers = tuple(map(known, msgspec.convert(made.layers, list[Description])))
     check_stack(layers, None, cell.path)
     problem = place.homes.refuses(wanted.method)
     if problem:
@@ -221,16 +218,13 @@ def subtree_group(place: SubtreeHome, cell: Cell, wanted: Wanted, before: Any) -
     if spec is not None and pack_recipe(spec.start, cell.path) == made.recipe:
         cell.spec = dataclasses.replace(spec, mechanism=layers[0] if len(layers) == 1 else layers)
         cell.extra().start = spec.start
-    is_there = cell.host is before or isinstance(cell.host, Transit)
-    if isinstance(before, SubtreeGroup) and is_there and describe(before.layers) == describe(layers):
+    if isinstance(before, SubtreeGroup) and describe(before.layers) == describe(layers):
         before.method = wanted.method
         return before
-    group = SubtreeGroup(place, wanted.method, layers)
-    cell.host = group
-    return group
+    return SubtreeGroup(place, wanted.method, layers)
 
 
-def _revived(description: Description) -> Mechanism:
+def known(description: Description) -> Mechanism:
     """The mechanism that is meant, if its code is here already: nothing is imported for an actor process.
 
     Raises:

@@ -93,6 +93,22 @@ async def test_an_attached_actor_survives_the_death_of_its_primary(system: hf.Ac
     load.check(await ref.ask(Tags()))
 
 
+async def test_an_attach_whose_replica_dies_while_it_starts_leaves_the_life(system: hf.ActorSystem) -> None:
+    """It goes on in its first life, with its state."""
+    ref = await system.start(hf.child("alice", hf.start(Counter)))
+    assert await ref.ask(Add(0)) == 1
+    attaching = asyncio.ensure_future(attach(system, ref))
+    async with asyncio.timeout(10):
+        while f"{ref.path}/ftm/r1" not in system._workers.processes():
+            await asyncio.sleep(0)
+    os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
+    with pytest.raises(hf.TransactionFailed, match="could not be started"):
+        await attaching
+    assert await gone(system, ref)
+    assert await ref.ask(Add(1)) == 2
+    assert ref._cell.life == 1
+
+
 async def test_detached_while_nobody_leads_and_nothing_is_inside(system: hf.ActorSystem, recovery: Any) -> None:
     """Nothing has to come out, and yet it waits until somebody can say what the state is."""
     ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery, mechanism=PBR()))

@@ -15,6 +15,7 @@ from tests.removing import Check, copied, is_true, missed, without
 
 JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
+SUBTREE = "tests/ftm/test_subtree.py"
 FAILOVER, CHECKS_ALONE = "tests/ftm/test_failover.py", "tests/ftm/test_checks.py"
 CHECKS = {
     "T36: a batch of an earlier epoch is refused": Check(
@@ -296,6 +297,34 @@ CHECKS = {
         "        late = 0.0\n",
         "tests/ftm/test_detector.py",
         "test_an_observer_that_was_held_up",
+    ),
+    "a group that is no life yet does not end the one that is": Check(
+        "ftm/host.py",
+        "        if cell.host is not self:\n",
+        "        if False:\n",
+        "tests/ftm/test_attach.py",
+        "test_an_attach_whose_replica_dies",
+    ),
+    "a group ends with the process of its supervisor": Check(
+        "checkpoint/subtree.py",
+        "            self._group.lost(self.cell, reason)\n",
+        "            pass\n",
+        SUBTREE,
+        "test_the_group_ends",
+    ),
+    "the root loads nothing that an actor process names": Check(
+        "ftm/subtree.py",
+        "        if module not in sys.modules and module not in COMMON:\n",
+        "        if False:\n",
+        SUBTREE,
+        "test_the_root_loads_nothing",
+    ),
+    "a supervisor in a process hears what its child is protected by now": Check(
+        "ftm/subtree.py",
+        "                self._port.to_life(Respec(self._described()))\n",
+        "                pass\n",
+        "tests/ftm/test_subtree_changes.py",
+        "test_the_new_stack_holds",
     ),
     "a message that kills is found out": Check(
         "ftm/group.py",
