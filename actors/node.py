@@ -16,7 +16,7 @@ from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
 from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
-from .events import DeadLetter, Event, EventHub
+from .events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from .exits import ExitReason
 from .keeper import Keeper, NothingKept
 from .lives import LOCAL
@@ -50,6 +50,7 @@ class Node(RunLoop):
         self.kept: weakref.WeakKeyDictionary[Cell, Any] = weakref.WeakKeyDictionary()  # what outlives an actor's lives
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
+        self.gave_up: SupervisorGaveUp | None = None  # the last supervisor here that did
         self.dead_letters = 0
         self.late_replies = 0
         self.wall: Callable[[], float] = time.time
