@@ -7,9 +7,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
 from ..actors.actor import Actor
+from ..actors.control.state import attributes
 from ..actors.errors import HoldfastError, type_name
 from ..actors.values import UnsavableValue, decode_value, encode_value
-from ..actors.values.classes import slots_of
 from .image import is_image, read_image
 from .method import Method
 
@@ -115,12 +115,6 @@ def key_names(actor: Actor) -> tuple[str, ...] | None:
         return named
     # A class with get_state means that, whatever else it says.
     return None if getattr(actor, "get_state", None) is not None else actor.key_variables
-
-
-def attributes(root: object) -> list[tuple[str, Any]]:
-    """Names and values of the attributes of an object, also of one with slots."""
-    slots = [(name, getattr(root, name)) for name in slots_of(type(root)) if hasattr(root, name)]
-    return [*getattr(root, "__dict__", {}).items(), *slots]
 
 
 def read_path(where: str, root: object, path: str) -> Any:
