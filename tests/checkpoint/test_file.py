@@ -1,4 +1,4 @@
-"""The recovery file: methods and key variables without a change to the program, and what is wrong in one (R17, R19)."""
+"""The recovery file: methods and key variables without a change to the program, and what is wrong in one (R17-R19)."""
 
 from __future__ import annotations
 
