@@ -128,6 +128,7 @@ class Actor:
                 table[handles.kind] = in_thread(handler) if handles.to_thread else handler
                 declared[handles.kind] = handles
             topics.extend(getattr(handler, "__topics__", ()))
+        _check_state(cls)
         cls._table, cls._declared, cls._topics = table, declared, tuple(topics)
         cls._bindings = cls._bindings | _declared_bindings(cls)
 
@@ -184,6 +185,15 @@ def _check(cls: type, name: str, handler: Any, kind: type) -> None:
         return
     if isinstance(declared, type) and declared is not Any and not issubclass(kind, declared):
         raise TypeError(f"{type_name(cls)}.{name} is @on({kind.__name__}) but takes a {declared.__name__}")
+
+
+def _check_state(cls: type[Actor]) -> None:
+    """Refuse what cannot say which variables are saved, when the class is made."""
+    names = cast("Any", cls.key_variables)
+    if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
+        raise TypeError(f"{type_name(cls)}.key_variables must be names, such as ('goal', 'pose.x'), not {names!r}")
+    if not isinstance(cls.schema_version, int) or isinstance(cls.schema_version, bool):
+        raise TypeError(f"{type_name(cls)}.schema_version must be a whole number, not {cls.schema_version!r}")
 
 
 def _declared_bindings(cls: type) -> frozenset[str]:

@@ -146,6 +146,13 @@ class SafeStateEntered(Event, frozen=True, eq=False):
     because: str
 
 
+class SafeStateMissed(Event, frozen=True, eq=False):
+    """Nobody was made safe for a recovery here, an address or the name of a binding; the recovery goes on."""
+
+    because: str
+    reason: str
+
+
 class SafeStateLeft(Event, frozen=True, eq=False):
     """An actor was told that all recoveries are over because of which it was safe; `because` is the last one's."""
 

@@ -216,7 +216,7 @@ def wrap(
         deterministic: whether the same messages lead to the same state; False refuses methods that replay.
 
     Raises:
-        TypeError: a method is not there, or does not take what the message has.
+        TypeError: a method is not there, or does not take what the message has; key_variables are no names.
 
     >>> class Counter:
     ...     def __init__(self) -> None:
@@ -231,6 +231,8 @@ def wrap(
         if not isinstance(factory, type):
             raise TypeError(f"wrap needs methods= or callbacks= for {factory!r}, which is no class")
         methods = {kind: method for method, kind in calls(factory).messages.items()}
+    if isinstance(key_variables, str):
+        raise TypeError(f"wrap: key_variables must be names, such as ('goal', 'robot.pose.x'), not {key_variables!r}")
     name = name or f"{getattr(factory, '__name__', 'program')}Actor"
     namespace: dict[str, Any] = {
         "__module__": sys._getframe(1).f_globals.get("__name__", __name__),

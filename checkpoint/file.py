@@ -76,12 +76,16 @@ class RecoveryFile:
 
     # -- what is asked of it ------------------------------------------------------------------------------------------
 
-    def check_classes(self) -> None:
-        """Look at the classes that it names.
+    def check(self, system: str) -> None:
+        """Look at the classes that it names, and whether its addresses can be some of this system.
 
         Raises:
-            SpecError: there is no such actor class.
+            SpecError: there is no such actor class, or the addresses are another system's.
         """
+        for name, _ in self._addresses:
+            fixed = re.split(r"[*?[]", name, maxsplit=1)[0]
+            if not fixed.startswith(f"/{system}/") and (fixed == name or not f"/{system}/".startswith(fixed)):
+                raise self._error(name, f"names no address of this system, which all begin with '/{system}/'")
         for name in self._classes:
             try:
                 kind = find_class(name)
@@ -222,7 +226,9 @@ def find_line(text: str, table: str, setting: str | None = None, value: str | No
 
 
 def _decodable(hint: Any) -> Any:
-    """A type as msgspec checks it; what it has no check for, the method's function checks."""
+    """A type as msgspec checks it; what it has no check for, or none that names the choices, the method's does."""
+    if any(typing.get_origin(one) is typing.Literal for one in (hint, *typing.get_args(hint))):
+        return Any
     try:
         msgspec.json.Decoder(hint)
     except TypeError:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+import inspect
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
 
 from ..actors.actor import Actor
+from ..actors.control.state import attributes
 from ..actors.errors import HoldfastError, type_name
 from ..actors.values import UnsavableValue, decode_value, encode_value
-from ..actors.values.classes import slots_of
 from .image import is_image, read_image
 from .method import Method
 
@@ -96,10 +98,7 @@ def put_back(actor: Actor, saved: Any) -> None:
     if version != actor.schema_version:
         state = migrated(type(actor), state, version, where)
     if form == "state":
-        set_state = getattr(actor, "set_state", None)
-        if set_state is None:
-            raise StateMismatch(where, f"{type_name(type(actor))} has no set_state")
-        set_state(state)
+        setter_of(actor)(state)
         return
     if not isinstance(state, dict):
         raise StateMismatch(where, f"its key variables came as {type_name(type(state))}, not as a dict")
@@ -116,12 +115,6 @@ def key_names(actor: Actor) -> tuple[str, ...] | None:
         return named
     # A class with get_state means that, whatever else it says.
     return None if getattr(actor, "get_state", None) is not None else actor.key_variables
-
-
-def attributes(root: object) -> list[tuple[str, Any]]:
-    """Names and values of the attributes of an object, also of one with slots."""
-    slots = [(name, getattr(root, name)) for name in slots_of(type(root)) if hasattr(root, name)]
-    return [*getattr(root, "__dict__", {}).items(), *slots]
 
 
 def read_path(where: str, root: object, path: str) -> Any:
@@ -173,6 +166,35 @@ def check_keys(actor: Actor, method: Method, *, first: bool) -> None:
             raise StateMismatch(where, f"{method.origin}: {error.problem}") from error
 
 
+def check_saved(actor: Actor, method: Method) -> None:
+    """Check, when an actor has been started for the first time, that its state can be saved and put back.
+
+    Raises:
+        UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there or cannot
+            be set, or the class lacks what puts its state back.
+    """
+    if method.snapshots and key_names(actor) is None and hasattr(actor, "get_state"):
+        setter_of(actor)
+    save_state(actor)
+    where, root = actor.ctx.path, actor._state_root()
+    for name in key_names(actor) or ():
+        write_path(where, root, name, read_path(where, root, name))
+
+
+def setter_of(actor: Actor) -> Callable[[Any], object]:
+    """What puts back a state that `get_state` has given.
+
+    Raises:
+        StateMismatch: there is none, or it is a coroutine function, which would only do it later.
+    """
+    set_state = getattr(actor, "set_state", None)
+    if set_state is None:
+        raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))} has no set_state, which goes with get_state")
+    if inspect.iscoroutinefunction(set_state):
+        raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))}.set_state is `async def`: it must be plain")
+    return cast("Callable[[Any], object]", set_state)
+
+
 def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
     """A state that an older version of the class has saved, as this one wants it.
 
@@ -181,11 +203,13 @@ def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
             stays as it is.
     """
     known = f"it has schema version {version}, {type_name(kind)} {kind.schema_version}"
+    if not isinstance(version, int) or version > kind.schema_version:
+        raise StateMismatch(where, f"{known}: an older class cannot read what a newer one has saved")
     migrate = getattr(kind, "migrate", None)
     if migrate is None:
         raise StateMismatch(where, f"{known}, which has no classmethod migrate(state, from_version)")
-    if not isinstance(version, int) or version > kind.schema_version:
-        raise StateMismatch(where, f"{known}: an older class cannot read what a newer one has saved")
+    if inspect.iscoroutinefunction(migrate):
+        raise StateMismatch(where, f"{known}, whose migrate is `async def`: it must be plain")
     try:
         return migrate(state, version)
     except Exception as error:

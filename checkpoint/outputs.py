@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ..actors.cell import GONE, Cell
 from ..actors.codec import Parcel
 from ..actors.errors import AskDeadlock, HoldfastError, MailboxFull
@@ -249,3 +251,9 @@ class Outputs:
 def switch_of(cell: Cell) -> Switch | None:
     """The switch of a recorded actor's cell."""
     return getattr(cell.host, "switch", None)
+
+
+def went_elsewhere(home: Switch, out: Out, digest: int) -> bool:
+    """Whether a replayed output is the same but for its receiver, for its binding was changed since."""
+    others = home.node.led.get(home.path, {}).get(out.to, ())
+    return any(msgspec.structs.replace(out, to=path).digest() == digest for path in others)

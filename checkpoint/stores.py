@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import get_args
 
 from ..actors.errors import SpecError
@@ -13,7 +14,8 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Jour
     """The journal that `store` names: None or "memory", or "sqlite:PATH"; or the open engine that it is.
 
     Raises:
-        SpecError: the name is of no known form. StoreInUse: another living process has it open.
+        SpecError: the name is of no known form, or its folder is not there. StoreInUse: another living process has it
+            open.
     """
     if store is None or store == "memory":
         return MemoryJournal()
@@ -22,6 +24,8 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Jour
     kind, _, path = store.partition(":")
     if kind != "sqlite" or not path:
         raise SpecError("store", f"must be None, 'memory', 'sqlite:PATH' or an engine, not {store!r}")
+    if not Path(path).parent.is_dir() or Path(path).is_dir():
+        raise SpecError("store", f"{store!r} must name a file in a folder that is there")
     from .sqlite import SqliteJournal  # only now: sqlite3 takes a while to import, and most tests need no store
 
     return SqliteJournal(path, takeover=takeover)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import datetime
+import importlib
 import os
 import random
 import secrets
@@ -80,6 +81,7 @@ def _drawing() -> dict[CodeType, str]:
 
 BUILTINS, FUNCTIONS, DRAWING = _builtins(), _functions(), _drawing()
 SHARED: random.Random = random._inst
+MADE = random.Random.__init__.__code__
 CLASS_CLOCKS = {("datetime", "now"), ("datetime", "utcnow"), ("datetime", "today"), ("date", "today")}
 
 
@@ -133,6 +135,8 @@ class Guard:
             known = FUNCTIONS.get(frame.f_code)
             if known is not None:
                 self._refuse(*known, frame.f_back)
+            elif frame.f_code is MADE and frame.f_locals["x"] is None:
+                self._refuse("random.Random, without a seed,", DICE, frame.f_back)
             elif frame.f_code in DRAWING:
                 drawn_from = frame.f_locals.get("self")
                 if drawn_from is SHARED:
@@ -164,9 +168,9 @@ class Guard:
 
 def numpy_state() -> Any:
     """Where numpy's shared generator stands, if numpy is loaded: its functions do not show as calls."""
-    numpy: Any = sys.modules.get("numpy.random.mtrand")
-    if numpy is None:
+    if "numpy" not in sys.modules:
         return None
-    state = numpy._rand.get_state(legacy=False)
+    mtrand: Any = importlib.import_module("numpy.random.mtrand")  # numpy itself loads it with its first use, in a turn.
+    state = mtrand._rand.get_state(legacy=False)
     inner = state["state"]
     return state["has_gauss"], state["gauss"], inner.get("pos"), inner["key"].tobytes() if "key" in inner else None

@@ -12,7 +12,7 @@ from ..actors.errors import HoldfastError, RemoteCrash, StartFailed
 from ..actors.exits import NORMAL, ExitReason, unpack_exit
 from ..actors.mail import LEAVE, Item, ReplyHandle
 from ..actors.message import Refusal
-from .keys import save_state
+from .keys import check_saved
 from .records import CRASH, DROPPED, LATER, OK, START, STASHED, Answer, Feed, Go
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ class Fed(Item):
         """The turn is over; a stashed message stays open."""
         life = self.life
         if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None and life.saves:
-            save_state(life.cell.actor)  # What cannot be saved is refused now, not when it is needed.
+            check_saved(life.cell.actor, life.method)  # What cannot be saved is refused now, not when it is needed.
         if self.is_stashed:
             life.close_turn(STASHED, Answer())
         else:

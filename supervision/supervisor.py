@@ -229,7 +229,9 @@ class Supervisor(Inquiries):
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
         one.state = STOPPED
         self._blame(one)
-        self.ctx.cell.node.emit(SupervisorGaveUp(self.ctx.path, one.spec.id, reason))
+        node = self.ctx.cell.node
+        node.gave_up = SupervisorGaveUp(self.ctx.path, one.spec.id, reason)
+        node.emit(node.gave_up)
         self.ctx.stop(told)
 
     def _blame(self, one: Child) -> None:

@@ -136,7 +136,7 @@ class ActorSystem(Recorded, Controls):
         recovery = self._recovery_file
         file = recovery if isinstance(recovery, RecoveryFile) or recovery is None else load_recovery(recovery)
         if file is not None:
-            file.check_classes()
+            file.check(self.name)
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
         engine = open_journal(self._store, takeover=self._takeover)
         self._homes = Homes(node, engine, durability=self._durability)
@@ -264,11 +264,13 @@ class ActorSystem(Recorded, Controls):
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._body is None or done.cancelled():
             return
-        self._failure = TreeFailed(self.name, self._why())
+        last, why = self.node.gave_up, "restart intensity reached"
+        if last is None or done.result() != SHUTDOWN:
+            why = f"its root has ended, {done.result()}"
+        if last is not None:
+            why += f"; the last to end was {last.address}/{last.child}: {last.reason}"
+        self._failure = TreeFailed(self.name, why)
         self._body.cancel()
-
-    def _why(self) -> str:
-        return "restart intensity reached by the children of the root"
 
     # -- starting and finding actors --------------------------------------------------------------------------------
 

@@ -142,3 +142,17 @@ def test_blocks_keep_their_lines() -> None:
 def test_a_block_cannot_escape_by_its_language(language: str) -> None:
     with pytest.raises(AssertionError, match="write"):
         list(python_blocks(f"```{language}\n1 / 0\n```\n"))
+
+
+CITED = re.compile(r"\b([RT])(\d+)([a-z]?)(?:-[RT](\d+))?\b")
+
+
+def test_requirements_are_listed_if_tests_cite_them_and_cited_if_they_are_listed() -> None:
+    """Those of recovery and the traps; a range, R29-R31, cites all in it."""
+    listed = set(re.findall(r"^\| ([RT]\d+[a-z]?) \|", (ROOT / "docs/requirements.md").read_text(), re.MULTILINE))
+    cited: set[str] = set()
+    for path in (ROOT / "tests").rglob("*.py"):
+        for letter, first, suffix, last in CITED.findall(path.read_text()):
+            numbers = range(int(first), int(last or first) + 1)
+            cited.update(f"{letter}{number}{suffix}" for number in numbers)
+    assert listed == cited

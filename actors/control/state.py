@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, cast
 
 from ..errors import ControlFailed, error_text, portable, type_name
 from ..values import UnsavableValue, decode_value, encode_value
+from ..values.classes import slots_of
 
 if TYPE_CHECKING:
     from ..actor import Actor
@@ -25,10 +27,22 @@ def live_state(actor: Actor) -> Any:
     get_state = getattr(actor, "get_state", None)
     if get_state is not None:
         return get_state()
-    names = actor.key_variables
+    root, names = actor._state_root(), actor.key_variables
     if names is None:
-        return {name: value for name, value in vars(actor).items() if not name.startswith("_") and name != "ctx"}
-    return {name: getattr(actor, name) for name in names}
+        return {name: value for name, value in attributes(root) if not name.startswith("_") and name != "ctx"}
+    return {name: operator.attrgetter(name)(root) for name in names}
+
+
+def attributes(root: object) -> list[tuple[str, Any]]:
+    """Names and values of the attributes of an object, also of one with slots."""
+    slots = [(name, getattr(root, name)) for name in slots_of(type(root)) if hasattr(root, name)]
+    return [*getattr(root, "__dict__", {}).items(), *slots]
+
+
+def _holder(root: object, path: str) -> tuple[Any, str]:
+    """What has the variable at a dotted path, and its name there."""
+    above, _, name = path.rpartition(".")
+    return operator.attrgetter(above)(root) if above else root, name
 
 
 def copied(state: Any, otherwise: Callable[[Any], Any]) -> Any:
@@ -72,11 +86,12 @@ def put_state(actor: Actor, state: Any) -> None:
         return
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
         raise ControlFailed(where, "replace_state", f"the state must be a dict of variables, not {state!r}")
+    root = actor._state_root()
     for name in live_state(actor):
         if name not in state:
-            delattr(actor, name)
+            delattr(*_holder(root, name))
     for name, value in state.items():
-        setattr(actor, name, value)
+        setattr(*_holder(root, name), value)
 
 
 def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
@@ -89,6 +104,7 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
     ctx.may_replace()
     kind, before = type(actor), dict(vars(actor))
     hooked = state_to_change(actor) if hasattr(actor, "set_state") else None
+    values = None if hasattr(actor, "get_state") else live_state(actor)
     try:
         put_state(actor, change(state_to_change(actor)))
         ctx.replaced()
@@ -96,6 +112,8 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
         actor.__class__ = kind
         vars(actor).clear()
         vars(actor).update(before)
+        if values is not None:
+            put_state(actor, values)  # They may be another object's than the actor's.
         if hooked is not None:
             actor.set_state(hooked)  # type: ignore[attr-defined]  # it has one, see above
         if not isinstance(error, Exception) or isinstance(error, ControlFailed):

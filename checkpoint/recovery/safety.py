@@ -10,11 +10,13 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ...actors import mailbox
+from ...actors.actor import Actor
 from ...actors.cell import DOWN, Cell
 from ...actors.codec import Parcel
-from ...actors.errors import HoldfastError, MailboxFull
-from ...actors.events import SafeStateEntered, SafeStateLeft, SafeStateOverdue
+from ...actors.errors import HoldfastError, MailboxFull, UnknownMessage, type_name
+from ...actors.events import SafeStateEntered, SafeStateLeft, SafeStateMissed, SafeStateOverdue
 from ...actors.lives import LOCAL
+from ...actors.node import cell_kind
 from ...actors.safe import SafeStateChange
 from ..outputs import switch_of
 from .settings import SafeState
@@ -29,11 +31,12 @@ Key = tuple[str, tuple[str, bytes] | None, tuple[str, bytes] | None]
 class Receiver:
     """One that is safe, or is being told that it is not any more."""
 
-    __slots__ = ("because", "holders", "is_told", "life", "outbox", "path", "timeout", "timer", "words")
+    __slots__ = ("because", "holders", "is_missed", "is_told", "life", "outbox", "path", "timeout", "timer", "words")
 
     def __init__(self, key: Key, timeout: float) -> None:
         self.path, self.words = key[0], key[1:]
         self.holders: dict[str, None] = {}  # the recoveries that want it to be safe, oldest first
+        self.is_missed = False  # whether telling it makes nobody safe
         self.is_told = False  # whether the last word it was given is that it has to be safe
         self.because = ""
         self.timeout = timeout
@@ -52,7 +55,12 @@ class Safety:
 
     def enter(self, path: str, state: SafeState, timeout: float) -> None:
         """The recovery of `path` wants its receivers to be safe; a second time changes nothing."""
-        for key in self._keys(path, state):
+        for to in state.to:
+            address = self._address(path, state, to)
+            if address is None:
+                self._node.emit(SafeStateMissed(to, path, "this binding leads nowhere"))
+                continue
+            key = address, state.enter, state.leave
             receiver = self._receivers.get(key)
             if receiver is None:
                 receiver = self._receivers[key] = Receiver(key, timeout)
@@ -63,9 +71,29 @@ class Safety:
     def _enter(self, receiver: Receiver, path: str) -> None:
         receiver.is_told, receiver.because = True, path
         receiver.timer = self._node.loop.call_later(receiver.timeout, self._overdue, receiver)
+        problem = self._problem(receiver)
+        receiver.is_missed = bool(problem)
         self._say(receiver, entered=True)
-        self._node.emit(SafeStateEntered(receiver.path, path))
+        self._node.emit(
+            SafeStateMissed(receiver.path, path, problem) if problem else SafeStateEntered(receiver.path, path)
+        )
         self.on_entered(receiver)
+
+    def _problem(self, receiver: Receiver) -> str:
+        """Why telling this receiver makes nobody safe, as far as it is known here; "" if it does."""
+        cell = self._node.cell_at(receiver.path)
+        if cell.is_dead:
+            return "nobody lives there"
+        kind, enter = cell_kind(cell), receiver.words[0]
+        if kind is None:
+            return ""
+        if enter is None:
+            return f"{type_name(kind)} has no on_safe_state" if kind.on_safe_state is Actor.on_safe_state else ""
+        try:
+            kind._table.kind_named(enter[0])
+        except UnknownMessage as error:
+            return str(UnknownMessage(type_name(kind), error.message))
+        return ""
 
     def leave(self, path: str) -> None:
         """The recovery of `path` is over; a second time changes nothing."""
@@ -76,7 +104,8 @@ class Safety:
                     receiver.timer.cancel()
                 receiver.because = path
                 self._say(receiver, entered=False)
-                self._node.emit(SafeStateLeft(receiver.path, path))
+                if not receiver.is_missed:
+                    self._node.emit(SafeStateLeft(receiver.path, path))
 
     def holds(self, path: str) -> tuple[str, ...]:
         """Who is safe because of the recovery of `path`."""
@@ -104,16 +133,13 @@ class Safety:
 
     # -- telling ----------------------------------------------------------------------------------------------------
 
-    def _keys(self, path: str, state: SafeState) -> list[Key]:
-        """The receivers that a method names; a binding leads where it leads now."""
-        more, ports = self._node.cell_at(path).more, dict(state.ports)
-        found: list[Key] = []
-        for to in state.to:
-            bound = more.bindings.get(to) if more is not None else None
-            address = to if to.startswith("/") else bound.path if bound is not None else ports.get(to)
-            if address is not None:
-                found.append((address, state.enter, state.leave))
-        return found
+    def _address(self, path: str, state: SafeState, to: str) -> str | None:
+        """Of a receiver that a method names; a binding leads where it leads now."""
+        if to.startswith("/"):
+            return to
+        more = self._node.cell_at(path).more
+        bound = more.bindings.get(to) if more is not None else None
+        return bound.path if bound is not None else dict(state.ports).get(to)
 
     def _say(self, receiver: Receiver, *, entered: bool, again: bool = False) -> None:
         if receiver.outbox and not entered:

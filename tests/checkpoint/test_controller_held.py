@@ -1,4 +1,8 @@
-"""What comes while an actor is recovered: held, bounded, let in in order; nothing else gets out (R32-R34, T14, T15)."""
+"""What comes while an actor is recovered: held, bounded, let in in order; nothing else gets out (R32-R34, T14, T15).
+
+The message switch stands between the actor and all others (R13); what it keeps from it is held (R41). What is replayed
+comes to the actor alone, as over a shadow topic (R38).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The recovery controller: phases, hooks, and its own death at every point (R12, R44, R46, R69, T17, T18)."""
+"""The recovery controller: phases, hooks, and its own death at every point (R12, R44, R46, R69, T17, T18).
+
+The four parts are actors (R16); a crash is noticed by the end of the life (R28), the release is the last phase (R40).
+"""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from tests.checkpoint.guards import (
     wheels,
     words,
 )
-from tests.checkpoint.players import Do, Note, Seen, start, until
+from tests.checkpoint.players import Do, Doer, Note, Seen, start, until
 from tests.checkpoint.strikes import event, strike, struck
 
 
@@ -253,9 +253,31 @@ async def test_nobody_to_tell_holds_nothing_up(isolation: str) -> None:
         with system.events() as stream:
             await struck(system, robot)
             await over(system)
-            letters = [one for one in stream.take() if isinstance(one, hf.DeadLetter)]
-        assert [one.address for one in letters if "no such" not in one.why] != []
+            told = stream.take()
+        (missed,) = [one for one in told if isinstance(one, hf.SafeStateMissed)]
+        assert (missed.address, missed.because, missed.reason) == ("/app/nowhere", robot.path, "nobody lives there")
+        assert not [one for one in told if isinstance(one, hf.SafeStateEntered | hf.SafeStateLeft)]
         assert await robot.ask(Seen()) == ["one"]
+
+
+@pytest.mark.parametrize(
+    ("state", "problem"),
+    [
+        ("wheels", ("wheels", "this binding leads nowhere")),
+        ("/app/doer", ("/app/doer", "Doer has no on_safe_state")),
+        (hf.safe_state("/app/doer", enter=Halt(0.5)), ("/app/doer", "Doer has no handler for tests.checkpoint.gu")),
+    ],
+)
+async def test_who_cannot_be_made_safe_is_told_of(isolation: str, state: Any, problem: tuple[str, str]) -> None:
+    async with running() as system:
+        await start(system, "task", "doer", hf.start(Doer))
+        robot = await start(system, isolation, "robot", hf.start(Planner), recovery=hf.hybrid(safe_state=state))
+        with system.events() as stream:
+            await struck(system, robot)
+            await over(system)
+            (missed,) = [one for one in stream.take() if isinstance(one, hf.SafeStateMissed)]
+        assert (missed.address, missed.because) == (problem[0], robot.path)
+        assert problem[1] in missed.reason
 
 
 async def test_the_phases_of_a_recovery_with_safe_state(isolation: str) -> None:

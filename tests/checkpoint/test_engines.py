@@ -5,9 +5,12 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
+import pytest
+
 import holdfast as hf
 from holdfast.checkpoint.journal import Journal, MemoryJournal
 from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.stores import open_journal
 from holdfast.testing.stores import conformance
 from tests.checkpoint.players import Doer, Note, Seen
 from tests.checkpoint.sqlite.stores import disown
@@ -44,3 +47,11 @@ async def test_a_system_takes_an_engine_that_is_open(tmp_path: Path) -> None:
             doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid()))
             await doer.ask(Note(str(life)))
             assert await doer.ask(Seen()) == ["0", "1"][: life + 1]
+
+
+@pytest.mark.parametrize("place", ["not/there/app.db", ""])
+def test_a_store_without_a_place_is_refused(tmp_path: Path, place: str) -> None:
+    """Also a mistyped one: its folder is not made."""
+    with pytest.raises(hf.SpecError, match="must name a file in a folder that is there"):
+        open_journal(f"sqlite:{tmp_path / place}")
+    assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""The recovery file: methods and key variables without a change to the program, and what is wrong in one (R17, R19)."""
+"""The recovery file: methods and key variables without a change to the program, and what is wrong in one (R17-R19)."""
 
 from __future__ import annotations
 
@@ -199,7 +199,8 @@ def test_every_setting_of_a_method_can_stand_in_the_file() -> None:
         ('["/a"]\n\ninterval = "1"', r"line 3, \[/a\]: interval: Expected `float`, got `str`"),
         ('["/a"]\ninterval = true', r"line 2, \[/a\]: interval: Expected `float`, got `bool`"),
         ('["/a"]\ninterval = -1', r"line 2, \[/a\]: .*interval must be seconds > 0, not -1"),
-        ('["/a"]\npacing = "slow"', r"line 2, \[/a\]: .*pacing"),
+        ('["/a"]\npacing = "slow"', r"line 2, \[/a\]: .*pacing must be 'fast', 'original' or a factor"),
+        ('["/a"]\ndurability = "disk"', r"line 2, \[/a\]: .*durability must be one of 'memory', 'os', 'fsync'"),
         ('["/a"]\nkeep = 0', r"line 2, \[/a\]: .*keep must be a whole number from 1 to 100"),
         ('["/b"]\nkeep = 2\n["/a"]\n# keep\nkeep = 2.5', r"line 5, \[/a\]: keep: Expected `int`, got `float`"),
         ('["/a"]\nheld = 3', r"line 2, \[/a\]: held: Expected `object`, got `int`"),
@@ -232,6 +233,14 @@ def test_what_is_wrong_in_a_file_is_refused_by_line_and_setting(tmp_path: Path, 
 async def test_unknown_classes_are_refused_when_the_system_starts(tmp_path: Path, name: str, problem: str) -> None:
     path = written(tmp_path, f'\n["{name}"]\ninterval = 1.0')
     with pytest.raises(hf.SpecError, match=rf"recovery.toml, line 2, \[{name}\].*{problem}"):
+        async with hf.ActorSystem("app", log=False, recovery=path):
+            pass
+
+
+@pytest.mark.parametrize("name", ["/ap/*", "/ap/robot", "/app", "/application/*", "/b*"])
+async def test_addresses_of_another_system_are_refused_when_the_system_starts(tmp_path: Path, name: str) -> None:
+    path = written(tmp_path, f'["/app/*"]\nkeep = 1\n["/*/robot"]\nkeep = 1\n["{name}"]\nkeep = 1')
+    with pytest.raises(hf.SpecError, match=r"recovery.toml, line 5, .*begin with '/app/'"):
         async with hf.ActorSystem("app", log=False, recovery=path):
             pass
 

@@ -1,4 +1,4 @@
-"""A recorded actor that looks up others in its turns comes back without them, and before them (T21)."""
+"""A recorded actor comes back when those whom it has found or told are gone, elsewhere, or not there yet (T21)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.guards import running
-from tests.checkpoint.players import Note, Notes, start
+from tests.checkpoint.players import Note, Notes, Sink, start
 from tests.checkpoint.strikes import sink
 
 
@@ -71,3 +71,36 @@ async def test_another_class_is_refused(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("picky", hf.start(Picky), recovery=hf.hybrid()))
     with pytest.raises(hf.RemoteCrash, match="WrongActor"):
         await ref.ask(Tell(notes.path))
+
+
+class Bound(hf.Actor):
+    sink: hf.Binding[Sink]
+
+    def __init__(self) -> None:
+        self.told = 0
+
+    @hf.on(Tell)
+    async def tell(self, message: Tell) -> int:
+        self.told += 1
+        self.sink.tell(Note(f"told {self.told}"))
+        await self.sink.ask(Note(f"asked {self.told}"))
+        return self.told
+
+
+async def bound(system: hf.ActorSystem, isolation: str, to: str) -> hf.ActorRef[Bound]:
+    options = {"bindings": {"sink": to}, "recovery": hf.replay_only()}
+    return await start(system, isolation, "bound", hf.start(Bound), **options)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_its_binding_may_lead_elsewhere_since(system: hf.ActorSystem, isolation: str) -> None:
+    one, two = [await system.start(hf.child(name, hf.start(Sink))) for name in ("one", "two")]
+    ref = await bound(system, isolation, one.path)
+    assert await ref.ask(Tell("")) == 1
+    for target in (two, one, two):
+        system.bind(ref, "sink", target)
+    assert await ref.ask(Tell("")) == 2
+    ref.kill()
+    assert await ref.ask(Tell(""), timeout=30.0) == 3
+    assert await one.ask(Notes()) == ["told 1", "asked 1"]
+    assert await two.ask(Notes()) == ["told 2", "asked 2", "told 3", "asked 3"]

@@ -182,3 +182,49 @@ def test_a_damaged_state_is_refused() -> None:
     data = save_state(at_place(Plain()))
     with pytest.raises(DamagedValue):
         restore_state(at_place(Plain()), data[:-1])
+
+
+class Half(Plain):
+    def get_state(self) -> int:
+        return self.count
+
+
+class Later(Half):
+    async def set_state(self, state: int) -> None:
+        self.count = state
+
+
+class Fixed(Plain):
+    key_variables = ("count", "double")
+
+    @property
+    def double(self) -> int:
+        return 2 * self.count
+
+
+@pytest.mark.parametrize(
+    ("kind", "problem"),
+    [
+        (Half, "Half has no set_state, which goes with get_state"),
+        (Later, "Later.set_state is `async def`"),
+        (Fixed, "Fixed.double cannot be set"),
+    ],
+)
+async def test_a_state_that_could_not_be_put_back_is_refused_at_the_first_start(
+    kind: type[hf.Actor], problem: str
+) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        with pytest.raises(hf.StartFailed, match=problem):
+            await system.start(hf.child("it", hf.start(kind), recovery=hf.hybrid()))
+        if kind is not Fixed:  # No snapshot, nothing to put back.
+            assert await system.start(hf.child("it", hf.start(kind), recovery=hf.replay_only()))
+
+
+def test_key_variables_and_version_are_checked_with_the_class() -> None:
+    for wrong in ("goal", (1,)):
+        with pytest.raises(TypeError, match=r"Wrong.key_variables must be names"):
+            type("Wrong", (hf.Actor,), {"key_variables": wrong})
+    with pytest.raises(TypeError, match=r"Wrong.schema_version must be a whole number, not '2'"):
+        type("Wrong", (hf.Actor,), {"schema_version": "2"})
+    with pytest.raises(TypeError, match="key_variables must be names"):
+        hf.wrap(Point, key_variables="x")

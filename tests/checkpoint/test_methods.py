@@ -256,7 +256,7 @@ async def test_replay_alone_brings_everything_back_over_stops_and_moves(tmp_path
 @pytest.mark.parametrize(("pacing", "seconds"), [("fast", 0.0), ("original", 9.0), (3.0, 3.0), (0.5, 18.0)])
 @pytest.mark.asyncio(loop_factories=["virtual"])
 async def test_a_replay_waits_as_long_as_there_was_between_its_messages(pacing: Any, seconds: float) -> None:
-    """R39: nine seconds of messages; what comes meanwhile is held, and handled behind them."""
+    """R39, R76: nine seconds of messages; what comes meanwhile is held, and handled behind them."""
     loop = asyncio.get_running_loop()
     async with hf.ActorSystem("app", log=False) as system:
         system.node.wall = lambda: 1000.0 + loop.time()

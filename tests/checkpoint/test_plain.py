@@ -237,3 +237,44 @@ def test_what_does_not_fit_is_refused_when_it_is_wrapped() -> None:
         robot.__getattr__("_hidden")
     assert hf.calls(Robot) is robot
     assert robot.look() == robot.look("all", [])
+
+
+def farther(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "x": state["x"] + 10.0}
+
+
+def wrong(state: dict[str, Any]) -> dict[str, Any]:
+    state["log"].append("wrong")
+    return {"x": 0.0, "log": state["log"], "arm.angle": 0.0}  # It has no arm.
+
+
+class Arms:
+    def __init__(self) -> None:
+        self.left, self.right = Arm(), Arm()
+
+    def lift(self, by: float) -> float:
+        self.left.angle += by
+        return self.left.angle
+
+
+ArmsActor = hf.wrap(Arms, "ArmsActor", key_variables=["left.angle"])
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()])
+async def test_control_sees_the_programs_variables(system: hf.ActorSystem, recovery: Any) -> None:
+    ref = await system.start(hf.child("robot", hf.start(RobotActor, 1.0), recovery=recovery))
+    assert await system.get_state(ref) == {"x": 1.0, "log": []}
+    with pytest.raises(hf.ControlFailed):
+        await system.replace_state(ref, wrong)
+    assert await system.replace_state(ref, farther) == {"x": 11.0, "log": []}
+    await system.set_isolation(ref, "process")
+    assert await ref.ask(robot.move(1.0)) == 12.0
+    await system.set_isolation(ref, "task")
+    assert await system.get_state(ref) == {"x": 12.0, "log": ["move 1.0"]}
+
+
+async def test_control_sees_variables_inside_others(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("arms", hf.start(ArmsActor)))
+    assert await ref.ask(hf.calls(Arms).lift(2.0)) == 2.0
+    assert await system.replace_state(ref, lambda state: {"left.angle": state["left.angle"] + 1}) == {"left.angle": 3.0}
+    assert await ref.ask(hf.calls(Arms).lift(0.0)) == 3.0

@@ -1,4 +1,4 @@
-"""Messages that kill again and again are kept outside the actor, until somebody decides (T16)."""
+"""Messages that kill again and again are kept outside the actor, until somebody decides (T16, R45)."""
 
 from __future__ import annotations
 

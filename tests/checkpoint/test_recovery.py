@@ -1,4 +1,8 @@
-"""What comes back after a crash or a kill, in a task and in a process (DESIGN 4 and 6, T9-T28)."""
+"""What comes back after a crash or a kill, in a task and in a process (DESIGN 4 and 6, T9-T28).
+
+What is stored is used after the crash (R2): messages are recorded as they come (R14, R22, R23), the life is started
+again (R35) and handles them again (R37); none is lost on the way to isolation (R42), and who asked is answered (R43).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""What an actor keeps for later comes back too: timers, stash, replies; and snapshots shorten the replay (T9-T28)."""
+"""What an actor keeps for later comes back too: timers, stash, replies; and snapshots shorten the replay (T9-T28).
+
+Inputs that are no messages of others are recorded with their time too (R24, R75).
+"""
 
 from __future__ import annotations
 

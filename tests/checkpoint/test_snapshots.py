@@ -1,4 +1,7 @@
-"""Snapshots of a large state: when they are taken, what is written, and that it comes back (T9, T10, T18)."""
+"""Snapshots of a large state: when they are taken, what is written, and that it comes back (T9, T10, T18).
+
+The checkpoint handler (R15) saves at intervals (R21), outside the actor (R20), and restores a new life (R36).
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A state is saved between two turns, never in the middle of one that was cut off (T9)."""
+"""A state is saved between two turns, never in the middle of one that was cut off (T9, R27)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SIGKILL in the middle of a snapshot: the actor's process, the forked writer, the root itself (T9, T10, T17)."""
+"""SIGKILL in the middle of a snapshot: the actor's process, the forked writer, the root (R25, R26, T9, T10, T17)."""
 
 from __future__ import annotations
 

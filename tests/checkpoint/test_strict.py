@@ -8,6 +8,8 @@ import logging
 import os
 import random
 import secrets
+import subprocess
+import sys
 import time
 import uuid
 from collections.abc import Callable
@@ -33,6 +35,7 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "random.randint": (lambda: randint(1, 6), "ctx.random"),
     "random.choice": (lambda: random.choice([1, 2]), "ctx.random"),
     "random.shuffle": (lambda: random.shuffle([1, 2, 3]), "ctx.random"),
+    "random.Random": (lambda: random.Random(), "ctx.random"),
     "random.gauss": (lambda: random.gauss(), "ctx.random"),
     "uuid.uuid4": (lambda: uuid.uuid4(), "ctx.uuid()"),
     "uuid.uuid1": (lambda: uuid.uuid1(), "ctx.uuid()"),
@@ -126,6 +129,23 @@ async def test_what_comes_from_the_context_and_what_is_not_the_turns_own_is_let_
     assert await ref.ask(Fine()) == "4 True"
     ref.kill()
     assert await ref.ask(Fine(), timeout=20.0) == "4 True"  # It was replayed, strictly.
+
+
+LAZY = """
+import sys, holdfast as hf, numpy
+from holdfast.checkpoint.strict import Guard, NotDeterministic
+assert "numpy.random" not in sys.modules
+try:
+    Guard().call(lambda: numpy.random.rand())
+except NotDeterministic:
+    print("caught")
+"""
+
+
+def test_the_first_use_of_numpys_generator_is_seen_too() -> None:
+    """numpy loads it then only."""
+    run = subprocess.run([sys.executable, "-c", LAZY], capture_output=True, text=True, timeout=60.0, check=False)
+    assert run.stdout == "caught\n", run.stderr
 
 
 class Put(hf.Message[list[str]]):

@@ -1,4 +1,6 @@
-"""The six programs of the paper's evaluation do their task, also when they are killed, but not without recovery.
+"""The six programs of the paper's evaluation (R48) do their task, also when they are killed, but not without recovery.
+
+What the paper judges by (R51): the map is that of a run without kills, the goal is reached.
 
 The data are not in the repository: without them a test is skipped, and says which file it misses.
 """

@@ -173,7 +173,8 @@ async def test_cancelling_the_body_stops_everything() -> None:
 async def test_when_the_root_gives_up_the_body_is_cancelled_and_hears_why() -> None:
     log: list[str] = []
     ends: list[str] = []
-    with pytest.raises(hf.TreeFailed, match="the tree of app gave up: restart intensity reached"):
+    why = r"the tree of app gave up: restart intensity reached; the last to end was /app/kid: .*boom"
+    with pytest.raises(hf.TreeFailed, match=why):
         async with hf.ActorSystem("app", intensity=1, log=False) as system:
             await system.start(hf.child("sibling", hf.start(Kid, log)))
             ref = await system.start(hf.child("kid", hf.start(Kid)))
