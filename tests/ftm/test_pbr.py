@@ -146,6 +146,12 @@ async def test_whether_it_traps_exits_is_part_of_its_state(system: hf.ActorSyste
     assert await driver.ask(Trap(on=False))
 
 
+@pytest.mark.parametrize("setting", [{"window": 0}, {"window": -1}, {"window": "x"}, {"acknowledge": "no"}])
+def test_settings_that_mean_nothing_are_refused(setting: Any) -> None:
+    with pytest.raises(ValueError, match=rf"PBR: {next(iter(setting))} must be .*not {next(iter(setting.values()))!r}"):
+        PBR(**setting)
+
+
 @pytest.mark.parametrize("together", [False, True])
 async def test_a_turn_that_leaves_an_unsavable_state_fails(system: hf.ActorSystem, together: bool) -> None:
     """Only that turn, with the error for who has asked; neither the replica nor its successor dies of it."""
