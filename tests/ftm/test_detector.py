@@ -112,6 +112,7 @@ class Watched:
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
 async def test_who_falls_silent_is_suspected_and_the_other_is_not() -> None:
+    """A55, A56."""
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
@@ -143,6 +144,7 @@ async def test_a_new_life_of_a_suspect_is_judged_anew() -> None:
 
 
 async def test_an_observer_that_was_held_up_suspects_nobody() -> None:
+    """T3."""
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))

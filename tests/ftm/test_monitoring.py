@@ -376,6 +376,8 @@ async def test_a_change_that_somebody_else_made_is_seen_by_its_event() -> None:
 
 
 async def test_another_class_at_the_address_is_another_version() -> None:
+    """A2."""
+
     class Moody(Account):
         deterministic = False
 

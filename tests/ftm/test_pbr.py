@@ -40,6 +40,7 @@ from tests.ftm.replicated import (
 
 
 async def test_a_backup_that_leads_goes_on_where_the_primary_was(system: hf.ActorSystem) -> None:
+    """A35."""
     driver = await pair(system)
     assert await driver.ask(Add(1)) == 1
     assert await driver.ask(Add(2)) == 3
@@ -57,7 +58,7 @@ async def test_finish_takes_a_last_snapshot(system: hf.ActorSystem) -> None:
 
 
 async def test_a_reply_leaves_only_when_the_backup_has_its_state(system: hf.ActorSystem) -> None:
-    """T4, A52: the backup is stopped in the middle; no reply leaves until it goes on."""
+    """A34, T4, A52: the backup is stopped in the middle; no reply leaves until it goes on."""
     driver = await pair(system)
     backup = system.node.cell_at(driver.path("r2") + "/after").ref
     await system.suspend(backup)
@@ -385,7 +386,7 @@ def test_an_evicted_reply_is_told_apart_from_an_unknown_request() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 async def test_kills_at_any_moment_lose_and_double_nothing(system: hf.ActorSystem, seed: int) -> None:
-    """A44 to A59: the primary or the backup is killed again and again while requests flow."""
+    """A44-A59: the primary or the backup is killed again and again while requests flow."""
     dice = random.Random(seed)
     driver = await pair(system)
     sent: list[int] = []
