@@ -64,7 +64,6 @@ class GroupHost(Steered):
         self.group: Group | None = None
         self.epoch = 0
         self.config = 1
-        self.detection: Detection = getattr(self.layers[0], "detection", None) or Detection()
         self.replica: Callable[..., Start[Any]] = replica
         self.last_config = 1  # that was ever given to a stack of mechanisms
         self.on_step: Callable[[str], None] | None = None  # for tests: called before each step of a failover
@@ -74,6 +73,12 @@ class GroupHost(Steered):
         self._stop_wanted: ExitReason | None = None
         self._careful: set[int] = set()
         self._joined: asyncio.Future[None] | None = None
+
+    @property
+    def detection(self) -> Detection:
+        """How the replicas are watched: as the outermost mechanism says that says anything about it."""
+        said = (getattr(layer, "detection", None) for layer in self.layers)
+        return next((one for one in said if one is not None), Detection())
 
     # -- beginning --------------------------------------------------------------------------------------------------
 
@@ -238,7 +243,7 @@ class GroupHost(Steered):
 
         def switched(change: Reconfiguration) -> None:
             self.layers, self.config = change.layers, change.config
-            group.config = change.config
+            group.config, group.detection = change.config, self.detection
             group.secure(change.layers[0])
             for name in group.names:
                 one = group.cell_of(name)

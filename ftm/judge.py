@@ -60,7 +60,7 @@ class Threshold(msgspec.Struct, frozen=True):
 THRESHOLDS: Final = {
     "crash": Threshold("crash"),
     "mismatch": Threshold("transient_value", count=3, window=60.0, leave=0, calm=600.0),
-    "repeated_mismatch": Threshold("permanent_value", count=3, window=60.0, leave=0, calm=600.0),
+    "repeated_mismatch": Threshold("permanent_value", count=1, window=60.0, leave=0, calm=600.0),
     "rejected": Threshold("forgery", count=3, window=60.0, leave=0, calm=600.0),
 }
 """Kinds of signals, and what they say of the faults there are."""

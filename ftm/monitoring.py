@@ -1,8 +1,9 @@
 """The monitoring engine: sees to it that a mechanism suits what there is, and has it changed when it does not (A6).
 
-It looks at events of the protected address (crashes, mismatches), measures resources, is told of new versions of the
-application, and lets `Judge` decide. What it decides is an event with its reason, and a call of what it was given: it
-changes nothing itself. A person can forbid a mechanism, object to a decision that was announced, or be asked (`veto`).
+It looks at events of the protected address (crashes, mismatches, refused frames, mechanisms that somebody else has
+changed) and at the class of what lives there, measures resources, and lets `Judge` decide. What it decides is an event
+with its reason, and a call of what it was given: it changes nothing itself (`watched.watch_of` gives it transactions).
+A person can forbid a mechanism, object to a decision that was announced, or be asked (`veto`).
 
 What it knows is in a `Watch` outside of it: it can be killed at any moment, and its next life goes on.
 """
@@ -21,6 +22,7 @@ import psutil
 from ..actors.actor import Actor, on
 from ..actors.events import Event, EventHub, EventStream
 from ..actors.message import Message
+from ..actors.node import cell_kind
 from ..actors.ref import ActorRef
 from ..supervision.arbiter import Hand, arbiter_of
 from .adaptations import (
@@ -33,19 +35,28 @@ from .adaptations import (
     NothingValid,
 )
 from .application import Application
+from .events import MechanismAttached, MechanismChanged, MechanismDetached
 from .judge import ADAPT, HOLD, NONE, STAY, Judge, Readings, Verdict
 from .model import Choice, Faults, Resources, choice_of, label
 
-CRASH, MISMATCH, DIVERGED = "crash", "mismatch", "diverged"
+CRASH, MISMATCH, DIVERGED, FAULTY, REJECTED = "crash", "mismatch", "diverged", "repeated_mismatch", "rejected"
 SIGNS: Final[Mapping[str, str]] = {
     "ActorCrashed": CRASH,
     "ProcessDied": CRASH,
     "ReplicaLost": CRASH,
     "Masked": MISMATCH,
-    "Mismatch": MISMATCH,
+    "Objected": MISMATCH,
     "Diverged": DIVERGED,
+    "ReplicaFaulty": FAULTY,
+    "FrameRefused": REJECTED,
 }
 """Events, by the name of their class, and the kind of sign they are. One fault may leave several signs."""
+HARMLESS: Final = frozenset({"stale_epoch", "stale_life", "wrong_session", "closed", "generation", "out_of_order"})
+"""Why frames are refused that were underway when somebody was replaced, or when one was lost."""
+
+
+SIZES: Final = ("assertions", "versions", "state_bytes", "delta_bytes", "request_bytes", "rate", "turn_seconds")
+"""What is known of an application besides what its class says of itself."""
 
 
 # -- what it is told -------------------------------------------------------------------------------------------------
@@ -201,6 +212,8 @@ class Watch:
         self.told: object = None  # the last thing told about what is held back, or that nothing is valid
         self.numbers = 0
         self.changes = 0
+        self.kind: type | None = None  # the class of what lives there
+        self.found: tuple[str, ...] | None = None  # the mechanism that somebody has given to it
         self._events: EventStream | None = None
         self._missed = 0
 
@@ -216,9 +229,17 @@ class Watch:
             self._events = None
 
     def take_signs(self) -> list[str]:
-        """The kinds of the signs that came since the last time."""
+        """The kinds of the signs that came since the last time; what mechanisms there are now is noted."""
         events = self._events.take() if self._events is not None else []
+        for event in events:
+            if isinstance(event, (MechanismAttached, MechanismChanged, MechanismDetached)):
+                self._has_now(event)
         return [kind for event in events if (kind := self._kind(event)) is not None]
+
+    def _has_now(self, event: MechanismAttached | MechanismChanged | MechanismDetached) -> None:
+        layers = () if isinstance(event, MechanismDetached) else event.layers
+        if event.address == self.address and self.running is None:
+            self.found = layers
 
     def missed(self) -> int:
         """How many events could not be kept since the last time."""
@@ -228,8 +249,12 @@ class Watch:
     def _kind(self, event: Event) -> str | None:
         if event.address != self.address and not event.address.startswith(f"{self.address}/"):
             return None
+        if event.address.startswith(f"{self.address}/ftm/"):  # A replica that is lost is told at the address itself;
+            return None  # here, processes also end because of a change.
         reason = getattr(event, "reason", None)
         if getattr(reason, "is_clean", False):  # A process that ended because it was to is no fault.
+            return None
+        if isinstance(reason, str) and reason in HARMLESS:
             return None
         return self.signs.get(type(event).__name__)
 
@@ -265,6 +290,7 @@ class MonitoringEngine(Actor):
         watch = self._watch
         for kind in watch.take_signs():
             self._sign(kind, 1)
+        self._see_address()
         if watch.missed():
             self._emit(MonitoringBlind, "more events came than could be looked at")
         if watch.probe is not None:
@@ -273,6 +299,23 @@ class MonitoringEngine(Actor):
             except Exception as error:  # What is not measured stays as it was.
                 self._emit(MonitoringBlind, f"resources cannot be measured: {type(error).__name__}: {error}")
         self._decide()
+
+    def _see_address(self) -> None:
+        """Who lives there, and what protects it: both may have been changed by somebody else."""
+        watch, judge = self._watch, self._watch.judge
+        found, watch.found = watch.found, None
+        if found is not None and found != judge.current:
+            try:
+                judge.changed(found, self._now())
+            except ValueError as error:
+                self._emit(MonitoringBlind, f"somebody has changed the mechanism to {label(found)}: {error}")
+        cell = self.ctx.cell.node.find(watch.address)
+        kind = None if cell is None else cell_kind(cell)
+        if kind is not None and kind is not watch.kind:
+            if watch.kind is not None:  # Another version: only what no class says is still true.
+                known = {name: getattr(judge.application, name) for name in SIZES}
+                judge.application = Application.of(kind, **known)
+            watch.kind = kind
 
     def _with_own_load(self, readings: Readings) -> Readings:
         """What the present mechanism takes can be taken by another one, too."""

@@ -196,6 +196,7 @@ class Moves:
         task = self._node.loop.create_task(in_turn(), name=name, context=self._node.base_context.copy())
         self._tasks.add(task)
         task.add_done_callback(self._over)
+        task.add_done_callback(lambda done: change.close())  # It may never have begun.
         await asyncio.shield(task)
 
     async def _settle_in(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:

@@ -27,7 +27,7 @@ from ..mechanism import Mechanism, Role
 from ..messages import Request, State
 from ..runs import Deciding, Remembering, Run, Shadow, turns_of, vote
 from ..versions import version
-from ..voters import AnyVoter, Majority, Median, NoMajority, Undecided
+from ..voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided
 from .rb import protected_class
 
 MAJORITY = Majority()
@@ -65,7 +65,9 @@ class Versions(Deciding):
             return NoMajority(standing.address, decided.why)
         if not decided.is_unanimous:
             standing.node.emit(Masked(standing.address, standing.path, turns_of(runs)))
-        return own if 0 in decided.agreeing else decided.value
+        # Those that agree are alike for a voter that compares; one that picks has picked this very run.
+        picks = isinstance(mechanism.voter, (Custom, Median))
+        return own if 0 in decided.agreeing and not picks else decided.value
 
 
 @dataclasses.dataclass(frozen=True)
@@ -75,7 +77,8 @@ class NVP(Mechanism):
     Args:
         versions: the others besides the protected class: actor classes with the same messages and state, or handlers
             (functions with `@on`) that replace those of the protected class; or their names.
-        voter: what decides; not a `Median`, which makes answers that no version has a state for.
+        voter: what decides. A `Median` takes the run that is in the middle with all its numbers, those of its state
+            too (or of its answers alone, with `compare_state=False`); if none is, there is no majority.
         compare_state: whether the states must agree too, as the voter sees it.
         within: seconds in which a version must have come to its end.
     """
@@ -112,12 +115,13 @@ def voter_of(value: Any) -> Any:
     """A voter, as it was given or as it came from another process.
 
     Raises:
-        ValueError: it is none, or makes answers of its own.
+        ValueError: it is none.
     """
     try:
         made: Any = msgspec.convert(value, AnyVoter) if isinstance(value, dict) else value
     except msgspec.ValidationError as error:
         raise ValueError(f"{value!r} is no voter: {error}") from error
-    if isinstance(made, Median) or not hasattr(made, "vote"):
-        raise ValueError(f"a voter here chooses one of the outcomes, and {made!r} does not")
+    if isinstance(made, type) or not hasattr(made, "vote"):
+        known = "Exact(), Majority(), Tolerance(...), Median() or custom(function) of holdfast.ftm.voters"
+        raise ValueError(f"a voter is one such as {known}, not {made!r}")
     return made

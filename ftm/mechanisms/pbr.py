@@ -140,3 +140,9 @@ class PBR(Mechanism):
 
     acknowledge: bool = True
     window: int = 16
+
+    def __post_init__(self) -> None:
+        if self.acknowledge not in (True, False):
+            raise ValueError(f"PBR: acknowledge must be True or False, not {self.acknowledge!r}")
+        if not isinstance(self.window, int) or self.window < 1:
+            raise ValueError(f"PBR: window must be a number of batches >= 1, not {self.window!r}")

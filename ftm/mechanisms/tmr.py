@@ -27,7 +27,7 @@ from ..mechanism import Mechanism, Role
 from ..messages import Done, Request, StaleEpoch, State
 from ..runs import Deciding, Run, digest_of_state, turns_of, vote
 from ..standing import PeerLost
-from ..voters import Majority, NoMajority, Undecided
+from ..voters import Majority, Median, NoMajority, Undecided
 from .nvp import voter_of
 
 MAJORITY = Majority()
@@ -139,7 +139,7 @@ class TMR(Mechanism):
     """Triple modular redundancy.
 
     Args:
-        voter: what decides; not a `Median`, which makes answers that no replica has a state for.
+        voter: what decides; not a `Median`: all replicas run the same code, and who differs from it is faulty.
     """
 
     name: ClassVar[str] = "tmr"
@@ -160,3 +160,5 @@ class TMR(Mechanism):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "voter", voter_of(self.voter))
+        if type(self.voter) is Median:
+            raise ValueError("TMR: its replicas are to be alike, so none is outvoted by a Median; take Tolerance(...)")

@@ -7,6 +7,7 @@ import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.cell import Cell
+from ...actors.errors import CannotMove
 from ...supervision.arbiter import Grant, Hand, arbiter_of
 from ...supervision.respec import recipe_spec
 from .draft import Draft, Place, Target, is_elsewhere, rules
@@ -67,7 +68,16 @@ class OnProtection(OnLiving):
             else moves.protect(cell, system.homes, mechanism, PROTECT_TIMEOUT)
         )
         self._under_way = system.node.loop.create_task(change, name=f"mechanism of {cell.path}")
-        await asyncio.shield(self._under_way)
+        await self._to_its_end(self._under_way)
+
+    async def _to_its_end(self, change: asyncio.Task[None]) -> None:
+        """Wait for it. Raises what it raises; CannotMove if it is the system that ends."""
+        try:
+            await asyncio.shield(change)
+        except asyncio.CancelledError:
+            if change.cancelled():  # Not we: nobody has cancelled whoever waits here.
+                raise CannotMove(self.target, "the system ends") from None
+            raise
 
     async def undo(self, system: ActorSystem) -> None:
         if not self._has_begun:
@@ -204,7 +214,7 @@ class Adapt(OnProtection):
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
         change = system._moves.adapt(cell, mechanism, PROTECT_TIMEOUT)
         self._under_way = system.node.loop.create_task(change, name=f"adaptation of {cell.path}")
-        await asyncio.shield(self._under_way)
+        await self._to_its_end(self._under_way)
 
     def _give_up(self, system: ActorSystem) -> None:
         if self._under_way is not None and not self._under_way.done():

@@ -1,6 +1,6 @@
 """What the campaign strikes with: at which steps of a request each kind of fault can happen, and who claims to mask it.
 
-Steps are those of A44 to A59: from the proxy through the replica that leads and back, and through the others.
+Steps are those of A44-A59: from the proxy through the replica that leads and back, and through the others.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def names_of(layers: Layers) -> list[str]:
 
 
 def way(layers: Layers) -> list[Step]:
-    """The steps of a request through the replica that leads (A44 to A53)."""
+    """The steps of a request through the replica that leads (A44-A53)."""
     names = names_of(layers)
     is_secured = names[0] == "sec"
     entry, rest = ("Opened", names[1:]) if is_secured else ("Work", names)
@@ -46,7 +46,7 @@ def way(layers: Layers) -> list[Step]:
 
 
 def far(layers: Layers) -> list[Step]:
-    """The steps on the other replicas (A52 to A54)."""
+    """The steps on the other replicas (A52-A54)."""
     names = names_of(layers)
     if "pbr" in names:
         return [("pbr.after", "Letter", True), ("state", "Apply", True)]

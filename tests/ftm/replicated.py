@@ -237,7 +237,7 @@ async def all_once(driver: Driver, system: hf.ActorSystem, sent: list[int]) -> N
 
 
 async def kills_of_two(driver: Driver, system: hf.ActorSystem, dice: random.Random) -> None:
-    """The primary or the backup ends again and again while requests flow (A44 to A59): nothing is lost or doubled."""
+    """The primary or the backup ends again and again while requests flow (A44-A59): nothing is lost or doubled."""
     sent: list[int] = []
     backup = "r2"
     for step in range(12):

@@ -39,7 +39,7 @@ async def settled(driver: Any, name: str, turn: int) -> None:
 async def test_value_faults_of_the_one_that_leads_are_masked(
     system: hf.ActorSystem, below: Any, always: bool, what: str
 ) -> None:
-    """Transient and permanent ones; what is right is in the state of both afterwards."""
+    """Transient and permanent ones; what is right is in the state of both afterwards (A39)."""
     driver = await pair(system, Total, AD(CHECKS), below, FAULTY(what=what, always=always, skip=1))
     with system.events() as events:
         keys = driver.send(Add(1), Add(2), Fetch(3), Add(4), Say(5))

@@ -1,4 +1,4 @@
-"""Mechanisms are composed, exchanged and updated under load: nothing is lost, wrong or done twice (A76 to A82, T36)."""
+"""Mechanisms are composed, exchanged and updated under load: nothing is lost, wrong or done twice (A76-A82, T36)."""
 
 from __future__ import annotations
 
@@ -82,6 +82,7 @@ def stack(ref: hf.ActorRef[Any]) -> tuple[str, ...]:
 
 @pytest.mark.parametrize("method", METHODS)
 async def test_every_transition_under_load_loses_nothing(system: hf.ActorSystem, method: str) -> None:
+    """A13, A86."""
     ref = await protected(system, recovery=METHODS[method]())
     load, events = Load(ref), system.events()
     for wanted in STACKS:
@@ -115,7 +116,7 @@ async def test_failover_works_in_every_stack_that_was_changed_to(system: hf.Acto
 
 
 async def test_money_is_moved_once_while_mechanisms_change(system: hf.ActorSystem) -> None:
-    """Turns that have begun, and wait for replies of others, are let through (T36)."""
+    """Turns that have begun, and wait for replies of others, are let through (T36, T37)."""
     one = await system.start(hf.child("one", hf.start(Account, 1000)))
     two = await system.start(hf.child("two", hf.start(Account, 1000)))
     ref = await protected(system, hf.start(Bank), bindings={"one": one.path, "other": two.path})
@@ -226,7 +227,7 @@ async def test_a_dry_run_shows_steps_and_bricks(system: hf.ActorSystem) -> None:
 
 
 async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tmp_path: Path) -> None:
-    """T36: within a time limit; requests that waited meanwhile are handled."""
+    """A83, T36: within a time limit; requests that waited meanwhile are handled."""
     file = tmp_path / "slow"
     file.touch()
     ref = await protected(system, hf.start(Slow, str(file)))

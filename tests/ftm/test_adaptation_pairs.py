@@ -168,7 +168,7 @@ async def come_and_go(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load,
 
 
 async def test_the_engine_dies_with_three_replicas_and_its_next_life_goes_on(system: hf.ActorSystem) -> None:
-    """T38 to T41: at each step, while a replica comes in, and while it goes again."""
+    """T38-T41: at each step, while a replica comes in, and while it goes again."""
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=hf.PBR()))
     load = Load(ref, clients=2)
     for step, wanted in itertools.product(STEPS, (("tmr",), ("pbr",))):

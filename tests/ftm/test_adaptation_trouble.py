@@ -1,4 +1,4 @@
-"""Whatever dies in the middle of a change of mechanisms, it is made or undone, and never mixed (T38 to T41)."""
+"""Whatever dies in the middle of a change of mechanisms, it is made or undone, and never mixed (T38-T41)."""
 
 from __future__ import annotations
 

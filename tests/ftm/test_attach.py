@@ -411,3 +411,23 @@ async def test_what_has_ended_a_replica_is_told(system: hf.ActorSystem) -> None:
     with pytest.raises(hf.TransactionFailed, match=r"its after has ended: ValueError: a bug"):
         await attach(system, ref, Faulty())
     assert await ref.ask(Total()) == 0
+
+
+@pytest.mark.parametrize("mechanism", [None, PBR()], ids=["attach", "transition"])
+async def test_a_change_that_the_end_of_the_system_overtakes_fails(mechanism: Any) -> None:
+    """With an error: nobody has cancelled whoever waits for it."""
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=mechanism))
+
+        async def change() -> None:
+            async with system.transaction(timeout=30) as step:
+                (step.attach if mechanism is None else step.transition)(ref, LFR())
+
+        changing = asyncio.create_task(change())
+        with system.events() as events:
+            async for event in events:
+                if isinstance(event, hf.TransactionBegan):
+                    break
+    with pytest.raises(hf.TransactionFailed, match="the system ends"):
+        async with asyncio.timeout(20):
+            await changing

@@ -1,6 +1,6 @@
 """A mechanism masks every single fault that it claims, at each step of a request: nothing is lost, wrong or done twice.
 
-A44 to A59. Here a few faults of a few rows, by the seed (`HOLDFAST_SEED`); `HOLDFAST_REQUESTS=10000` has all rows run,
+A44-A59. Here a few faults of a few rows, by the seed (`HOLDFAST_SEED`); `HOLDFAST_REQUESTS=10000` has all rows run,
 at all steps. `benchmarks/bench_ftm.py --only campaign` prints the whole table.
 """
 
@@ -47,6 +47,7 @@ async def kept(name: str, kind: str, workload: str = "counter") -> None:
 
 @pytest.mark.parametrize(("name", "kind"), ROWS)
 async def test_a_claimed_fault_is_masked(name: str, kind: str) -> None:
+    """A67."""
     if name.startswith("SEC"):
         pytest.importorskip("cryptography")
     await kept(name, kind)

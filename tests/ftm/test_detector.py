@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import random
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -12,7 +13,10 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.actors.actor import Start
 from holdfast.ftm.detector import HIGHEST, Accrual, Detection, Detector, OwnClock
+from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.orders import Beat
+from tests.ftm.accounts import Counter
 
 DETECTION = Detection(interval=0.05, threshold=8.0, pause=0.2, spread=0.01)
 
@@ -108,6 +112,7 @@ class Watched:
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
 async def test_who_falls_silent_is_suspected_and_the_other_is_not() -> None:
+    """A55, A56."""
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
@@ -139,6 +144,7 @@ async def test_a_new_life_of_a_suspect_is_judged_anew() -> None:
 
 
 async def test_an_observer_that_was_held_up_suspects_nobody() -> None:
+    """T3."""
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
@@ -155,6 +161,31 @@ async def test_an_observer_that_was_held_up_suspects_nobody() -> None:
             detector.tell(Beat("r1", 1))
         assert watched.suspects == []
         await system.stop(detector)
+
+
+class QuickTR(TR):
+    detection = Detection(pause=0.1)
+
+
+class QuickPBR(PBR):
+    detection = Detection(pause=0.2)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_the_outermost_mechanism_that_says_how_is_heard() -> None:
+    """Also one that another stands around, and one that has come later."""
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=QuickTR()))
+        host: Any = ref._cell.host
+        assert host.group.detection == QuickTR.detection
+        for layers, said in (
+            ((QuickPBR(), QuickTR()), QuickPBR.detection),
+            ((PBR(), QuickTR()), QuickTR.detection),
+            ((PBR(), TR()), Detection()),
+        ):
+            async with system.transaction(timeout=30) as change:
+                change.transition(ref, layers)
+            assert host.group.detection == said
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])

@@ -103,7 +103,7 @@ async def test_the_graph_as_it_is_shown(system: hf.ActorSystem) -> None:
 
 
 async def test_the_steps_of_a_failover(system: hf.ActorSystem) -> None:
-    """A57 to A59, T1."""
+    """A57-A59, T1."""
     ref: Any = await system.start(hf.child("c", hf.start(Counter), mechanism=hf.PBR()))
     steps: list[str] = []
     ref._cell.host.on_step = steps.append
@@ -141,7 +141,7 @@ async def test_the_mechanism_of_the_example_runs_from_its_file(system: hf.ActorS
 async def test_the_script_of_the_example_is_applied_from_another_process(
     system: hf.ActorSystem, tmp_path: Path
 ) -> None:
-    """A76."""
+    """A76, A80, A81."""
     await system.start(hf.supervisor("bank", children=[hf.child("alice", hf.start(Counter))]))
     alice = system.ref("/app/bank/alice", Counter)
     assert await alice.ask(Add(0)) == 1
@@ -213,3 +213,16 @@ async def test_refusals_say_what_the_document_says(system: hf.ActorSystem) -> No
     with pytest.raises(MechanismRefused, match="state_access = False"):
         hf.child("x", hf.start(Closed), mechanism=hf.PBR())
     assert await system.ref("/app/c", Counter).ask(Add(1)) == 1
+
+
+CITED = re.compile(r"\bA(\d+)(?:-A(\d+))?\b")
+
+
+def test_what_tests_cite_of_the_paper_is_listed_and_what_is_listed_is_cited() -> None:
+    """A range cites all in it."""
+    listed = set(re.findall(r"^\| (A\d+) \|", (ROOT / "docs" / "requirements.md").read_text("utf-8"), re.MULTILINE))
+    cited: set[str] = set()
+    for path in (ROOT / "tests").rglob("*.py"):
+        for first, last in CITED.findall(path.read_text("utf-8")):
+            cited.update(f"A{number}" for number in range(int(first), int(last or first) + 1))
+    assert listed == cited

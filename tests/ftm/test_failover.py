@@ -89,6 +89,7 @@ async def stop_process(pid: int) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 async def test_a_protected_actor_answers_as_an_ordinary_one(system: hf.ActorSystem, method: str) -> None:
+    """A7, A60."""
     ref = await started(system, hf.start(Counter, 10), recovery=METHODS[method]())
     assert [await ref.ask(Add(tag)) for tag in range(5)] == [11, 12, 13, 14, 15]
     assert await ref.ask(Tags()) == [0, 1, 2, 3, 4]
@@ -99,6 +100,7 @@ async def test_a_protected_actor_answers_as_an_ordinary_one(system: hf.ActorSyst
 
 
 async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSystem) -> None:
+    """A41, A89."""
     ref = await started(system)
     seen = {path.removeprefix(f"{ref.path}/ftm/") for path in system.tree() if path.startswith(f"{ref.path}/ftm/")}
     bricks = {
@@ -117,7 +119,7 @@ async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSy
 
 
 async def test_the_bindings_of_the_bricks_are_seen_from_outside(system: hf.ActorSystem) -> None:
-    """A44 to A51: from the proxy to the protected actor, and back."""
+    """A44-A51: from the proxy to the protected actor, and back."""
     ref = await started(system)
     group = group_of(ref)
     first, second = group.primary, other(group)
@@ -233,6 +235,7 @@ STEPS = ("depose", "epoch", "kill", "lead", "bind", "peer")
 
 @pytest.mark.parametrize("step", STEPS)
 async def test_the_failover_manager_may_die_at_each_step(system: hf.ActorSystem, step: str) -> None:
+    """A58."""
     ref = await started(system)
     load, hit = Load(ref), list[str]()
 
@@ -257,6 +260,7 @@ async def test_the_failover_manager_may_die_at_each_step(system: hf.ActorSystem,
 
 
 async def test_a_stopped_primary_that_wakes_up_changes_nothing(system: hf.ActorSystem) -> None:
+    """T1, T2."""
     ref = await started(system)
     load = Load(ref)
     events = system.events()

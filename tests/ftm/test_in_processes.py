@@ -25,7 +25,7 @@ STACKS = {
 
 @pytest.mark.parametrize("name", STACKS)
 async def test_kills_of_the_one_that_leads_lose_and_double_nothing(system: hf.ActorSystem, name: str) -> None:
-    """A57 to A59."""
+    """A57-A59."""
     mechanism: Any = hf.compose(STACKS[name])
     events = system.events()
     ref = await system.start(hf.child("c", hf.start(Counter), mechanism=mechanism))

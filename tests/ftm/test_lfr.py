@@ -27,6 +27,7 @@ async def settled(driver: Any, name: str, turn: int) -> None:
 
 @pytest.mark.parametrize("kind", [Total, Closed])
 async def test_the_follower_computes_the_same_and_can_lead(system: hf.ActorSystem, kind: Any) -> None:
+    """A37."""
     driver = await pair(system, kind, LFR())
     keys = driver.send(Add(1), Fetch(2), Add(3), Say(4))
     assert [await driver.reply(key) for key in keys] == [1, 3, 6, 10]
@@ -68,6 +69,7 @@ async def test_an_ask_that_is_out_is_joined_by_the_next_leader(system: hf.ActorS
 
 
 async def test_a_reply_leaves_only_when_the_follower_has_the_request(system: hf.ActorSystem) -> None:
+    """A36."""
     driver = await pair(system, Total, LFR())
     before = system.node.cell_at(driver.path("r2") + "/lfr.before").ref
     before = system.node.cell_at(driver.path("r2") + "/before").ref

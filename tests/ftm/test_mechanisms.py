@@ -87,6 +87,7 @@ def test_one_slot_is_one_brick() -> None:
 
 
 async def test_a_mechanism_from_a_file_that_was_never_seen_is_woven_in(system: hf.ActorSystem, tmp_path: Path) -> None:
+    """A3."""
     kind: Any = load(own_copy(tmp_path))
     driver = await pair(system, Total, kind(word="heard"), PBR())
     seen: list[str] = sys.modules[kind.__module__].SEEN
@@ -146,6 +147,7 @@ async def test_transitions_keep_state_log_and_stash(system: hf.ActorSystem, seed
 
 
 async def test_only_bricks_that_differ_are_touched(system: hf.ActorSystem) -> None:
+    """A5."""
     driver = await pair(system, Total, PBR())
     await driver.ask(Add(1))
     before = lives(driver, "r1")

@@ -255,7 +255,7 @@ def test_more_resources_never_make_it_dearer(
 
 @pytest.mark.parametrize("layers", [(), (PBR,), (PBR, TR), (LFR, TR), (AD, PBR), (SEC, PBR, TR), (SEC, AD, LFR, RB)])
 def test_these_are_nested_rightly(layers: tuple[type[Declared], ...]) -> None:
-    """A64 to A66."""
+    """A64-A66."""
     assert nesting_problems(layers) == ()
 
 

@@ -16,6 +16,7 @@ from holdfast.ftm.adaptations import (
     NothingValid,
 )
 from holdfast.ftm.application import Application
+from holdfast.ftm.events import MechanismAttached, MechanismChanged, MechanismDetached, ReplicaFaulty
 from holdfast.ftm.judge import Readings
 from holdfast.ftm.model import Faults, Resources
 from holdfast.ftm.monitoring import (
@@ -28,6 +29,7 @@ from holdfast.ftm.monitoring import (
     Object,
     Observe,
 )
+from holdfast.ftm.sealed import FrameRefused
 from holdfast.testing import advance
 from tests.ftm.monitored import APP, NARROW, SETTINGS, WIDE, World, in_world
 
@@ -350,3 +352,67 @@ async def test_a_change_that_somebody_else_made_counts() -> None:
         assert [order.current for order in world.orders] == [("tmr",)]
 
     await in_world(play, resources=Resources(units=3))
+
+
+async def test_a_change_that_somebody_else_made_is_seen_by_its_event() -> None:
+    async def play(world: World) -> None:
+        emit = world.system.node.emit
+        emit(MechanismChanged("/app/bob", ("pbr",), ("lfr",), 2, 0.0))  # Of somebody else.
+        await advance(2)
+        assert (await world.report()).current == ("pbr",)
+        emit(MechanismChanged("/app/alice", ("pbr",), ("lfr",), 2, 0.0))
+        await advance(2)
+        assert (await world.report()).current == ("lfr",)
+        emit(MechanismDetached("/app/alice", ("lfr",), 0.0))
+        await advance(2)
+        assert (await world.report()).current == ()
+        emit(MechanismAttached("/app/alice", ("nobodys_own",), 0.0))
+        world.told()
+        await advance(2)
+        (blind,) = [event for event in world.told() if isinstance(event, MonitoringBlind)]
+        assert "no declaration of nobodys_own" in blind.reason
+
+    await in_world(play)
+
+
+async def test_another_class_at_the_address_is_another_version() -> None:
+    """A2."""
+
+    class Moody(Account):
+        deterministic = False
+
+    async def play(world: World) -> None:
+        alice = await world.system.start(hf.child("alice", hf.start(Account)))
+        await advance(2)
+        assert (await world.report()).application == APP
+        await world.system.suspend(alice)
+        await world.system.replace_code(alice, Moody)
+        await world.system.resume(alice)
+        await advance(2)
+        seen = (await world.report()).application
+        assert not seen.is_deterministic
+        assert (seen.state_bytes, seen.rate) == (APP.state_bytes, APP.rate)
+        await advance(5)
+        assert [order.target for order in world.orders] == [("pbr",)]
+
+    await in_world(play, current=("lfr",))
+
+
+@pytest.mark.parametrize(("reason", "seen"), [("forged", True), ("replayed", True), ("stale_epoch", False)])
+async def test_refused_frames_are_signs_but_not_those_of_the_time_before(reason: str, seen: bool) -> None:
+    async def play(world: World) -> None:
+        for count in range(3):
+            world.system.node.emit(FrameRefused("/app/alice", "/app/alice/ftm/r1", reason, count + 1))
+        await advance(1.5)
+        assert ("forgery" in (await world.report()).faults.classes) is seen
+
+    await in_world(play)
+
+
+async def test_a_replica_that_is_faulty_again_and_again_is_a_permanent_fault() -> None:
+    async def play(world: World) -> None:
+        world.system.node.emit(ReplicaFaulty("/app/alice", "r2", 1, 3))
+        await advance(1.5)
+        assert "permanent_value" in (await world.report()).faults.classes
+
+    await in_world(play)

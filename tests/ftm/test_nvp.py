@@ -11,7 +11,7 @@ from holdfast.ftm.alarms import Masked
 from holdfast.ftm.mechanism import MechanismRefused, find, revive
 from holdfast.ftm.mechanisms.nvp import NVP
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.voters import Exact, Majority, Median, NoMajority, Tolerance
+from holdfast.ftm.voters import Exact, Majority, Median, NoMajority, Tolerance, custom
 from tests.ftm import versions
 from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Put, Read, Say, Total, pair
 from tests.ftm.versions import FAULTY
@@ -89,6 +89,24 @@ async def test_a_transient_fault_of_one_run_is_masked(system: hf.ActorSystem) ->
     assert await driver.ask(Read()) == [1, 2]
 
 
+async def test_the_version_in_the_middle_is_taken_with_its_state(system: hf.ActorSystem) -> None:
+    """T44: also when it is not the protected class, which comes to something else each time."""
+    driver = await pair(system, versions.Low, NVP((versions.High, Total), voter=Median()), others=())
+    assert [await driver.ask(Add(10)) for _ in range(3)] == [10, 20, 30]
+    assert await driver.ask(Read()) == [10, 10, 10]
+
+
+async def test_if_no_version_is_in_the_middle_there_is_no_majority(system: hf.ActorSystem) -> None:
+    driver = await pair(system, versions.Low, NVP((versions.High, versions.Swaying), voter=Median()), others=())
+    with pytest.raises(NoMajority, match="in the middle"):
+        await driver.ask(Add(10))
+
+
+async def test_a_voter_of_ones_own_says_which_run_is_taken(system: hf.ActorSystem) -> None:
+    driver = await pair(system, versions.Low, NVP((versions.High, Total), voter=custom(versions.last)), others=())
+    assert await driver.ask(Add(10)) == 10
+
+
 async def test_below_passive_replication_the_backup_has_what_was_voted_for(system: hf.ActorSystem) -> None:
     driver = await pair(system, versions.BadState, PBR(), NVP(GOOD))
     assert await driver.ask(Add(13)) == 13
@@ -109,8 +127,8 @@ def test_what_cannot_work_is_refused_with_the_reason() -> None:
         NVP(GOOD).check(Random)
     with pytest.raises(ValueError, match="at least two"):
         NVP(versions.Second)
-    with pytest.raises(ValueError, match="chooses one of the outcomes"):
-        NVP(GOOD, voter=Median())
+    with pytest.raises(ValueError, match="a voter is one such as"):
+        NVP(GOOD, voter=Median)
     made: Any = revive(NVP(GOOD, voter=Majority(need=3)).describe())
     assert made == NVP(GOOD, voter=Majority(need=3))
     assert find("nvp") is NVP

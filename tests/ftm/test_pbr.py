@@ -41,6 +41,7 @@ from tests.ftm.replicated import (
 
 
 async def test_a_backup_that_leads_goes_on_where_the_primary_was(system: hf.ActorSystem) -> None:
+    """A35."""
     driver = await pair(system)
     assert await driver.ask(Add(1)) == 1
     assert await driver.ask(Add(2)) == 3
@@ -58,7 +59,7 @@ async def test_finish_takes_a_last_snapshot(system: hf.ActorSystem) -> None:
 
 
 async def test_a_reply_leaves_only_when_the_backup_has_its_state(system: hf.ActorSystem) -> None:
-    """T4, A52: the backup is stopped in the middle; no reply leaves until it goes on."""
+    """A34, T4, A52: the backup is stopped in the middle; no reply leaves until it goes on."""
     driver = await pair(system)
     backup = system.node.cell_at(driver.path("r2") + "/after").ref
     await system.suspend(backup)
@@ -145,6 +146,12 @@ async def test_whether_it_traps_exits_is_part_of_its_state(system: hf.ActorSyste
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
     assert await driver.ask(Trap(on=False))
+
+
+@pytest.mark.parametrize("setting", [{"window": 0}, {"window": -1}, {"window": "x"}, {"acknowledge": "no"}])
+def test_settings_that_mean_nothing_are_refused(setting: Any) -> None:
+    with pytest.raises(ValueError, match=rf"PBR: {next(iter(setting))} must be .*not {next(iter(setting.values()))!r}"):
+        PBR(**setting)
 
 
 @pytest.mark.parametrize("together", [False, True])

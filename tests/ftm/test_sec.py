@@ -74,7 +74,7 @@ STACKS: dict[str, Callable[[], tuple[Any, ...]]] = {
 
 @pytest.mark.parametrize("name", STACKS)
 async def test_requests_are_answered_over_it(secured: hf.ActorSystem, name: str) -> None:
-    """A66, A71."""
+    """A73, A74, A66, A71."""
     ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(STACKS[name]())))
     replies = await asyncio.gather(*[ref.ask(Add(n), timeout=20.0) for n in range(200)])
     assert replies == list(range(1, 201))

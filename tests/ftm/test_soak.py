@@ -1,4 +1,4 @@
-"""Mechanisms come, change and go every 200 ms under full load, while replicas are killed (A76 to A82).
+"""Mechanisms come, change and go every 200 ms under full load, while replicas are killed (A76-A82).
 
 `HOLDFAST_SOAK=60` soaks for a minute.
 """

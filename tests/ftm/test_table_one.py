@@ -1,4 +1,4 @@
-"""`select` and `coverage` of the built-in mechanisms, against Table I and its extension (A26 to A33)."""
+"""`select` and `coverage` of the built-in mechanisms, against Table I and its extension (A26-A33)."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ SITUATIONS = [
 
 
 def test_what_is_valid_is_what_the_table_says_first_by_faults_then_application_then_resources() -> None:
-    """A19, A25: in all situations, against the rule read from the table."""
+    """A16, A18, A19, A25: in all situations, against the rule read from the table."""
     assert len(SITUATIONS) == 225
     for faults, lacks, units in SITUATIONS:
         application = Application(

@@ -205,7 +205,9 @@ def test_what_cannot_work_is_refused_with_the_reason() -> None:
         TMR().check(Closed)
     with pytest.raises(MechanismRefused, match="deterministic = False"):
         TMR().check(Random)
-    with pytest.raises(ValueError, match="chooses one of the outcomes"):
+    with pytest.raises(ValueError, match=r"take Tolerance"):
         TMR(voter=Median())
+    with pytest.raises(ValueError, match=r"one such as .*Majority\(\).*not 'majority'"):
+        TMR(voter="majority")
     assert revive(TMR().describe()) == TMR()
     assert find("tmr") is TMR

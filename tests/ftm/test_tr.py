@@ -63,7 +63,7 @@ async def test_all_goes_through_as_before(system: hf.ActorSystem) -> None:
 @pytest.mark.parametrize("kind", ["answer", "state", "output", "crash"])
 @pytest.mark.parametrize("run", [0, 1, 2])
 async def test_one_fault_is_masked_in_whatever_run(system: hf.ActorSystem, kind: str, run: int) -> None:
-    """T43, T44: two of three."""
+    """A38, T43, T44: two of three."""
     driver = await pair(system, Struck, TR(), others=())
     assert await driver.ask(Add(1)) == 1
     with system.events() as events:

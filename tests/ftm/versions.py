@@ -51,6 +51,38 @@ class Second(Total):
         return total
 
 
+class Low(Total):
+    """Always a little less."""
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.seen.append(message.n - 1)
+        return sum(self.seen)
+
+
+class High(Total):
+    """Always a little more."""
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.seen.append(message.n + 1)
+        return sum(self.seen)
+
+
+class Swaying(Total):
+    """More in what it says than anybody, and less in what it keeps."""
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.seen.append(message.n - 5)
+        return message.n
+
+
+def last(ballots: Any) -> tuple[int, ...]:
+    """A voter: takes the last run, all others may be as they are."""
+    return tuple(range(len(ballots)))[::-1]
+
+
 class Third(Total):
     """Does it by itself too."""
 

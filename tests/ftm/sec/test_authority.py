@@ -1,4 +1,4 @@
-"""The certification authority, as an actor in a system (A68 to A70)."""
+"""The certification authority, as an actor in a system (A68-A70)."""
 
 import time
 from pathlib import Path
@@ -30,6 +30,7 @@ async def enrol(authority: Authority, name: str, key: SigningKey | None = None, 
 
 
 async def test_participants_that_it_has_enrolled_can_meet() -> None:
+    """A69."""
     async with hf.ActorSystem("app", log=False) as system:
         authority = system.spawn(hf.start(CertificationAuthority), name="ca")
         one, other = await enrol(authority, "a"), await enrol(authority, "b")

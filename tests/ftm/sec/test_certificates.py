@@ -1,4 +1,4 @@
-"""Certificates: whom to believe, and for how long (A68 to A70)."""
+"""Certificates: whom to believe, and for how long (A68-A70)."""
 
 import datetime as dt
 from collections.abc import Callable

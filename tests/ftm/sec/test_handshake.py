@@ -1,4 +1,4 @@
-"""Hand-shakes: only with whom one means, in this life and this epoch (A71 to A75, T47)."""
+"""Hand-shakes: only with whom one means, in this life and this epoch (A71-A75, T47)."""
 
 from collections.abc import Callable
 

@@ -1,0 +1,86 @@
+"""A watch over a running actor: what it has is read from its spec, and it is changed by transactions (A6, A15)."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm.adaptations import AdaptationDone, AdaptationFailed
+from holdfast.ftm.application import Application
+from holdfast.ftm.judge import Settings
+from holdfast.ftm.mechanism import MechanismRefused
+from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.model import Faults, Resources
+from holdfast.ftm.monitoring import MonitoringEngine, Observe, Report
+from holdfast.ftm.watched import watch_of
+from tests.ftm.accounts import Add, Counter
+from tests.ftm.versions import is_positive
+
+# Processes do not care which event loop the root has.
+pytestmark = pytest.mark.asyncio(loop_factories=["uvloop"])
+
+CRASHES = Settings(required=Faults.of("crash"), interval=0.02, confirm=0.0, dwell=0.1, urgent_dwell=0.0)
+TWO = Resources(units=2)
+
+
+async def engine(system: hf.ActorSystem, watch: Any) -> hf.ActorRef[Any]:
+    return await system.start(hf.child("monitoring", hf.start(MonitoringEngine, watch)))
+
+
+async def done(events: Any) -> AdaptationDone:
+    async with asyncio.timeout(30):
+        async for event in events:
+            assert not isinstance(event, AdaptationFailed), event
+            if isinstance(event, AdaptationDone):
+                return event
+    raise AssertionError("the stream has ended")
+
+
+def stack(ref: hf.ActorRef[Any]) -> Any:
+    return ref._cell.spec.mechanism
+
+
+async def test_what_is_decided_is_done_to_what_the_spec_says(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR(window=3)))
+    watch = watch_of(system, ref, CRASHES, resources=TWO, probe=None)
+    assert watch.judge.current == ("pbr",)
+    with system.events() as events:
+        monitor = await engine(system, watch)
+        monitor.tell(Observe("mismatch", 3))
+        assert (await done(events)).current == ("pbr", "tr")
+    assert stack(ref) == (PBR(window=3), hf.TR())  # What it had keeps its settings.
+    async with system.transaction(timeout=30) as change:
+        change.transition(ref, (LFR(), hf.TR()))
+    async with asyncio.timeout(30):
+        while (await monitor.ask(Report())).current != ("lfr", "tr"):
+            await asyncio.sleep(0.01)
+    assert await ref.ask(Add(1)) == 1
+
+
+async def test_what_has_no_mechanism_gets_one_and_loses_it_when_none_is_needed(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter)))
+    watch = watch_of(system, ref, CRASHES, resources=TWO, probe=None)
+    with system.events() as events:
+        monitor = await engine(system, watch)
+        assert (await done(events)).current == ("pbr",)
+        assert stack(ref) == PBR()
+        watch.judge.settings = Settings(interval=0.02, confirm=0.0, dwell=0.0, urgent_dwell=0.0, transition_cost=0.0)
+        assert (await done(events)).current == ()
+    assert stack(ref) is None
+    assert (await monitor.ask(Report())).changes == 2
+    assert await ref.ask(Add(1)) == 1
+
+
+async def test_what_mechanisms_bring_along_counts(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter)))
+    asserting = hf.AD(assertions=(is_positive,))
+    watch = watch_of(system, ref, CRASHES, mechanisms=(asserting, "pbr", LFR), known={"rate": 7.0})
+    assert watch.judge.application == Application.of(Counter, assertions=1, rate=7.0)
+    with pytest.raises(MechanismRefused, match="no mechanism of that name"):
+        watch_of(system, ref, CRASHES, mechanisms=("pbr", "nosuch"))
+    with pytest.raises(hf.SpecError, match="not supervised"):
+        watch_of(system, system.spawn(hf.start(Counter)), CRASHES)
