@@ -178,11 +178,13 @@ class Shadow(Server):
         self._place()
         await self._go_back(before)
         pending, ends = deque(requests), list[TurnEnd]()
-        while pending and not self.is_over:
+        while pending and not self.is_over and not self._is_stopping:
             new = await self.part(pending)
             self._keep_tail(self.begun, new)
             ends += new
         self._skips.clear()
+        if self._is_stopping:  # Stopped in the middle: what has no end here may well have one elsewhere.
+            self._fail("its replica ends")
         if self._why:
             return ends, None
         if self.is_over:

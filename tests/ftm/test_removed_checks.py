@@ -241,6 +241,13 @@ CHECKS = {
         "tests/ftm/test_tmr.py",
         "test_a_follower_that_is_wrong",
     ),
+    "TMR: what is stopped in the middle has no vote": Check(
+        "ftm/runs.py",
+        "        if self._is_stopping:  # Stopped",
+        "        if False:  # Stopped",
+        "tests/ftm/test_tmr.py",
+        "test_a_replica_that_is_stopped_while",
+    ),
     "T47: a frame counts once": Check(
         "ftm/sec/session.py",
         "        refusal = TOO_OLD if sequence >= MOST_FRAMES else self._window.refusal(sequence)\n",
