@@ -6,12 +6,7 @@ whether the checks and the tests are where this table says.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
-import pytest
-
-from tests.removing import Check, copied, is_true, missed, without
+from tests.removing import Check, tests_of
 
 JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
@@ -304,6 +299,13 @@ CHECKS = {
         "tests/ftm/test_detector.py",
         "test_an_observer_that_was_held_up",
     ),
+    "a detach that has the state looks whether that still counts": Check(
+        "ftm/leaving.py",
+        "            if group.epoch == epoch and group.primary is not None and group.out is None and not",
+        "            if not",
+        "tests/ftm/test_attach.py",
+        "test_detached_while_whoever_leads_is_deposed",
+    ),
     "a message that kills is found out": Check(
         "ftm/group.py",
         "        return out.requests[0].feed.id\n",
@@ -313,20 +315,4 @@ CHECKS = {
     ),
 }
 
-
-@pytest.mark.parametrize("name", CHECKS)
-def test_the_table_is_true(name: str) -> None:
-    assert is_true(CHECKS[name])
-
-
-@pytest.fixture(scope="module")
-def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package and its tests, to be broken."""
-    return copied(tmp_path_factory.mktemp("removed"))
-
-
-@pytest.mark.skipif("HOLDFAST_REMOVED" not in os.environ, reason="HOLDFAST_REMOVED=1 has the checks removed")
-@pytest.mark.parametrize("name", CHECKS)
-def test_without_the_check_a_test_fails(copy: Path, name: str) -> None:
-    with without(copy, CHECKS[name]):
-        assert missed(copy, CHECKS[name]), f"{CHECKS[name].test} does not miss it"
+test_the_table_is_true, test_without_the_check_a_test_fails = tests_of(CHECKS)
