@@ -198,6 +198,7 @@ if TYPE_CHECKING:
         ReplicaFaulty,
         ReplicaJoined,
         ReplicaLost,
+        TurnHung,
         WrongSuspicion,
     )
     from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
@@ -414,6 +415,7 @@ __all__ = [
     "TreeFailed",
     "TurnBegan",
     "TurnEnded",
+    "TurnHung",
     "TurnSlow",
     "TurnsLost",
     "TurnsSkipped",
@@ -485,6 +487,7 @@ _LAZY = {
     "SEC": "holdfast.ftm.mechanisms.sec",
     "TMR": "holdfast.ftm.mechanisms.tmr",
     "TR": "holdfast.ftm.mechanisms.tr",
+    "TurnHung": "holdfast.ftm.events",
     "WrongSuspicion": "holdfast.ftm.events",
     "compose": "holdfast.ftm.mechanism",
 }

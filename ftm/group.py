@@ -40,6 +40,7 @@ from .hold import Hold
 from .messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
 from .securing import Securing
 from .strays import Strays
+from .stuck import Stuck
 
 if TYPE_CHECKING:
     from ..actors.node import Node
@@ -84,6 +85,7 @@ class Group(Securing):
         self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}
         self.strays = Strays(self)
+        self.stuck = Stuck(self)
         self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
         self.failovers = 0
@@ -475,6 +477,9 @@ class Group(Securing):
         source = switch.open.get(end.id)
         if source is not None and source.kind == START and end.status == FAILED:
             self.on_start_failed(end)
+            return
+        if self.stuck.takes(end):
+            self.ledger.pop(end.id, None)
             return
         if end.outs:
             self.background.note(end.turn, end.outs)

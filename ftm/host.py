@@ -189,7 +189,8 @@ class GroupHost(Steered):
         start = cell.extra().start
         assert start is not None
         bindings = {port: target.path for port, target in cell.extra().bindings.items()}
-        setting = Setting(cell.path, name, config, self.method.data(), bindings, self.detection.interval)
+        interval, watch_turns = self.detection.interval, self.detection.watch_turns or 0.0
+        setting = Setting(cell.path, name, config, self.method.data(), bindings, interval, watch_turns)
         return self.replica(setting, start, tuple(layer.describe() for layer in layers))
 
     # -- other mechanisms -------------------------------------------------------------------------------------------

@@ -28,6 +28,8 @@ class Setting(msgspec.Struct, array_like=True, frozen=True):
     """Of the protected actor: port to address."""
     beat: float
     """Seconds between two heartbeats."""
+    watch_turns: float = 0.0
+    """Seconds that a turn may take; 0: as many as it wants."""
 
 
 class Install(Message[None]):
@@ -82,11 +84,19 @@ class Finish(Message[None]):
     reason: dict[str, Any]
 
 
+class EndTurn(Message[None]):
+    """The turn of this input, if it is in hand, is over: as if its handler had raised."""
+
+    epoch: int
+    number: int
+
+
 class Beat(Message):
-    """This replica's bricks are running."""
+    """This replica's bricks are running; the turn of input `hung` has taken too long, -1 if none has."""
 
     name: str
     epoch: int
+    hung: int = -1
 
 
 class Exported(msgspec.Struct, array_like=True):

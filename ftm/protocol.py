@@ -37,7 +37,7 @@ from .messages import (
     Taken,
     Work,
 )
-from .orders import Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
+from .orders import EndTurn, Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
 from .post import Where
 from .sealed import Refused
 from .transfer import Assume, Transfer
@@ -292,6 +292,11 @@ class RequestProtocol(Transfer):
             raise ConfigMismatch(self._standing.path, self._standing.config, message.config)
         return path
 
+    @on(EndTurn)
+    def _end_turn(self, message: EndTurn) -> None:
+        self._check(message.epoch)
+        self._standing.server.end_turn(message.number)
+
     # -- the state --------------------------------------------------------------------------------------------------
 
     @on(Export)
@@ -360,6 +365,7 @@ RequestProtocol.handlers = {
     Lead: "_lead",
     Follow: "_follow",
     Peer: "_peer",
+    EndTurn: "_end_turn",
     Join: "_join",
     Export: "_export",
     Quiesce: "_quiesce",

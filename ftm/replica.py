@@ -10,8 +10,7 @@ import asyncio
 import dataclasses
 from typing import Any, NamedTuple
 
-from ..actors.actor import Actor, Start, on, start
-from ..actors.bindings import Binding
+from ..actors.actor import Start, on, start
 from ..actors.cell import Cell
 from ..actors.errors import HoldfastError, type_name
 from ..actors.events import ActorStarted
@@ -22,8 +21,9 @@ from ..supervision.children import Child, new_cell
 from ..supervision.spec import Flags, Plan, child
 from ..supervision.supervisor import Supervisor
 from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
+from .heart import Heart
 from .mechanism import Description, Mechanism, MechanismRefused, revive
-from .orders import Beat, Setting
+from .orders import Setting
 from .protocol import InnerProtocol, RequestProtocol
 from .server import Server
 from .standing import Standing
@@ -59,32 +59,6 @@ class EndBricks(Message):
     """From the replica to itself: these are not needed any more."""
 
     names: list[str]
-
-
-class Tick(Message):
-    """It is time for a heartbeat."""
-
-
-class Heart(Actor):
-    """Tells the failure detector that the bricks of this replica run."""
-
-    detector: Binding[Actor]
-
-    def __init__(self, standing: Standing, name: str, interval: float) -> None:
-        self._standing, self._name, self._interval = standing, name, interval
-
-    def on_start(self, restored: bool) -> None:
-        """Beat at once, then regularly."""
-        if self._interval > 0:
-            self._beat(Tick())
-            self.ctx.every(self._interval, Tick())
-
-    @on(Tick)
-    def _beat(self, message: Tick) -> None:
-        try:
-            self.detector.tell(Beat(self._name, self._standing.epoch))
-        except HoldfastError:
-            return  # It is between two lives.
 
 
 class Place(NamedTuple):
@@ -204,7 +178,7 @@ class Replica(Supervisor):
         node.emit(ActorStarted(self._cell(SERVER).path, 1))  # Its lives come and go with the role: the address stays.
         woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=False)
         await self._take_up(woven)
-        one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat)))
+        one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat, setting.watch_turns)))
         one.cell = cell = new_cell(self.ctx.cell, one)
         node.bind(cell, "detector", node.cell_at(f"{setting.address}/ftm/detector"))
         self._enlist(one)

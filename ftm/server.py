@@ -214,6 +214,13 @@ class Server(Points):
         self.point = None
         return True
 
+    def end_turn(self, number: int) -> None:
+        """The turn of this input hangs: if it is in hand, it has failed, as if its handler had raised."""
+        life, cell = self.life, self.cell
+        if cell is not None and life is not None and life.feed is not None and life.feed.id == number:
+            life.fail_turn(TimeoutError(f"the turn of {life.feed.name} does not end"))
+            self.kill(cell)
+
     # -- the front --------------------------------------------------------------------------------------------------
 
     @property

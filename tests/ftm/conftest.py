@@ -29,7 +29,7 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
 ON_ONE_LOOP = {
     "test_ad", "test_attach", "test_campaign", "test_composed", "test_failover", "test_images", "test_in_processes",
     "test_lfr", "test_nvp", "test_pbr", "test_pbr_joining", "test_post", "test_rb", "test_sec", "test_strays",
-    "test_tmr", "test_tr",
+    "test_stuck", "test_tmr", "test_tr",
 }  # fmt: skip
 
 

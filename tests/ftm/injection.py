@@ -27,13 +27,14 @@ from holdfast.checkpoint.records import OK, REPLY, Answer, TurnEnd
 from holdfast.ftm.bricks import Brick
 from holdfast.ftm.detector import Detector
 from holdfast.ftm.failover import FailoverManager
+from holdfast.ftm.heart import Heart
 from holdfast.ftm.join import Joiner
 from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanism import BUILT_IN, find
 from holdfast.ftm.messages import Done, Follow, Lead, Work
 from holdfast.ftm.orders import Peer
 from holdfast.ftm.proxy import Proxy
-from holdfast.ftm.replica import Heart, Replica
+from holdfast.ftm.replica import Replica
 from holdfast.ftm.sealed import Sealed
 from holdfast.ftm.state import StateManager
 from tests.ftm.accounts import Bank, Counter

@@ -306,6 +306,13 @@ CHECKS = {
         "tests/ftm/test_attach.py",
         "test_detached_while_whoever_leads_is_deposed",
     ),
+    "a message that hangs again is put aside": Check(
+        "ftm/group.py",
+        "        if self.stuck.takes(end):\n",
+        "        if False:\n",
+        "tests/ftm/test_stuck.py",
+        "test_a_message_that_hangs_again and tr",
+    ),
     "a message that kills is found out": Check(
         "ftm/group.py",
         "        return out.requests[0].feed.id\n",

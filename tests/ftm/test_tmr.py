@@ -106,7 +106,7 @@ class Gated(Total):
     gates: ClassVar[dict[str, asyncio.Future[None]]] = {}
 
     @hf.on(Fetch)
-    async def fetch(self, message: Fetch) -> int:
+    async def fetch(self, message: Fetch) -> Any:
         reached = self.gates.pop(self.ctx.cell.path.split("/")[4], None)
         if reached is not None:
             reached.set_result(None)

@@ -1,0 +1,80 @@
+"""Turns that do not end, though their process lives: another replica tries, and then the message is put aside.
+
+Attempts are counted here, at the home's input, as deaths in the turn of a message are.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ..actors.errors import HoldfastError
+from ..checkpoint.records import FAILED
+from .events import TurnHung
+from .orders import EndTurn
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from ..checkpoint.records import TurnEnd
+    from .group import Group
+
+MOST = 2
+"""Replicas that are given up for one message: it is the message, then, and not they."""
+ANSWERED_WITHIN = 5.0
+"""Seconds after which a replica that was told to end a turn is told again."""
+
+
+class Stuck:
+    """Which inputs have held up a replica, and which are to be put aside."""
+
+    def __init__(self, group: Group) -> None:
+        self._group = group
+        self._counted: set[tuple[int, int]] = set()  # epoch and input
+        self._given_up: set[int] = set()
+        self._telling: asyncio.Future[Any] | None = None
+
+    def told(self, name: str, life: int, number: int) -> None:
+        """A replica says that the turn of this input has taken it too long."""
+        group = self._group
+        if name != group.primary:
+            # A follower may wait for what the one that leads has not got either: that one is looked at then.
+            if group.primary is not None and number not in group.switch.open and group.members.get(name) == life:
+                group.suspect(name, life, f"it does not end the turn of input {number}")
+            return
+        source = group.switch.open.get(number)
+        if source is None or group.members.get(name) != life:
+            return  # Its end is known: that the turn is over will be heard of.
+        if (group.epoch, number) not in self._counted:
+            self._counted.add((group.epoch, number))
+            source.deliveries += 1
+            group.node.emit(TurnHung(group.path, name, group.epoch, source.name, source.deliveries))
+        if source.deliveries < min(MOST, group.switch.method.max_deliveries) and group.backups():
+            group.suspect(name, life, f"it does not end the turn of input {number}")
+            return
+        self._given_up.add(number)
+        self._tell(name, number)
+
+    def _tell(self, name: str, number: int) -> None:
+        """Have it end the turn; it says so again with its next heartbeat, if that gets lost."""
+        if self._telling is not None and not self._telling.done():
+            return
+        group = self._group
+        try:
+            self._telling = group.protocol(name).ask(EndTurn(group.epoch, number), ANSWERED_WITHIN)
+        except HoldfastError:
+            return  # It has died.
+        self._telling.add_done_callback(lambda done: done.cancelled() or done.exception())
+
+    def takes(self, end: TurnEnd) -> bool:
+        """Whether this turn was ended because it hung: its message is put aside."""
+        if not self._counted:
+            return False
+        self._counted = {one for one in self._counted if one[1] != end.id}
+        if end.id not in self._given_up:
+            return False
+        self._given_up.discard(end.id)
+        source = self._group.switch.open.get(end.id)
+        if source is None or end.status != FAILED:
+            return False
+        self._group.switch.ends.quarantine(source)
+        return True
