@@ -159,10 +159,7 @@ class Detector(Actor):
             self._known[beat.name, life] = Accrual(group.detection, now)
         else:
             accrual.heard(now)
-        if beat.hung < 0:
-            group.heard(beat.name, life)
-        else:
-            group.stuck.told(beat.name, life, beat.hung)
+        group.heard(beat.name, life)
 
     def _look(self) -> None:
         if self.ctx.closed:

@@ -162,6 +162,8 @@ class Group(Securing):
 
     def heard(self, name: str, life: int) -> None:
         """A replica has given a sign of life."""
+        if self.stuck.holds(name, life):
+            return
         if self.suspects.get(name) == life:
             self.wrong += 1
             del self.suspects[name]

@@ -9,7 +9,8 @@ from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.message import Message
 from ..checkpoint.records import START
-from .orders import Beat
+from .orders import Beat, Stalled
+from .sealed import tell_over
 
 if TYPE_CHECKING:
     from .standing import Standing
@@ -23,6 +24,7 @@ class Heart(Actor):
     """Tells the failure detector that the bricks of this replica run, and that a turn does not end."""
 
     detector: Binding[Actor]
+    proxy: Binding[Actor]
 
     def __init__(self, standing: Standing, name: str, interval: float, watch_turns: float) -> None:
         self._standing, self._name, self._interval, self._longest = standing, name, interval, watch_turns
@@ -37,16 +39,19 @@ class Heart(Actor):
 
     @on(Tick)
     def _beat(self, message: Tick) -> None:
+        standing = self._standing
         try:
-            self.detector.tell(Beat(self._name, self._standing.epoch, self._hung()))
+            self.detector.tell(Beat(self._name, standing.epoch))
+            if self._longest and (number := self._hung()) >= 0:
+                self._say(Stalled(self._name, standing.epoch, number))
         except HoldfastError:
-            return  # It is between two lives.
+            return  # They are between two lives.
 
     def _hung(self) -> int:
         """The input whose turn takes too long, -1 if none does. While this process stood still, nothing is counted."""
         life = self._standing.server.life
         feed = None if life is None else life.feed
-        if not self._longest or life is None or feed is None or feed.kind == START:
+        if life is None or feed is None or feed.kind == START:
             self._turn = None
             return -1
         now, turn = self.ctx.cell.node.loop.time(), (self._standing.epoch, life.turn, feed.id)
@@ -55,4 +60,14 @@ class Heart(Actor):
             self._turn, self._seconds = turn, 0.0
             return -1
         self._seconds += gap
-        return feed.id if self._seconds > self._longest else -1
+        if self._seconds <= self._longest:
+            return -1
+        self._seconds -= self._longest / 2  # It is said again then, if that has not helped.
+        return feed.id
+
+    def _say(self, stalled: Stalled) -> None:
+        link, turn = self._standing.link, self._turn
+        if link is None:
+            self.proxy.tell(stalled)
+        else:
+            tell_over(link, self.proxy._cell, stalled, lambda: self._turn == turn)

@@ -12,6 +12,7 @@ import msgspec
 
 from ..actors.message import Message
 from ..checkpoint.records import TurnEnd
+from .mechanism import Description
 
 
 class Setting(msgspec.Struct, array_like=True, frozen=True):
@@ -77,6 +78,28 @@ class Quiesce(Message[Stand]):
     config: int
 
 
+class Prepare(Message[None]):
+    """Start the bricks of another stack of mechanisms beside those of the present one."""
+
+    config: int
+    layers: list[Description]
+
+
+class Commit(Message[int]):
+    """Bind everything as that stack wants it, and end the bricks that are not needed. Nothing may be inside.
+
+    The reply is the last turn whose state is here.
+    """
+
+    config: int
+
+
+class Abort(Message[None]):
+    """End the bricks that were prepared; everything stays as it was."""
+
+    config: int
+
+
 class Finish(Message[None]):
     """End in good order: a last snapshot (if the method takes any), then `on_stop` of the protected actor."""
 
@@ -92,11 +115,18 @@ class EndTurn(Message[None]):
 
 
 class Beat(Message):
-    """This replica's bricks are running; the turn of input `hung` has taken too long, -1 if none has."""
+    """This replica's bricks are running. Goes as it is, over secured links too: see there."""
 
     name: str
     epoch: int
-    hung: int = -1
+
+
+class Stalled(Message):
+    """From a replica to the proxy: the turn of this input takes too long."""
+
+    name: str
+    epoch: int
+    number: int
 
 
 class Exported(msgspec.Struct, array_like=True):

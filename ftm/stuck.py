@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ..actors.errors import HoldfastError
 from ..checkpoint.records import FAILED
 from .events import TurnHung
-from .orders import EndTurn
+from .orders import EndTurn, Stalled
 
 if TYPE_CHECKING:
     import asyncio
@@ -31,31 +31,43 @@ class Stuck:
         self._group = group
         self._counted: set[tuple[int, int]] = set()  # epoch and input
         self._given_up: set[int] = set()
+        self._suspected: dict[str, int] = {}  # name to life
         self._telling: asyncio.Future[Any] | None = None
 
-    def told(self, name: str, life: int, number: int) -> None:
-        """A replica says that the turn of this input has taken it too long."""
-        group = self._group
+    def told(self, stalled: Stalled) -> None:
+        """A replica says that the turn of an input has taken it too long."""
+        group, name, number = self._group, stalled.name, stalled.number
+        life = group.life_of(name)
+        if stalled.epoch != group.epoch or group.members.get(name) != life:
+            return
         if name != group.primary:
             # A follower may wait for what the one that leads has not got either: that one is looked at then.
-            if group.primary is not None and number not in group.switch.open and group.members.get(name) == life:
-                group.suspect(name, life, f"it does not end the turn of input {number}")
+            if group.primary is not None and number not in group.switch.open:
+                self._suspect(name, life, number)
             return
         source = group.switch.open.get(number)
-        if source is None or group.members.get(name) != life:
-            return  # Its end is known: that the turn is over will be heard of.
+        if source is None:
+            return  # Its end is known: the turn is over by now.
         if (group.epoch, number) not in self._counted:
             self._counted.add((group.epoch, number))
             source.deliveries += 1
             group.node.emit(TurnHung(group.path, name, group.epoch, source.name, source.deliveries))
         if source.deliveries < min(MOST, group.switch.method.max_deliveries) and group.backups():
-            group.suspect(name, life, f"it does not end the turn of input {number}")
+            self._suspect(name, life, number)
             return
         self._given_up.add(number)
         self._tell(name, number)
 
+    def _suspect(self, name: str, life: int, number: int) -> None:
+        self._suspected[name] = life
+        self._group.suspect(name, life, f"it does not end the turn of input {number}")
+
+    def holds(self, name: str, life: int) -> bool:
+        """Whether it was for that that this replica is suspected: then its heartbeats mean nothing."""
+        return self._suspected.get(name) == life
+
     def _tell(self, name: str, number: int) -> None:
-        """Have it end the turn; it says so again with its next heartbeat, if that gets lost."""
+        """Have it end the turn; if that gets lost, it will be heard of again."""
         if self._telling is not None and not self._telling.done():
             return
         group = self._group
