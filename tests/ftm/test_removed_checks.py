@@ -271,6 +271,20 @@ CHECKS = {
         SEC,
         "test_what_is_forged",
     ),
+    "plain orders change no stack of mechanisms": Check(
+        "ftm/protocol.py",
+        "        if changes and not self._admits():\n",
+        "        if False:\n",
+        "tests/ftm/test_sec_orders.py",
+        "test_orders_that_are_forged",
+    ),
+    "a link that is not wanted any more ends behind the answer to the order that says so": Check(
+        "ftm/replica.py",
+        "            await brick.answered()  # Among",
+        "            pass  # Among",
+        SEC,
+        "test_attached_composed_and_detached",
+    ),
     "plain words are not admitted at the proxy": Check(
         "ftm/securing.py",
         "        return self.link is None\n",
