@@ -74,7 +74,7 @@ def missed(copy: Path, check: Check) -> str:
 Test = Callable[..., None]
 
 
-def tests_of(checks: dict[str, Check]) -> tuple[Test, Test]:
+def as_tests(checks: dict[str, Check]) -> tuple[Test, Test]:
     """The tests of a table: that it says what there is; and, if that is wanted, that each check is missed."""
     copies: list[Path] = []
 

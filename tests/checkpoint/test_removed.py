@@ -6,7 +6,7 @@ whether the checks and the tests are where this table says.
 
 from __future__ import annotations
 
-from tests.removing import Check, tests_of
+from tests.removing import Check, as_tests
 
 CHECKS = {
     "T13: after a failed sync nothing takes effect": Check(
@@ -250,4 +250,4 @@ CHECKS = {
     ),
 }
 
-test_the_table_is_true, test_without_the_check_a_test_fails = tests_of(CHECKS)
+test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

@@ -6,7 +6,7 @@ whether the checks and the tests are where this table says.
 
 from __future__ import annotations
 
-from tests.removing import Check, tests_of
+from tests.removing import Check, as_tests
 
 JOINING = "tests/ftm/test_pbr_joining.py"
 PBR, LFR, SEC = "tests/ftm/test_pbr.py", "tests/ftm/test_lfr.py", "tests/ftm/test_sec.py"
@@ -336,4 +336,4 @@ CHECKS = {
     ),
 }
 
-test_the_table_is_true, test_without_the_check_a_test_fails = tests_of(CHECKS)
+test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
