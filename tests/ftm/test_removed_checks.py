@@ -83,7 +83,7 @@ CHECKS = {
         "test_who_led_before_is_dead",
     ),
     "who alone has the state is not killed on suspicion": Check(
-        "ftm/group.py",
+        "ftm/members.py",
         "        return is_alive and not self.backups() and waited",
         "        return False and waited",
         FAILOVER,
