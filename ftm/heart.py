@@ -9,15 +9,21 @@ from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.message import Message
 from ..checkpoint.records import START
+from .life import ServerLife
 from .orders import Beat, Stalled
 from .sealed import tell_over
 
 if TYPE_CHECKING:
+    from .points import Points
     from .standing import Standing
 
 
 class Tick(Message):
     """It is time for a heartbeat."""
+
+
+Turn = tuple[int, ServerLife, int]
+"""A turn in hand: epoch, life, input."""
 
 
 class Heart(Actor):
@@ -28,8 +34,8 @@ class Heart(Actor):
 
     def __init__(self, standing: Standing, name: str, interval: float, watch_turns: float) -> None:
         self._standing, self._name, self._interval, self._longest = standing, name, interval, watch_turns
-        self._turn: tuple[int, int, int] | None = None  # that was in hand when last seen: epoch, turn, input
-        self._seen = self._seconds = 0.0
+        self._turns: dict[Points, tuple[Turn, float]] = {}  # with the seconds that they have taken
+        self._seen = 0.0
 
     def on_start(self, restored: bool) -> None:
         """Beat at once, then regularly."""
@@ -42,32 +48,36 @@ class Heart(Actor):
         standing = self._standing
         try:
             self.detector.tell(Beat(self._name, standing.epoch))
-            if self._longest and (number := self._hung()) >= 0:
-                self._say(Stalled(self._name, standing.epoch, number))
+            if self._longest:
+                self._watch_turns()
         except HoldfastError:
             return  # They are between two lives.
 
-    def _hung(self) -> int:
-        """The input whose turn takes too long, -1 if none does. While this process stood still, nothing is counted."""
-        life = self._standing.server.life
-        feed = None if life is None else life.feed
-        if life is None or feed is None or feed.kind == START:
-            self._turn = None
-            return -1
-        now, turn = self.ctx.cell.node.loop.time(), (self._standing.epoch, life.turn, feed.id)
-        gap, self._seen = min(now - self._seen, 2 * self._interval), now
-        if turn != self._turn:
-            self._turn, self._seconds = turn, 0.0
-            return -1
-        self._seconds += gap
-        if self._seconds <= self._longest:
-            return -1
-        self._seconds -= self._longest / 2  # It is said again then, if that has not helped.
-        return feed.id
+    def _watch_turns(self) -> None:
+        """Tell of a turn that takes too long; a run that is only one of several has failed then."""
+        standing = self._standing
+        now = self.ctx.cell.node.loop.time()
+        gap, self._seen = min(now - self._seen, 2 * self._interval), now  # While this process stood still, no turn ran.
+        before, self._turns = self._turns, {}
+        for server in (standing.server, *standing.shadows):
+            life = server.life
+            feed = None if life is None else life.feed
+            if life is None or feed is None or feed.kind == START:
+                continue
+            turn = standing.epoch, life, feed.id
+            known, seconds = before.get(server, (None, 0.0))
+            seconds = seconds + gap if known == turn else 0.0
+            if seconds > self._longest:
+                seconds /= 2  # It is said again then, if that has not helped.
+                if server is standing.server:
+                    self._say(Stalled(self._name, standing.epoch, feed.id), turn)
+                else:
+                    server.end_turn(feed.id, again=False)
+            self._turns[server] = turn, seconds
 
-    def _say(self, stalled: Stalled) -> None:
-        link, turn = self._standing.link, self._turn
+    def _say(self, stalled: Stalled, turn: Turn) -> None:
+        link, server = self._standing.link, self._standing.server
         if link is None:
             self.proxy.tell(stalled)
         else:
-            tell_over(link, self.proxy._cell, stalled, lambda: self._turn == turn)
+            tell_over(link, self.proxy._cell, stalled, lambda: self._turns.get(server, (None, 0.0))[0] == turn)

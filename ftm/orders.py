@@ -108,10 +108,11 @@ class Finish(Message[None]):
 
 
 class EndTurn(Message[None]):
-    """The turn of this input, if it is in hand, is over: as if its handler had raised."""
+    """The turn of this input, if it is in hand, is over: as if its handler had raised; or it is tried `again`."""
 
     epoch: int
     number: int
+    again: bool
 
 
 class Beat(Message):

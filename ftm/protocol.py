@@ -317,7 +317,7 @@ class RequestProtocol(Transfer):
     @on(EndTurn)
     def _end_turn(self, message: EndTurn) -> None:
         self._check(message.epoch)
-        self._standing.server.end_turn(message.number)
+        self._standing.server.end_turn(message.number, again=message.again)
 
     # -- the state --------------------------------------------------------------------------------------------------
 

@@ -214,6 +214,7 @@ class Shadow(Server):
         assert main.parent is not None
         name = f"shadow-{next(_NUMBERS)}"
         cell = node.cell_below(main.parent, name, self)
+        self.standing.shadows.add(self)
         cell.spec = child(name, self._recipe)
         cell.extra().start = self._recipe
         for port, target in main.extra().bindings.items():
@@ -226,6 +227,7 @@ class Shadow(Server):
         if self.cell is not None:
             lives.retire(self.cell, SHUTDOWN)
             self.cell = None
+            self.standing.shadows.discard(self)
 
     # -- nothing leaves ---------------------------------------------------------------------------------------------
 

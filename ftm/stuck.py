@@ -1,4 +1,6 @@
-"""Turns that do not end, though their process lives: another replica tries, and then the message is put aside.
+"""Turns that do not end, though their process lives: they are tried once more, and then the message is put aside.
+
+Another replica tries; if there is none, the same one, from the state before.
 
 Attempts are counted here, at the home's input, as deaths in the turn of a message are.
 """
@@ -19,7 +21,7 @@ if TYPE_CHECKING:
     from .group import Group
 
 MOST = 2
-"""Replicas that are given up for one message: it is the message, then, and not they."""
+"""Attempts after which it is the message, and not who handles it."""
 ANSWERED_WITHIN = 5.0
 """Seconds after which a replica that was told to end a turn is told again."""
 
@@ -48,15 +50,18 @@ class Stuck:
         source = group.switch.open.get(number)
         if source is None:
             return  # Its end is known: the turn is over by now.
+        self._counted = {one for one in self._counted if one[1] in group.switch.open}
         if (group.epoch, number) not in self._counted:
             self._counted.add((group.epoch, number))
             source.deliveries += 1
             group.node.emit(TurnHung(group.path, name, group.epoch, source.name, source.deliveries))
-        if source.deliveries < min(MOST, group.switch.method.max_deliveries) and group.backups():
+        if source.deliveries >= min(MOST, group.switch.method.max_deliveries):
+            self._given_up.add(number)
+            self._tell(name, number, again=False)
+        elif group.backups():
             self._suspect(name, life, number)
-            return
-        self._given_up.add(number)
-        self._tell(name, number)
+        else:
+            self._tell(name, number, again=True)
 
     def _suspect(self, name: str, life: int, number: int) -> None:
         self._suspected[name] = life
@@ -66,22 +71,25 @@ class Stuck:
         """Whether it was for that that this replica is suspected: then its heartbeats mean nothing."""
         return self._suspected.get(name) == life
 
-    def _tell(self, name: str, number: int) -> None:
+    def _tell(self, name: str, number: int, *, again: bool) -> None:
         """Have it end the turn; if that gets lost, it will be heard of again."""
         if self._telling is not None and not self._telling.done():
             return
         group = self._group
         try:
-            self._telling = group.protocol(name).ask(EndTurn(group.epoch, number), ANSWERED_WITHIN)
+            self._telling = group.protocol(name).ask(EndTurn(group.epoch, number, again), ANSWERED_WITHIN)
         except HoldfastError:
             return  # It has died.
-        self._telling.add_done_callback(lambda done: done.cancelled() or done.exception())
+        attempt = group.epoch, number
+
+        def told(done: asyncio.Future[Any]) -> None:
+            if not done.cancelled() and done.exception() is None and again:
+                self._counted.discard(attempt)  # What is heard of it from now on is another one.
+
+        self._telling.add_done_callback(told)
 
     def takes(self, end: TurnEnd) -> bool:
         """Whether this turn was ended because it hung: its message is put aside."""
-        if not self._counted:
-            return False
-        self._counted = {one for one in self._counted if one[1] != end.id}
         if end.id not in self._given_up:
             return False
         self._given_up.discard(end.id)

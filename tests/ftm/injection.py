@@ -61,6 +61,7 @@ class Fault:
 
     crash    the process is killed                 raise      the brick crashes
     hang     the process does nothing any more     stop       it is stopped (SIGSTOP)
+    wait     the turn waits for ever
     delay    the message waits                     reorder    others overtake it
     double   the message comes twice               lose       it never comes
     answer   the actor's answer is wrong           state      its state is wrong from now on
@@ -245,6 +246,8 @@ def happen(fault: Fault) -> None:
 def before(fault: Fault, handler: Any, actor: Any, item: Any) -> Any:
     happen(fault)
     match fault.action:
+        case "wait":
+            return asyncio.Event().wait()
         case "delay":
             return late(handler, actor, item)
         case "double":
