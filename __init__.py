@@ -199,6 +199,7 @@ if TYPE_CHECKING:
         ReplicaFaulty,
         ReplicaJoined,
         ReplicaLost,
+        TurnHung,
         WrongSuspicion,
     )
     from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
@@ -416,6 +417,7 @@ __all__ = [
     "TreeFailed",
     "TurnBegan",
     "TurnEnded",
+    "TurnHung",
     "TurnSlow",
     "TurnsLost",
     "TurnsSkipped",
@@ -487,6 +489,7 @@ _LAZY = {
     "SEC": "holdfast.ftm.mechanisms.sec",
     "TMR": "holdfast.ftm.mechanisms.tmr",
     "TR": "holdfast.ftm.mechanisms.tr",
+    "TurnHung": "holdfast.ftm.events",
     "WrongSuspicion": "holdfast.ftm.events",
     "compose": "holdfast.ftm.mechanism",
 }

@@ -25,8 +25,7 @@ from ..supervision.spec import ChildSpec
 from .failover import bury
 from .group import Look
 from .messages import ConfigMismatch, StaleEpoch
-from .orders import Quiesce, Stand
-from .replica import Abort, Commit, Prepare
+from .orders import Abort, Commit, Prepare, Quiesce, Stand
 
 if TYPE_CHECKING:
     from .group import Group
@@ -382,11 +381,8 @@ class AdaptationEngine(Actor):
         replies: dict[str, Any] = {}
         errors: dict[str, BaseException] = {}
         for name in names:
-            cell = group.cell_of(name)
             try:
-                if cell is None:
-                    raise CannotAdapt(group.place(name), "it has ended")
-                asked[name] = cell.ref.ask(message, timeout=seconds)
+                asked[name] = group.protocol(name).ask(message, seconds)
                 asked[name].add_done_callback(_heard)  # If this actor is killed, nobody looks at it.
             except HoldfastError as error:
                 errors[name] = error

@@ -93,6 +93,9 @@ class Brick(Posting):
     async def drain(self) -> None:
         """Wait until the other replica has what it was sent, if that is not waited for anyway; nothing new comes."""
 
+    async def answered(self) -> None:
+        """Wait until whoever has asked has the answer."""
+
     def _refuses(self, epoch: int | None = None) -> bool:
         """Whether this comes from an earlier epoch, or nothing from here counts any more.
 

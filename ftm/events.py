@@ -54,6 +54,15 @@ class ReplicaLost(Event, frozen=True, eq=False):
     why: str
 
 
+class TurnHung(Event, frozen=True, eq=False):
+    """A turn has taken longer than `Detection.watch_turns`, for the `times`-th time for its message."""
+
+    replica: str
+    epoch: int
+    message: str
+    times: int
+
+
 class ReplicaFaulty(Event, frozen=True, eq=False):
     """A follower has diverged `times` times in a row, right after it had the leader's state: its process is ended."""
 

@@ -6,14 +6,11 @@ The proxy, the detector and the failover manager act on this; the next life of e
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from ..actors.cell import RUNNING, Cell
-from ..actors.errors import HoldfastError
+from ..actors.cell import Cell
 from ..actors.message import Message
 from ..checkpoint.inputs import Batch
 from ..checkpoint.records import (
@@ -35,14 +32,14 @@ from ..checkpoint.records import (
 from ..checkpoint.saved import meta_now, put
 from .background import Background
 from .detector import Detection
-from .events import ReplicaLost, WrongSuspicion
 from .hold import Hold
+from .members import Look as Look
+from .members import Members
 from .messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
-from .securing import Securing
 from .strays import Strays
+from .stuck import Stuck
 
 if TYPE_CHECKING:
-    from ..actors.node import Node
     from ..checkpoint.switch import Switch
     from .adaptation import Reconfiguration
 
@@ -52,43 +49,23 @@ KEPT_TURNS = 256
 """Ended turns after which those of an actor that keeps none are forgotten."""
 
 
-class Look(Message):
-    """Something has happened to the group: see what is to be done."""
-
-
 class Flush(Message):
     """There is something to send."""
 
 
-class Group(Securing):
+class Group(Members):
     """A protected address: its replicas, who of them leads, and what is on its way to it."""
 
     def __init__(
         self, cell: Cell, switch: Switch, names: tuple[str, ...], *, epoch: int, config: int, detection: Detection
     ) -> None:
-        self.node: Node = cell.node
-        self.cell, self.switch, self.names, self.detection = cell, switch, names, detection
-        self.path = cell.path
-        self.config = config
+        super().__init__(cell, names, epoch, detection)
+        self.switch, self.config = switch, config
         self.hold = Hold(self.node, self.path)
-        # Who leads, and who may.
-        self.epoch = epoch
-        self.primary: str | None = None
-        self.leading: str | None = None  # who is to lead in this epoch: `Lead` may or may not have reached it
-        self.why = ""  # why the last one does not any more
-        self.noticed = 0.0  # and since when that is known, on the monotonic clock
-        self.members: dict[str, int] = {}  # name to life, of those that hold all state: the primary and its backups
-        self.condemned: dict[str, int] = {}  # name to life, of those that must be dead before the next one leads
-        self.dropped: set[str] = set()  # backups that the primary still has to forget
-        self.up: dict[str, int] = {}  # name to life, of those heard of
-        self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
-        self.suspects: dict[str, int] = {}
         self.strays = Strays(self)
-        self.suspected_at = 0.0  # when the primary was, on the loop's clock
-        self.wrong = 0  # suspicions
+        self.stuck = Stuck(self)
         self.failovers = 0
         self.is_begun = False  # somebody has led
-        self.is_over = False
         # What is on its way.
         self.waiting: deque[Feed | Go] = deque()
         self.inward: list[Outcome | SnapshotNow] = []
@@ -110,7 +87,6 @@ class Group(Securing):
         self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
         self.background = Background(self)
         self._quiet: list[asyncio.Future[None]] = []
-        self._stirred: list[asyncio.Future[None]] = []
         # Whom to tell.
         self.on_live: Callable[[Live], None] = switch.from_life
         self.on_over: Callable[[str], None] = lambda why: None  # nobody is left who could lead
@@ -121,79 +97,6 @@ class Group(Securing):
 
     # -- replicas ---------------------------------------------------------------------------------------------------
 
-    def cell_of(self, name: str) -> Cell | None:
-        """The cell of an actor of the mechanism, if there is one now."""
-        return self.node.find(self.place(name))
-
-    def bind_proxy(self) -> None:
-        """Show who leads: the proxy is bound to its RequestProtocol."""
-        proxy = self.cell_of("proxy")
-        if proxy is not None and self.primary is not None:
-            self.node.bind(proxy, "protocol", self.node.cell_at(self.place(f"{self.primary}/protocol")))
-
-    def life_of(self, name: str) -> int:
-        """The number of the life that a replica lives now; 0 if none."""
-        cell = self.cell_of(name)
-        return cell.life if cell is not None and cell.state is RUNNING else 0
-
-    def is_well(self, name: str) -> bool:
-        """Whether a member is the one that was taken in, and nobody suspects it."""
-        life = self.members.get(name, 0)
-        return life > 0 and self.life_of(name) == life and self.suspects.get(name) != life
-
-    def is_awaited(self, name: str) -> bool:
-        """Whether a member that is suspected, and may yet be heard of again, is all there is."""
-        life = self.members.get(name, 0)
-        is_alive = life > 0 and self.life_of(name) == life
-        waited = self.node.loop.time() - self.suspected_at
-        return is_alive and not self.backups() and waited < self.detection.hopeless
-
-    def backups(self) -> list[str]:
-        """Those that could lead instead of the primary, in order."""
-        return [name for name in self.names if name not in (self.primary, self.leading) and self.is_well(name)]
-
-    def watched(self) -> Iterator[tuple[str, int]]:
-        """Who is expected to be heard of, and is not suspected already: name and life."""
-        for name, life in list(self.up.items()):
-            if self.life_of(name) == life and self.suspects.get(name) != life:
-                yield name, life
-
-    def heard(self, name: str, life: int) -> None:
-        """A replica has given a sign of life."""
-        if self.suspects.get(name) == life:
-            self.wrong += 1
-            del self.suspects[name]
-            self.node.emit(WrongSuspicion(self.path, name, self.wrong))
-        if self.up.get(name) != life:
-            self.up[name] = life
-            self.watch(name)
-            self.wake()
-
-    def watch(self, name: str) -> None:
-        """Hear of the end of a replica's present life."""
-        cell = self.cell_of(name)
-        if cell is not None and cell.state is RUNNING:
-            cell.ended().add_done_callback(lambda done: self._died(name))
-
-    def _died(self, name: str) -> None:
-        if not self.noticed:
-            self.noticed = time.monotonic()
-        self.wake()
-
-    def suspect(self, name: str, life: int, why: str) -> None:
-        """A replica is silent for too long."""
-        self.suspects[name] = life
-        self.suspected_at = self.node.loop.time()
-        if name in (self.primary, self.leading):
-            self.why, self.noticed = why, time.monotonic()
-        self.wake()
-
-    def lost(self, name: str, why: str) -> None:
-        """A replica does not count any more."""
-        self.stir()
-        if self.members.pop(name, None) is not None:
-            self.node.emit(ReplicaLost(self.path, name, self.epoch, why))
-
     def joined(self, name: str, life: int) -> None:
         """A replica has caught up, and could lead."""
         self.members[name] = life
@@ -201,19 +104,6 @@ class Group(Securing):
         self.stir()
         self.go_on()
         self.on_joined()
-
-    def stirred(self) -> asyncio.Future[None]:
-        """A future that ends when a replica begins or ceases to count."""
-        future: asyncio.Future[None] = self.node.loop.create_future()
-        self._stirred.append(future)
-        return future
-
-    def stir(self) -> None:
-        """One has, or whoever waits for that should look again."""
-        waiting, self._stirred = self._stirred, []
-        for future in waiting:
-            if not future.done():
-                future.set_result(None)
 
     def is_steady(self) -> bool:
         """Whether one replica leads, and nobody has to be told so, or of a death."""
@@ -225,20 +115,6 @@ class Group(Securing):
         """New inputs may go in."""
         self.is_held = False
         self.poke()
-
-    def wake(self) -> None:
-        """Something has happened: have the manager look."""
-        if not self.is_over:
-            self.tell("failover", Look())
-
-    def tell(self, name: str, message: Message[Any]) -> None:
-        """Tell an actor of the mechanism, if it is there."""
-        cell = self.cell_of(name)
-        if cell is None or cell.is_dead:
-            return  # Whoever comes there looks by itself.
-        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, whose words it is not.
-        with contextlib.suppress(HoldfastError):  # The same.
-            cell.admit(cell, message)
 
     # -- from the home ----------------------------------------------------------------------------------------------
 
@@ -475,6 +351,9 @@ class Group(Securing):
         source = switch.open.get(end.id)
         if source is not None and source.kind == START and end.status == FAILED:
             self.on_start_failed(end)
+            return
+        if self.stuck.takes(end):
+            self.ledger.pop(end.id, None)
             return
         if end.outs:
             self.background.note(end.turn, end.outs)

@@ -12,6 +12,7 @@ import msgspec
 
 from ..actors.message import Message
 from ..checkpoint.records import TurnEnd
+from .mechanism import Description
 
 
 class Setting(msgspec.Struct, array_like=True, frozen=True):
@@ -28,6 +29,8 @@ class Setting(msgspec.Struct, array_like=True, frozen=True):
     """Of the protected actor: port to address."""
     beat: float
     """Seconds between two heartbeats."""
+    watch_turns: float = 0.0
+    """Seconds that a turn may take; 0: as many as it wants."""
 
 
 class Install(Message[None]):
@@ -75,6 +78,28 @@ class Quiesce(Message[Stand]):
     config: int
 
 
+class Prepare(Message[None]):
+    """Start the bricks of another stack of mechanisms beside those of the present one."""
+
+    config: int
+    layers: list[Description]
+
+
+class Commit(Message[int]):
+    """Bind everything as that stack wants it, and end the bricks that are not needed. Nothing may be inside.
+
+    The reply is the last turn whose state is here.
+    """
+
+    config: int
+
+
+class Abort(Message[None]):
+    """End the bricks that were prepared; everything stays as it was."""
+
+    config: int
+
+
 class Finish(Message[None]):
     """End in good order: a last snapshot (if the method takes any), then `on_stop` of the protected actor."""
 
@@ -82,11 +107,27 @@ class Finish(Message[None]):
     reason: dict[str, Any]
 
 
+class EndTurn(Message[None]):
+    """The turn of this input, if it is in hand, is over: as if its handler had raised; or it is tried `again`."""
+
+    epoch: int
+    number: int
+    again: bool
+
+
 class Beat(Message):
-    """This replica's bricks are running."""
+    """This replica's bricks are running. Goes as it is, over secured links too: see there."""
 
     name: str
     epoch: int
+
+
+class Stalled(Message):
+    """From a replica to the proxy: the turn of this input takes too long."""
+
+    name: str
+    epoch: int
+    number: int
 
 
 class Exported(msgspec.Struct, array_like=True):

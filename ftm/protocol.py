@@ -18,7 +18,7 @@ from ..actors.bindings import Binding
 from ..actors.errors import ActorStopped, HoldfastError
 from ..actors.exits import unpack_exit
 from ..actors.mail import ReplyHandle
-from ..actors.message import message_name
+from ..actors.message import Message, message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
 from .bricks import FOREVER, Brick, Flush
@@ -37,9 +37,9 @@ from .messages import (
     Taken,
     Work,
 )
-from .orders import Export, Exported, Finish, Install, Join, Peer, Quiesce, Stand
+from .orders import Abort, Commit, EndTurn, Export, Exported, Finish, Install, Join, Peer, Prepare, Quiesce, Stand
 from .post import Where
-from .sealed import Refused
+from .sealed import Opened, Refused
 from .transfer import Assume, Transfer
 
 if TYPE_CHECKING:
@@ -254,7 +254,7 @@ class RequestProtocol(Transfer):
         standing.set_peer(None, "none")
         standing.is_fenced = standing.follows = False
         standing.ready()
-        await self._replica().ask(Assume(True), timeout=FOREVER)
+        await self._order(Assume(True))
         standing.leading = epoch
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
         self._current = self._marker = marker = -2 - epoch
@@ -276,13 +276,35 @@ class RequestProtocol(Transfer):
         self._current = self._marker = self._wanted = None
         standing.inside.clear()
         standing.unready()
-        await self._replica().ask(Assume(False), timeout=FOREVER)
+        await self._order(Assume(False))
         return standing.server.turn
 
-    def _replica(self) -> Any:
+    def _order(self, message: Message[Any]) -> asyncio.Future[Any]:
+        """Have the replica do it, which obeys us alone."""
         parent = self.ctx.cell.parent
         assert parent is not None
-        return parent.ref
+        return parent.ref.ask(Opened(self._standing.put_opened(message)), timeout=FOREVER)
+
+    @on(Prepare)
+    def _prepare(self, message: Prepare) -> Any:
+        return self._passed_on(message)
+
+    @on(Commit)
+    def _commit(self, message: Commit) -> Any:
+        # What was done already changes nothing, whichever way the order has come this time.
+        return self._passed_on(message, changes=message.config != self._standing.config)
+
+    @on(Abort)
+    def _abort(self, message: Abort) -> Any:
+        return self._passed_on(message)
+
+    def _passed_on(self, message: Message[Any], *, changes: bool = True) -> ReplyHandle[Any]:
+        """To the replica; not in line with other orders, nor with what else comes: the bricks may need us meanwhile."""
+        if changes and not self._admits():
+            raise Refused(path=self._standing.path, reason="plain")
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._passed(handle, self._order(message)))
+        return handle
 
     @on(Where)
     def _where(self, message: Where) -> str:
@@ -291,6 +313,11 @@ class RequestProtocol(Transfer):
         if path is None:
             raise ConfigMismatch(self._standing.path, self._standing.config, message.config)
         return path
+
+    @on(EndTurn)
+    def _end_turn(self, message: EndTurn) -> None:
+        self._check(message.epoch)
+        self._standing.server.end_turn(message.number, again=message.again)
 
     # -- the state --------------------------------------------------------------------------------------------------
 
@@ -360,6 +387,10 @@ RequestProtocol.handlers = {
     Lead: "_lead",
     Follow: "_follow",
     Peer: "_peer",
+    EndTurn: "_end_turn",
+    Prepare: "_prepare",
+    Commit: "_commit",
+    Abort: "_abort",
     Join: "_join",
     Export: "_export",
     Quiesce: "_quiesce",

@@ -10,6 +10,7 @@ from ..actors.errors import HoldfastError
 from ..actors.message import Message, message_name
 from .group import Flush
 from .messages import Done, Outward
+from .orders import Stalled
 from .sealed import Agree, Back, Call, Greet, Refused, Sealed
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from .sealed import SecuredLink
 
 
-SAID: dict[str, type[Message[Any]]] = {message_name(kind): kind for kind in (Done, Outward)}
+SAID: dict[str, type[Message[Any]]] = {message_name(kind): kind for kind in (Done, Outward, Stalled)}
 """What replicas say to it."""
 
 
@@ -61,6 +62,12 @@ class Proxy(Actor):
         if self._group.is_plain():
             self._group.take_outward(outward)
 
+    @on(Stalled)
+    def stalled(self, stalled: Stalled) -> None:
+        """A turn takes too long."""
+        if self._group.is_plain():
+            self._group.stuck.told(stalled)
+
     @on(Greet)
     async def greet(self, message: Greet) -> bytes:
         """A replica begins a hand-shake."""
@@ -88,6 +95,8 @@ class Proxy(Actor):
             message = codec.decode(SAID[part.name], part.body)
             if isinstance(message, Done):
                 group.take_done(message)
+            elif isinstance(message, Stalled):
+                group.stuck.told(message)
             else:
                 group.take_outward(message)
         self._send()

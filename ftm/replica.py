@@ -10,8 +10,7 @@ import asyncio
 import dataclasses
 from typing import Any, NamedTuple
 
-from ..actors.actor import Actor, Start, on, start
-from ..actors.bindings import Binding
+from ..actors.actor import Start, on, start
 from ..actors.cell import Cell
 from ..actors.errors import HoldfastError, type_name
 from ..actors.events import ActorStarted
@@ -23,9 +22,11 @@ from ..supervision.children import Child, new_cell
 from ..supervision.spec import Flags, Plan, child
 from ..supervision.supervisor import Supervisor
 from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
+from .heart import Heart
 from .mechanism import Description, Mechanism, MechanismRefused, revive
-from .orders import Beat, Setting
+from .orders import Abort, Commit, Prepare, Setting
 from .protocol import InnerProtocol, RequestProtocol
+from .sealed import Opened, Refused
 from .server import Server
 from .standing import Standing
 from .state import StateManager
@@ -34,58 +35,10 @@ from .transfer import Assume
 SERVER, STATE, BEAT, PROTOCOL = "server", "state", "beat", "protocol"
 
 
-class Prepare(Message[None]):
-    """Start the bricks of another stack of mechanisms beside those of the present one."""
-
-    config: int
-    layers: list[Description]
-
-
-class Commit(Message[int]):
-    """Bind everything as that stack wants it, and end the bricks that are not needed. Nothing may be inside.
-
-    The reply is the last turn whose state is here.
-    """
-
-    config: int
-
-
-class Abort(Message[None]):
-    """End the bricks that were prepared; everything stays as it was."""
-
-    config: int
-
-
 class EndBricks(Message):
     """From the replica to itself: these are not needed any more."""
 
     names: list[str]
-
-
-class Tick(Message):
-    """It is time for a heartbeat."""
-
-
-class Heart(Actor):
-    """Tells the failure detector that the bricks of this replica run."""
-
-    detector: Binding[Actor]
-
-    def __init__(self, standing: Standing, name: str, interval: float) -> None:
-        self._standing, self._name, self._interval = standing, name, interval
-
-    def on_start(self, restored: bool) -> None:
-        """Beat at once, then regularly."""
-        if self._interval > 0:
-            self._beat(Tick())
-            self.ctx.every(self._interval, Tick())
-
-    @on(Tick)
-    def _beat(self, message: Tick) -> None:
-        try:
-            self.detector.tell(Beat(self._name, self._standing.epoch))
-        except HoldfastError:
-            return  # It is between two lives.
 
 
 class Place(NamedTuple):
@@ -209,9 +162,10 @@ class Replica(Supervisor):
         node.emit(ActorStarted(self._cell(SERVER).path, 1))  # Its lives come and go with the role: the address stays.
         woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=False)
         await self._take_up(woven)
-        one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat)))
+        one = Child(child(BEAT, start(Heart, self._standing, setting.name, setting.beat, setting.watch_turns)))
         one.cell = cell = new_cell(self.ctx.cell, one)
-        node.bind(cell, "detector", node.cell_at(f"{setting.address}/ftm/detector"))
+        for port in ("detector", "proxy"):
+            node.bind(cell, port, node.cell_at(f"{setting.address}/ftm/{port}"))
         self._enlist(one)
         await self._start(one)
 
@@ -318,11 +272,11 @@ class Replica(Supervisor):
             server.capture()  # From here on, the last part is what was handled since the last point.
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         standing.forget_bricks()
-        self._secure()
         self._bind_all(woven)
         if behind:
-            self.ctx.ref.tell(EndBricks(left))
+            self.ctx.ref.tell(Opened(standing.put_opened(EndBricks(left))))
         else:
+            self._secure()
             await self._end_bricks(left)
         if not standing.computes:
             await self._keep_state()
@@ -330,8 +284,11 @@ class Replica(Supervisor):
             await self._server.ensure()
 
     def _secure(self) -> None:
-        """Have the link that the outermost mechanism wants."""
-        standing = self._standing
+        """Have the link that the outermost mechanism wants, and its gate."""
+        standing, woven = self._standing, self._woven
+        for owner, port, target in self._wiring(woven):
+            if port == "gate":
+                self.ctx.cell.node.bind(owner, port, target)
         outermost = standing.layers[0] if standing.layers else None
         old = standing.link
         if old is not None and old.mechanism == outermost:
@@ -351,7 +308,8 @@ class Replica(Supervisor):
     def _bind_all(self, woven: Woven) -> None:
         node = self.ctx.cell.node
         for owner, port, target in self._wiring(woven):
-            node.bind(owner, port, target)
+            if port != "gate":
+                node.bind(owner, port, target)
         proceed = self._cell(woven.names["proceed"]).actor
         assert isinstance(proceed, Proceed)
         proceed.take_over()
@@ -422,7 +380,23 @@ class Replica(Supervisor):
 
     # -- orders -----------------------------------------------------------------------------------------------------
 
-    @on(Assume)
+    @on(Opened)
+    async def _ordered(self, message: Opened) -> Any:
+        """From its own RequestProtocol, which has seen how it came, or from itself; nobody else gives it orders."""
+        match self._standing.take_opened(message.key):
+            case Assume() as order:
+                return await self._assume(order)
+            case Prepare() as order:
+                return await self._prepare(order)
+            case Commit() as order:
+                return await self._commit(order)
+            case Abort() as order:
+                return await self._abort(order)
+            case EndBricks() as order:
+                return await self._end(order)
+            case _:
+                return self._fail(Refused(path=self.ctx.path, reason="forged"))
+
     async def _assume(self, message: Assume) -> None:
         old = self._woven
         places = weave(old.layers, leads=message.leads)
@@ -433,7 +407,6 @@ class Replica(Supervisor):
         woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         await self._take_up(woven, leads=message.leads)
 
-    @on(Prepare)
     async def _prepare(self, message: Prepare) -> Any:
         try:
             if self._prepared is not None:
@@ -449,7 +422,6 @@ class Replica(Supervisor):
             return self._fail(error)
         return None
 
-    @on(Commit)
     async def _commit(self, message: Commit) -> Any:
         woven, self._prepared = self._prepared, None
         if self._woven.config == message.config:
@@ -469,11 +441,14 @@ class Replica(Supervisor):
             await self._settled(names[slot])
         await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
 
-    @on(EndBricks)
     async def _end(self, message: EndBricks) -> None:
+        for name in message.names:
+            brick = self._cell(name).actor
+            assert isinstance(brick, Brick)
+            await brick.answered()  # Among others, to the order that wants all this: it has come over the old link.
+        self._secure()
         await self._end_bricks(message.names)
 
-    @on(Abort)
     async def _abort(self, message: Abort) -> None:
         if self._prepared is not None and self._prepared.config == message.config:
             await self._drop_prepared()

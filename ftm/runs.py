@@ -178,11 +178,13 @@ class Shadow(Server):
         self._place()
         await self._go_back(before)
         pending, ends = deque(requests), list[TurnEnd]()
-        while pending and not self.is_over:
+        while pending and not self.is_over and not self._is_stopping:
             new = await self.part(pending)
             self._keep_tail(self.begun, new)
             ends += new
         self._skips.clear()
+        if self._is_stopping:  # Stopped in the middle: what has no end here may well have one elsewhere.
+            self._fail("its replica ends")
         if self._why:
             return ends, None
         if self.is_over:
@@ -212,6 +214,7 @@ class Shadow(Server):
         assert main.parent is not None
         name = f"shadow-{next(_NUMBERS)}"
         cell = node.cell_below(main.parent, name, self)
+        self.standing.shadows.add(self)
         cell.spec = child(name, self._recipe)
         cell.extra().start = self._recipe
         for port, target in main.extra().bindings.items():
@@ -224,6 +227,7 @@ class Shadow(Server):
         if self.cell is not None:
             lives.retire(self.cell, SHUTDOWN)
             self.cell = None
+            self.standing.shadows.discard(self)
 
     # -- nothing leaves ---------------------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from ..actors.events import Event
 from ..actors.message import Message, Refusal
 
 if TYPE_CHECKING:
+    from ..actors.cell import Cell
     from ..actors.codec import Codec
 
 
@@ -100,6 +101,15 @@ Handle = Callable[[Call], Awaitable[Back]]
 """Does what a frame says."""
 Still = Callable[[], bool]
 """Whether anybody is still interested."""
+
+
+def tell_over(link: SecuredLink, cell: Cell, message: Message[Any], still: Still) -> None:
+    """Tell whoever lives at an address, over a secured link."""
+
+    async def ask(said: Message[Any], seconds: float) -> Any:
+        return await cell.ref.ask(said, timeout=seconds)
+
+    link.tell(cell.path, message, ask, still)
 
 
 class LinkLost(Exception):

@@ -216,6 +216,18 @@ class Server(Points):
         self.point = None
         return True
 
+    def end_turn(self, number: int, *, again: bool) -> None:
+        """The turn of this input hangs: if it is in hand, it has failed, as if its handler had raised.
+
+        `again`: it has not, but begins again, from the state before (if that is known).
+        """
+        life, cell = self.life, self.cell
+        if cell is None or life is None or life.feed is None or life.feed.id != number:
+            return
+        if not again or not self.has_access:
+            life.fail_turn(TimeoutError(f"the turn of {life.feed.name} does not end"))
+        self.kill(cell)
+
     # -- the front --------------------------------------------------------------------------------------------------
 
     @property

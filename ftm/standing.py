@@ -53,6 +53,7 @@ class Standing:
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to a follower
         self.refused = 0  # messages of other epochs or configurations
         self.server: Server = None  # type: ignore[assignment]  # made with it, by the replica
+        self.shadows: set[Server] = set()  # more lives of it, which only compute
         self.link: SecuredLink | None = None  # what comes and goes has to be sealed
         self._opened: dict[int, Message[Any]] = {}  # came over it, and waits for its handler
         self._opened_keys = itertools.count()

@@ -6,10 +6,12 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
+
+import pytest
 
 import holdfast
 
@@ -67,3 +69,25 @@ def missed(copy: Path, check: Check) -> str:
         check=False,
     )
     return done.stdout if done.returncode == 1 and " failed" in done.stdout else ""
+
+
+Test = Callable[..., None]
+
+
+def as_tests(checks: dict[str, Check]) -> tuple[Test, Test]:
+    """The tests of a table: that it says what there is; and, if that is wanted, that each check is missed."""
+    copies: list[Path] = []
+
+    @pytest.mark.parametrize("name", checks)
+    def table_is_true(name: str) -> None:
+        assert is_true(checks[name])
+
+    @pytest.mark.skipif("HOLDFAST_REMOVED" not in os.environ, reason="HOLDFAST_REMOVED=1 has the checks removed")
+    @pytest.mark.parametrize("name", checks)
+    def a_test_fails(tmp_path_factory: pytest.TempPathFactory, name: str) -> None:
+        if not copies:
+            copies.append(copied(tmp_path_factory.mktemp("removed")))
+        with without(copies[0], checks[name]):
+            assert missed(copies[0], checks[name]), f"{checks[name].test} does not miss it"
+
+    return table_is_true, a_test_fails

@@ -3,8 +3,8 @@
 Fault model  somebody sits on the links: reads, alters, forges, replays, drops, delays, speaks as another.
 Guarantee    nothing can be read there; what was altered, forged, replayed, is another's or too old is refused, counted
              by reason and told (`FrameRefused`); what was refused or lost is sent again, and handled once, in order.
-Not covered  who sees or runs the processes; sizes and times; one who drops everything; heartbeats, and the orders with
-             which the stack of mechanisms itself is changed, which are not ciphered.
+Not covered  who sees or runs the processes; sizes and times; one who drops everything; heartbeats, which say no more
+             than that somebody is alive: to forge them does no more harm than to drop what the replica sends.
 Needs        a certification authority (`CertificationAuthority`), and `pip install holdfast[sec]`.
 Cost         a signature each at both ends for a session; then a seal for each batch and each acknowledgement.
 Source       Lauer et al. 2018, figure 6 (A66 to A75); traps T47, T48.
@@ -15,6 +15,7 @@ read by a replica that leads later. Keys are files of mode 0600 in a directory t
 
 from __future__ import annotations
 
+import asyncio
 import atexit
 import dataclasses
 import functools
@@ -31,7 +32,7 @@ from ...actors.mail import ReplyHandle
 from ..bricks import FOREVER, After, Before
 from ..mechanism import Mechanism, MechanismRefused, Role
 from ..messages import Done, Outward, Taken
-from ..sealed import ORDERS, Agree, Back, Call, Greet, LinkLost, Opened, Refused, Sealed, encode_reply
+from ..sealed import ORDERS, Agree, Back, Call, Greet, LinkLost, Opened, Refused, Sealed, encode_reply, tell_over
 
 if TYPE_CHECKING:
     from ...actors.message import Message
@@ -39,8 +40,16 @@ if TYPE_CHECKING:
     from ..sealed import SecuredLink
 
 
+ANSWERED_WITHIN = 1.0
+"""Seconds that the end of a link waits for what has come over it."""
+
+
 class Opening(Before):
     """Before of a secured replica: opens and verifies what comes, and hands it to the protocol (A72)."""
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._replies: set[asyncio.Task[None]] = set()
 
     @on(Greet)
     def greet(self, message: Greet) -> ReplyHandle[bytes]:
@@ -66,8 +75,15 @@ class Opening(Before):
 
     def _later(self, work: Any) -> ReplyHandle[Any]:
         handle: ReplyHandle[Any] = self.ctx.reply_handle()
-        self.ctx.create_task(self._reply(handle, work))
+        task = self.ctx.create_task(self._reply(handle, work))
+        self._replies.add(task)
+        task.add_done_callback(self._replies.discard)
         return handle
+
+    async def answered(self) -> None:
+        """Wait, but not for long, until all that has come is answered."""
+        if self._replies:
+            await asyncio.wait(list(self._replies), timeout=ANSWERED_WITHIN)
 
     async def _reply(self, handle: ReplyHandle[Any], work: Any) -> None:
         try:
@@ -106,18 +122,12 @@ class Sealing(After):
         self._send(outward)
 
     def _send(self, message: Message[Any]) -> None:
-        standing, proxy = self._standing, self.next
+        standing = self._standing
         link, epoch = standing.link, standing.epoch
-        if link is None:
-            return
-        cell = proxy._cell
-        reach = functools.partial(ask, cell)
-        link.tell(cell.path, message, reach, lambda: standing.epoch == epoch and not standing.is_fenced)
-
-
-def ask(cell: Any, message: Message[Any], seconds: float) -> Any:
-    """Ask whoever is there."""
-    return cell.ref.ask(message, timeout=seconds)
+        if link is not None:
+            tell_over(
+                link, self.next._cell, message, lambda: standing.epoch == epoch and not standing.is_fenced
+            )  # fmt: skip
 
 
 @functools.cache

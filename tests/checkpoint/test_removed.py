@@ -6,12 +6,7 @@ whether the checks and the tests are where this table says.
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
-
-import pytest
-
-from tests.removing import Check, copied, is_true, missed, without
+from tests.removing import Check, as_tests
 
 CHECKS = {
     "T13: after a failed sync nothing takes effect": Check(
@@ -332,20 +327,4 @@ CHECKS = {
     ),
 }
 
-
-@pytest.mark.parametrize("name", CHECKS)
-def test_the_table_is_true(name: str) -> None:
-    assert is_true(CHECKS[name])
-
-
-@pytest.fixture(scope="module")
-def copy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The package and its tests, to be broken."""
-    return copied(tmp_path_factory.mktemp("removed"))
-
-
-@pytest.mark.skipif("HOLDFAST_REMOVED" not in os.environ, reason="HOLDFAST_REMOVED=1 has the checks removed")
-@pytest.mark.parametrize("name", CHECKS)
-def test_without_the_check_a_test_fails(copy: Path, name: str) -> None:
-    with without(copy, CHECKS[name]):
-        assert missed(copy, CHECKS[name]), f"{CHECKS[name].test} does not miss it"
+test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)

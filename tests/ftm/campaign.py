@@ -40,6 +40,7 @@ OF_CRASHES = (FailedOver, WrongSuspicion, ProtectionLost, ReplicaLost)
 TOLD = (Diverged, Objected, Outvoted, FrameRefused)
 """Alarms that say that something is wrong, though not that it was mended."""
 QUICK = Detection(interval=0.02, pause=0.3)
+WATCHED = dataclasses.replace(QUICK, watch_turns=1.0)
 
 
 # -- the campaign -----------------------------------------------------------------------------------------------------
@@ -202,7 +203,7 @@ class Campaign:
         row, load = self.row, self.load
         faults = KINDS[self.kind](self.layers)
         self.rng.shuffle(faults)
-        with injecting() as page:
+        with injecting(WATCHED if self.kind.startswith("turn") else QUICK) as page:
             async with running() as system:
                 self.system, self.page, self.events = system, page, system.events()
                 await enrolling(system, self.layers)
@@ -277,6 +278,8 @@ class Campaign:
             false += (FailedOver, ProtectionLost, ReplicaLost)  # A machine under load may well suspect for a moment.
         if self.kind in LATE and trial.fault.leads is False:
             false = ()  # A follower that gets something twice or in another order has really come to something else.
+        if self.kind.startswith("turn"):
+            false = ()  # A run that has no end is one that has come to something else.
         wrong = [one for one in told if isinstance(one, false)]
         self.row.false_alarms += len(wrong)
         self.row.trouble += [f"{trial.fault} nth={trial.fault.nth}: false alarm {one}" for one in wrong[:2]]
@@ -286,6 +289,8 @@ class Campaign:
         if self.kind == "SIGSTOP, wake-up":
             await asyncio.sleep(self.rng.uniform(0.02, 0.45))  # About as long as it takes to be suspected.
             self._signal(signal.SIGCONT)
+        elif fault.action == "wait":
+            await self._ends(self.page.pid)  # It is a second or so before anybody knows.
         elif fault.action == "lose" and self.kind not in FRAMES:
             await asyncio.sleep(1.1 * load.timeout)
             self._signal(signal.SIGKILL)  # It waits for ever.
@@ -293,6 +298,11 @@ class Campaign:
         if fault.permanent:
             self.page.disarm()
         await whole(self.ref)
+
+    async def _ends(self, pid: int) -> None:
+        async with asyncio.timeout(STUCK):
+            while Path(f"/proc/{pid}").exists():
+                await asyncio.sleep(0.01)
 
     def _signal(self, number: signal.Signals) -> None:
         with contextlib.suppress(ProcessLookupError):

@@ -25,11 +25,18 @@ async def system() -> AsyncIterator[hf.ActorSystem]:
         yield running
 
 
+@pytest.fixture
+async def secured(system: hf.ActorSystem) -> hf.ActorSystem:
+    """A system with a certification authority."""
+    await system.start(hf.child("ca", hf.start(hf.CertificationAuthority)))
+    return system
+
+
 # These start real processes; what they are about does not depend on the root's loop, and once takes long enough.
 ON_ONE_LOOP = {
-    "test_ad", "test_attach", "test_campaign", "test_composed", "test_failover", "test_images", "test_in_processes",
-    "test_lfr", "test_nvp", "test_pbr", "test_pbr_joining", "test_post", "test_rb", "test_sec", "test_strays",
-    "test_subtree", "test_subtree_changes", "test_tmr", "test_tr",
+    "test_ad", "test_attach", "test_campaign", "test_composed", "test_failover", "test_failover_turns", "test_images",
+    "test_in_processes", "test_lfr", "test_nvp", "test_pbr", "test_pbr_joining", "test_post", "test_rb", "test_sec",
+    "test_sec_orders", "test_strays", "test_stuck", "test_subtree", "test_subtree_changes", "test_tmr", "test_tr",
 }  # fmt: skip
 
 

@@ -87,6 +87,12 @@ def between(action: str, layers: Layers) -> list[Fault]:
     ]
 
 
+def waiting(layers: Layers) -> list[Fault]:
+    """The protected actor's turn waits for what never comes, in the replica that leads and where another computes."""
+    others = ("server", REQUEST, False) in far(layers)
+    return [Fault("wait", "server", REQUEST, leads=leads) for leads in (True, False) if leads or others]
+
+
 def of_joining(action: str, layers: Layers) -> list[Fault]:
     """While a replica is told that it follows, and is brought to the state."""
     first = "Sealed" if names_of(layers)[0] == "sec" else "Follow"
@@ -126,6 +132,7 @@ KINDS: dict[str, Callable[[Layers], list[Fault]]] = {
     "crash while joining": lambda layers: of_joining("crash", layers) + of_joining("raise", layers),
     "crash of a root part": of_root,
     "hang": lambda layers: at_each("hang", layers),
+    "turn without an end": lambda layers: waiting(layers) * 3,
     "SIGSTOP": lambda layers: at_each("stop", layers),
     "SIGSTOP, wake-up": lambda layers: at_each("stop", layers),
     "message delayed": lambda layers: between("delay", layers),
@@ -145,7 +152,7 @@ KINDS: dict[str, Callable[[Layers], list[Fault]]] = {
     "frame replayed": lambda layers: on_links("double", layers),
     "frame forged": lambda layers: on_links("forge", layers),
 }
-CRASHES = frozenset(kind for kind in KINDS if kind.startswith(("crash", "hang", "SIGSTOP")))
+CRASHES = frozenset(kind for kind in KINDS if kind.startswith(("crash", "hang", "turn", "SIGSTOP")))
 FRAMES = frozenset(kind for kind in KINDS if kind.startswith("frame"))
 LATE = frozenset({"message delayed", "message doubled", "message reordered"})
 VALUES = frozenset(kind for kind in KINDS if kind.endswith(("transient", "permanent", "class")))

@@ -27,13 +27,14 @@ from holdfast.checkpoint.records import OK, REPLY, Answer, TurnEnd
 from holdfast.ftm.bricks import Brick
 from holdfast.ftm.detector import Detector
 from holdfast.ftm.failover import FailoverManager
+from holdfast.ftm.heart import Heart
 from holdfast.ftm.join import Joiner
 from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanism import BUILT_IN, find
 from holdfast.ftm.messages import Done, Follow, Lead, Work
 from holdfast.ftm.orders import Peer
 from holdfast.ftm.proxy import Proxy
-from holdfast.ftm.replica import Heart, Replica
+from holdfast.ftm.replica import Replica
 from holdfast.ftm.sealed import Sealed
 from holdfast.ftm.state import StateManager
 from tests.ftm.accounts import Bank, Counter
@@ -60,6 +61,7 @@ class Fault:
 
     crash    the process is killed                 raise      the brick crashes
     hang     the process does nothing any more     stop       it is stopped (SIGSTOP)
+    wait     the turn waits for ever
     delay    the message waits                     reorder    others overtake it
     double   the message comes twice               lose       it never comes
     answer   the actor's answer is wrong           state      its state is wrong from now on
@@ -244,6 +246,8 @@ def happen(fault: Fault) -> None:
 def before(fault: Fault, handler: Any, actor: Any, item: Any) -> Any:
     happen(fault)
     match fault.action:
+        case "wait":
+            return asyncio.Event().wait()
         case "delay":
             return late(handler, actor, item)
         case "double":

@@ -15,6 +15,7 @@ import holdfast as hf
 from holdfast.actors.process.remote import ProcessHost
 from holdfast.ftm.bricks import After
 from holdfast.ftm.events import MechanismAttached, MechanismDetached
+from holdfast.ftm.failover import FailoverManager
 from holdfast.ftm.host import GroupHost
 from holdfast.ftm.mechanism import MechanismRefused, Role
 from holdfast.ftm.mechanisms.lfr import LFR
@@ -121,6 +122,36 @@ async def test_detached_while_nobody_leads_and_nothing_is_inside(system: hf.Acto
         while group.primary is not None:
             await asyncio.sleep(0)
     await detach(system, ref)
+    assert await ref.ask(Tags()) == list(range(5))
+
+
+async def test_detached_while_whoever_leads_is_deposed_when_nothing_is_inside(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Between the word that nothing is inside and the question for the state: what did not come is not taken."""
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
+    for number in range(5):
+        await ref.ask(Add(number))
+    group = group_of(ref)
+    await two_again(ref)
+    epoch, quiet = group.epoch, group.quiet
+
+    def suspected(done: asyncio.Future[None]) -> None:
+        primary, manager = group.primary, system.node.cell_at(f"{ref.path}/ftm/failover").actor
+        assert primary is not None
+        assert isinstance(manager, FailoverManager)
+        group.suspect(primary, group.members[primary], "a test wants it")
+        manager._depose(primary)
+
+    def quiet_until_suspected() -> asyncio.Future[None]:
+        monkeypatch.undo()
+        future = quiet()
+        future.add_done_callback(suspected)  # Before whoever waits for it goes on.
+        return future
+
+    monkeypatch.setattr(group, "quiet", quiet_until_suspected)
+    await detach(system, ref)
+    assert group.epoch > epoch
     assert await ref.ask(Tags()) == list(range(5))
 
 

@@ -76,7 +76,8 @@ def test_what_is_chosen() -> None:
 
 def test_how_replicas_are_watched() -> None:
     table = rows("setting")
-    assert {name: float(cells[0]) for name, cells in table.items()} == dataclasses.asdict(hf.Detection())
+    said = {name: None if cells[0] == "none" else float(cells[0]) for name, cells in table.items()}
+    assert said == dataclasses.asdict(hf.Detection())
 
 
 async def test_the_graph_as_it_is_shown(system: hf.ActorSystem) -> None:

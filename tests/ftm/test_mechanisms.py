@@ -14,7 +14,8 @@ from holdfast.ftm.mechanism import BUILT_IN, Description, Mechanism, MechanismRe
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.replica import Abort, Commit, Prepare, weave
+from holdfast.ftm.orders import Abort, Commit, Prepare
+from holdfast.ftm.replica import weave
 from tests.ftm import versions
 from tests.ftm.driver import Driver
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Total, pair
@@ -103,7 +104,7 @@ async def test_a_mechanism_from_a_file_that_was_never_seen_is_woven_in(system: h
 async def exchange(driver: Driver, *layers: Mechanism, names: tuple[str, ...] = ("r1", "r2")) -> None:
     """As the adaptation engine does it: nothing is inside, both replicas prepare, then both commit."""
     driver.config += 1
-    refs = [driver.system.node.cell_at(driver.path(name)).ref for name in names]
+    refs = [driver.protocol(name) for name in names]
     described = [one.describe() for one in layers]
     for ref in refs:
         await ref.ask(Prepare(driver.config, described))
@@ -164,7 +165,7 @@ async def test_only_bricks_that_differ_are_touched(system: hf.ActorSystem) -> No
 
 async def test_what_was_prepared_can_be_dropped_and_what_cannot_be_had_is_refused(system: hf.ActorSystem) -> None:
     driver = await pair(system, Closed, LFR())
-    replica = system.node.cell_at(driver.path("r1")).ref
+    replica = driver.protocol("r1")
     before = lives(driver, "r1")
     await replica.ask(Prepare(1, [LFR().describe(), *()]))
     await replica.ask(Abort(1))

@@ -38,12 +38,6 @@ from tests.ftm.sec.parties import Office
 CA = "/app/ca"
 
 
-@pytest.fixture
-async def secured(system: hf.ActorSystem) -> hf.ActorSystem:
-    await system.start(hf.child("ca", hf.start(CertificationAuthority)))
-    return system
-
-
 def group_of(ref: Any) -> Any:
     return ref._cell.host.group
 

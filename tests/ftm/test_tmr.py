@@ -6,12 +6,12 @@ import asyncio
 import os
 import random
 import signal
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.alarms import Outvoted, ProtectionLost
+from holdfast.ftm.alarms import Masked, Outvoted, ProtectionLost
 from holdfast.ftm.events import FailedOver, ReplicaJoined
 from holdfast.ftm.mechanism import MechanismRefused, find, revive
 from holdfast.ftm.mechanisms.tmr import TMR
@@ -97,6 +97,33 @@ async def test_with_one_gone_a_wrong_value_is_seen_and_not_answered(system: hf.A
         assert await driver.ask(Add(4)) == 8
         assert any(isinstance(one, ProtectionLost) for one in events.take())
     assert await driver.ask(Read()) == [1, 3, 4]
+
+
+class Gated(Total):
+    """Its next run on a replica in `gates` stands still there."""
+
+    gates: ClassVar[dict[str, asyncio.Future[None]]] = {}
+
+    @hf.on(Fetch)
+    async def fetch(self, message: Fetch) -> Any:
+        reached = self.gates.pop(self.ctx.cell.path.split("/")[4], None)
+        if reached is not None:
+            reached.set_result(None)
+            await asyncio.Event().wait()
+        return await super().fetch(message)
+
+
+async def test_a_replica_that_is_stopped_while_it_computes_has_no_vote(system: hf.ActorSystem) -> None:
+    """What it has not come to the end of is no outcome: nobody is outvoted, and nothing was masked."""
+    driver = await trio(system, kind=Gated)
+    Gated.gates["r2"] = reached = asyncio.get_running_loop().create_future()
+    with system.events() as events:
+        (key,) = driver.send(Fetch(2))
+        await reached
+        system.node.cell_at(driver.path("r2")).request_stop(hf.SHUTDOWN)  # As when one of its bricks has crashed.
+        assert await driver.reply(key) == 2
+        assert [one for one in events.take() if isinstance(one, Outvoted | Masked)] == []
+    assert await driver.ask(Add(5)) == 7
 
 
 async def test_nothing_leaves_before_all_that_are_up_have_it(system: hf.ActorSystem) -> None:

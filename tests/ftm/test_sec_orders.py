@@ -1,0 +1,90 @@
+"""Orders that change a stack of mechanisms, over a secured link with an attacker on it."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.orders import Abort, Commit, Prepare, Stalled
+from holdfast.ftm.replica import EndBricks
+from holdfast.ftm.sealed import Opened, Refused, Sealed
+from holdfast.ftm.transfer import Assume
+from tests.ftm.accounts import Add, Counter, Tags
+from tests.ftm.test_sec import CA, Tap, every, flip, group_of, joined
+
+
+async def begun(secured: hf.ActorSystem) -> Any:
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(hf.SEC(CA), hf.PBR())))
+    await joined(ref)
+    assert await ref.ask(Add(0)) == 1
+    return ref
+
+
+def names(ref: Any) -> list[str]:
+    return [layer.name for layer in ref._cell.host.layers]
+
+
+async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_replayed(
+    secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """T47: each is done once, in the order in which they were given, and none is there to be read."""
+    tap = Tap().on_replicas(monkeypatch)
+    ref = await begun(secured)
+    held: list[tuple[str, bytes]] = []
+    harm = every(3, flip)
+
+    def strike(path: str, frame: bytes) -> bytes | None:
+        if path.endswith("/protocol") and path not in dict(held):
+            held.append((path, frame))
+            return None
+        return harm(path, frame)
+
+    tap.seen.clear()
+    tap.strike = strike
+    async with secured.transaction(timeout=60) as change:
+        change.transition(ref, hf.compose(hf.SEC(CA), LFR(), hf.TR()))
+    tap.strike = lambda path, frame: frame
+    assert names(ref) == ["sec", "lfr", "tr"]
+    assert {path for path, _ in held} == {"/app/c/ftm/r1/protocol", "/app/c/ftm/r2/protocol"}
+    said = list(tap.seen)
+    assert not [one for _, one in said if isinstance(one, (Prepare, Commit, Abort))]
+    again = [*held, *((path, one.frame) for path, one in said if isinstance(one, Sealed) and "/r" in path)]
+    for path, frame in again:
+        with pytest.raises(Refused, match=r"replayed|wrong_session|forged|stale"):
+            await secured.node.cell_at(path).ref.ask(Sealed(frame))
+    assert await ref.ask(Add(1)) == 2
+    await joined(ref)
+    assert names(ref) == ["sec", "lfr", "tr"]
+
+
+async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) -> None:
+    ref = await begun(secured)
+    group, node = group_of(ref), secured.node
+    replica, protocol = node.cell_at("/app/c/ftm/r1").ref, node.cell_at("/app/c/ftm/r1/protocol").ref
+    bricks = sorted(secured.tree())
+    with secured.events() as events:
+        for order in (Prepare(99, [hf.PBR().describe()]), Commit(99), Abort(group.config)):
+            with pytest.raises(Refused, match="plain"):
+                await protocol.ask(order)
+            with pytest.raises(hf.HoldfastError):
+                await replica.ask(order)
+        for order in (Assume(False), EndBricks(["before"])):
+            with pytest.raises(hf.HoldfastError):
+                await replica.ask(order)  # type: ignore[type-var]
+        with pytest.raises(Refused, match="forged"):
+            await replica.ask(Opened(0))
+        node.cell_at("/app/c/ftm/proxy").ref.tell(Stalled(group.primary, group.epoch, 0))
+        places: set[tuple[str, str]] = set()
+        async with asyncio.timeout(20):
+            while places < {("/app/c/ftm/r1", "plain"), ("/app/c/ftm/proxy", "plain")}:
+                places |= {(one.place, one.reason) for one in events.take() if isinstance(one, hf.FrameRefused)}
+                await asyncio.sleep(0.01)
+    assert await protocol.ask(Commit(group.config)) == 1  # What was done already can be asked, and is only told.
+    assert sorted(secured.tree()) == bricks
+    assert await ref.ask(Add(1)) == 2
+    assert await ref.ask(Tags()) == [0, 1]
+    assert (group.epoch, ref._cell.life) == (1, 1)
