@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from ..actors.cell import Cell
+from ..actors.cell import RUNNING, Cell
 from ..actors.control.moving import Transit, now
 from ..actors.errors import CannotMove, StartFailed
 from ..actors.exits import unpack_exit
@@ -92,6 +92,9 @@ class OutOfSubtree(ToGroup):
         assert self.transit is not None
         assert group is not None
         assert switch is not None
+        if cell.state is not RUNNING:
+            self.is_late = True
+            raise CannotMove(cell.path, "its life has ended")
         self.is_done = True
         self._worker.on_move = lambda data: None
         wanted = self._place.hand_over(host)

@@ -113,23 +113,22 @@ class SubtreeGroup(GroupHost):
 
     def closed(self, record: Closed) -> None:
         """The supervisor has heard of the end of a life, or gives up its start."""
-        wanted = self._wanted
-        if wanted is None or record.number != wanted.number:
+        cell = None if self.switch is None else self.switch.cell
+        if self._wanted is None or record.number != self._wanted.number or cell is None:
             return
         self._wanted = None
-        switch = self.switch
-        if self._last is not None and switch is not None and switch.cell is not None:
-            self._close(switch.cell, unpack_exit(record.reason), recovers=record.recovers)
-        elif self._starting is not None:
-            self._starting.cancel()
+        self._end_unwanted(cell, unpack_exit(record.reason), recovers=record.recovers)
 
     def lost(self, cell: Cell, reason: ExitReason) -> None:
         """The supervisor has died with its process: nobody is left who would stop the replicas."""
-        if self._wanted is None:
-            return
-        self._wanted = None
+        if self._wanted is not None:
+            self._wanted = None
+            self._end_unwanted(cell, reason, recovers=True)
+
+    def _end_unwanted(self, cell: Cell, reason: ExitReason, *, recovers: bool) -> None:
+        """Nobody wants the life any more, however far it has come."""
         if self._last is not None:
-            self._close(cell, reason, recovers=True)
+            self._close(cell, reason, recovers=recovers)
         elif self._starting is not None and not self._starting.done():
             self._starting.cancel()
         else:

@@ -15,10 +15,12 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.exits import KILLED, pack_exit
+from holdfast.checkpoint.records import Closed
 from holdfast.ftm.mechanism import Code, Description, MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.subtree import SubtreeGroup, known
-from tests.ftm.accounts import Add, Counter, Load, Tags
+from tests.ftm.accounts import Account, Add, Counter, Load, Pay, Purse, Tags
 from tests.ftm.test_failover import METHODS, SEED, group_of, pid_of, two_again
 
 RECOVERIES = ("without recovery", "hybrid")
@@ -252,6 +254,31 @@ async def test_who_watches_it_hears_of_its_end_and_not_of_a_replica(system: hf.A
     assert (await watcher.ask(Heard()))[-1] == "down False"
 
 
+async def test_its_bindings_are_those_of_its_replicas(system: hf.ActorSystem) -> None:
+    """Also of what was bound later, and for a replica that is started again."""
+    purse = hf.child("purse", hf.start(Purse), mechanism=PBR(), bindings={"account": "/app/bank/account"})
+    await system.start(bank(hf.child("account", hf.start(Account, 5)), purse))
+    other = await system.start(hf.child("other", hf.start(Account, 100)))
+    ref = at(system, "purse")
+    assert await ref.ask(Pay(3)) == 8
+    system.bind(ref, "account", other)
+    assert await ref.ask(Pay(3)) == 103
+    await two_again(ref)
+    os.kill(pid_of(system, ref, group_of(ref).primary or ""), signal.SIGKILL)
+    assert await ref.ask(Pay(3)) == 106
+
+
+async def test_a_child_of_a_dynamic_supervisor(system: hf.ActorSystem) -> None:
+    template = hf.child(None, hf.start(Counter), mechanism=PBR(), mailbox=hf.bounded(2))
+    await system.start(hf.dynamic("pool", template=template, isolation="process"))
+    pool = system.ref("/app/pool", hf.Supervisor)
+    one = await pool.ask(hf.StartChild(id="one"), timeout=30.0)
+    assert await asyncio.gather(*(one.ask(Add(tag)) for tag in range(6))) == [1, 2, 3, 4, 5, 6]
+    with pytest.raises(hf.TransactionRefused, match="no recipe here has its spec"):
+        async with system.transaction() as change:
+            change.transition(one, "lfr")
+
+
 class Never(Counter):
     def __init__(self) -> None:
         raise RuntimeError("not today")
@@ -268,6 +295,18 @@ async def test_what_cannot_start_fails_the_start_of_the_subtree_with_the_reason(
     with pytest.raises(hf.HoldfastError, match="not today"):
         await house.ask(hf.StartChild(protected("bob", hf.start(Never))), timeout=30.0)
     assert await at(system, "alice").ask(Add(0)) == 1
+
+
+async def test_a_start_that_is_given_up_just_as_it_ends_leaves_nothing(system: hf.ActorSystem) -> None:
+    """What both sides say may cross: the life is up, and nobody wants it."""
+    await system.start(bank(protected("alice")))
+    alice = at(system, "alice")
+    host, pids = alice._cell.host, pids_of(system, alice)
+    assert isinstance(host, SubtreeGroup)
+    host.closed(Closed(host.number, pack_exit(KILLED)))
+    await ended(pids)
+    os.kill(bank_pid(system), signal.SIGKILL)  # The supervisor there has not said so.
+    assert await alice.ask(Add(0), timeout=30.0) == 1
 
 
 async def test_the_root_loads_nothing_that_an_actor_process_names(tmp_path: Path) -> None:
