@@ -31,7 +31,6 @@ from .records import (
     START,
     STASHED,
     Answer,
-    Begin,
     Feed,
     Go,
     Ignored,
@@ -43,7 +42,6 @@ from .records import (
     Restore,
     Snapshot,
     SnapshotNow,
-    Started,
     ToHome,
     ToLife,
     TurnEnd,
@@ -175,7 +173,7 @@ class Life:
             case Restore():
                 self._has_state = True
                 self._state.append(record.data)
-            case Begin() | Started():
+            case _:
                 pass  # for whoever begins lives
 
     def _take(self, feed: Feed) -> None:

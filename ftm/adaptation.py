@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
 from ..actors.actor import Actor, on
@@ -276,7 +276,12 @@ class AdaptationEngine(Actor):
         group = self._group
         group.is_resting = group.is_changing = True
         self._step("commit")
-        turns, found = await self._ask_all(change.prepared, Commit(change.config), COMMITTED_WITHIN)
+        order = Commit(change.config)
+        turns, found = await self._ask_all(change.prepared, order, COMMITTED_WITHIN)
+        if found and group.link is not None:  # Done for an earlier life of ours, their links have ended.
+            done, _ = await self._ask_all(found, order, COMMITTED_WITHIN, reach=group.entry)
+            turns |= done
+            found = {name: error for name, error in found.items() if name not in done}
         change.behind = {name for name, turn in turns.items() if turn != change.turn}
         for name, error in found.items():
             if group.life_of(name) == change.prepared[name]:
@@ -374,7 +379,7 @@ class AdaptationEngine(Actor):
         return not change.why
 
     async def _ask_all(
-        self, names: dict[str, int], message: Message[Any], seconds: float
+        self, names: Iterable[str], message: Message[Any], seconds: float, reach: Callable[[str], Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, BaseException]]:
         """Order all of these replicas at once: replies, and the errors of those that have not done so."""
         group, asked = self._group, dict[str, asyncio.Future[Any]]()
@@ -382,7 +387,7 @@ class AdaptationEngine(Actor):
         errors: dict[str, BaseException] = {}
         for name in names:
             try:
-                asked[name] = group.protocol(name).ask(message, seconds)
+                asked[name] = (reach or group.protocol)(name).ask(message, seconds)
                 asked[name].add_done_callback(_heard)  # If this actor is killed, nobody looks at it.
             except HoldfastError as error:
                 errors[name] = error

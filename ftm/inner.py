@@ -39,11 +39,11 @@ from ..checkpoint.records import (
     Returned,
     Returning,
     Started,
-    ToHome,
     Wanted,
 )
 from ..checkpoint.turns import StopRecorded
 from ..supervision.respec import replace_mechanism
+from .life import Nowhere
 from .mechanism import Description, compose, revive
 from .unkept import UNKEPT
 
@@ -188,16 +188,6 @@ def respec(cell: Cell, described: list[Any]) -> None:
 
 
 # -- lives that are handed over while they are lived -----------------------------------------------------------------
-
-
-class Nowhere:
-    """The way home of a life that is not the one any more: nobody listens."""
-
-    def to_home(self, record: ToHome) -> None:
-        pass
-
-    def closed(self) -> None:
-        pass
 
 
 class Arriving(NamedTuple):

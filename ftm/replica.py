@@ -41,6 +41,10 @@ class EndBricks(Message):
     names: list[str]
 
 
+ORDERS = (Assume, Prepare, Commit, Abort, EndBricks)
+"""What a replica obeys."""
+
+
 class Place(NamedTuple):
     """A brick in the graph: its class, and the mechanism whose it is (None: it passes through)."""
 
@@ -383,7 +387,7 @@ class Replica(Supervisor):
     @on(Opened)
     async def _ordered(self, message: Opened) -> Any:
         """From its own RequestProtocol, which has seen how it came, or from itself; nobody else gives it orders."""
-        match self._standing.take_opened(message.key):
+        match self._standing.take_opened(message.key, ORDERS):
             case Assume() as order:
                 return await self._assume(order)
             case Prepare() as order:
@@ -394,7 +398,7 @@ class Replica(Supervisor):
                 return await self._abort(order)
             case EndBricks() as order:
                 return await self._end(order)
-            case _:
+            case _:  # None.
                 return self._fail(Refused(path=self.ctx.path, reason="forged"))
 
     async def _assume(self, message: Assume) -> None:
@@ -423,9 +427,9 @@ class Replica(Supervisor):
         return None
 
     async def _commit(self, message: Commit) -> Any:
-        woven, self._prepared = self._prepared, None
         if self._woven.config == message.config:
-            return self._server.turn  # It was done already.
+            return self._server.turn  # It was done already. Whoever asks: it changes nothing.
+        woven, self._prepared = self._prepared, None
         if woven is None or woven.config != message.config:
             self._prepared = woven
             return self._fail(MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared"))
@@ -443,9 +447,10 @@ class Replica(Supervisor):
 
     async def _end(self, message: EndBricks) -> None:
         for name in message.names:
-            brick = self._cell(name).actor
-            assert isinstance(brick, Brick)
-            await brick.answered()  # Among others, to the order that wants all this: it has come over the old link.
+            one = self._children.get(name)
+            brick = None if one is None or one.cell is None else one.cell.actor
+            if isinstance(brick, Brick):
+                await brick.answered()  # Among others, the order that wants all this: it has come over the old link.
         self._secure()
         await self._end_bricks(message.names)
 

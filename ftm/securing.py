@@ -61,7 +61,7 @@ class Securing:
         """How to ask the outermost RequestProtocol of a replica."""
 
         async def ask(message: Message[Any], seconds: float) -> Any:
-            return await self._entry(name).ask(message, timeout=seconds)
+            return await self.entry(name).ask(message, timeout=seconds)
 
         return ask
 
@@ -78,9 +78,9 @@ class Securing:
 
     def protocol(self, name: str) -> ActorRef[Any] | Sealing:
         """The outermost RequestProtocol of a replica; over the secured link, if there is one."""
-        return self._entry(name) if self.link is None else Sealing(self, name, self.link)
+        return self.entry(name) if self.link is None else Sealing(self, name, self.link)
 
-    def _entry(self, name: str) -> ActorRef[Any]:
+    def entry(self, name: str) -> ActorRef[Any]:
         """The outermost RequestProtocol of a replica.
 
         Raises:

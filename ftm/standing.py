@@ -80,9 +80,9 @@ class Standing:
         self._opened[key] = message
         return key
 
-    def take_opened(self, key: int) -> Message[Any] | None:
-        """What has come, once."""
-        return self._opened.pop(key, None)
+    def take_opened(self, key: int, kinds: tuple[type[Message[Any]], ...]) -> Message[Any] | None:
+        """What has come, once; None if it is not for whoever understands these."""
+        return self._opened.pop(key) if isinstance(self._opened.get(key), kinds) else None
 
     def entries(self, ends: list[TurnEnd]) -> list[Logged]:
         """Outcomes as the reply log has them."""

@@ -281,8 +281,8 @@ CHECKS = {
     ),
     "a link that is not wanted any more ends behind the answer to the order that says so": Check(
         "ftm/replica.py",
-        "            await brick.answered()  # Among",
-        "            pass  # Among",
+        "                await brick.answered()  # Among",
+        "                pass  # Among",
         SEC,
         "test_attached_composed_and_detached",
     ),

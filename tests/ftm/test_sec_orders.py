@@ -14,6 +14,7 @@ from holdfast.ftm.replica import EndBricks
 from holdfast.ftm.sealed import Opened, Refused, Sealed
 from holdfast.ftm.transfer import Assume
 from tests.ftm.accounts import Add, Counter, Tags
+from tests.ftm.test_adaptation_trouble import fails, struck
 from tests.ftm.test_sec import CA, Tap, every, flip, group_of, joined
 
 
@@ -59,6 +60,17 @@ async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_repl
     assert await ref.ask(Add(1)) == 2
     await joined(ref)
     assert names(ref) == ["sec", "lfr", "tr"]
+
+
+async def test_an_engine_that_dies_before_it_knows_that_the_links_have_ended_learns_it(secured: hf.ActorSystem) -> None:
+    ref = await begun(secured)
+    seen = struck(ref, "switch", fails)
+    async with secured.transaction(timeout=60) as change:
+        change.detach(ref, "sec")
+    assert seen.count("switch") == 2
+    assert names(ref) == ["pbr"]
+    assert await ref.ask(Add(1)) == 2
+    assert group_of(ref).failovers == 0
 
 
 async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) -> None:
