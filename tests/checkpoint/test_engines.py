@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -15,6 +16,7 @@ from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite.rows import crc_of
 from holdfast.checkpoint.stores import open_journal
 from holdfast.testing.stores import conformance
+from tests.checkpoint.one_file import OneFile
 from tests.checkpoint.players import Doer, Note, Seen
 
 
@@ -45,9 +47,20 @@ class TestMemory(conformance(lambda path: MemoryJournal())):  # type: ignore[mis
     """No store."""
 
 
-async def test_a_system_takes_an_engine_that_is_open(tmp_path: Path) -> None:
+def copied(journal: Journal, folder: Path) -> Path:
+    copy = folder.with_name(str(int(folder.name) + 1))
+    shutil.copytree(folder, copy)
+    return copy
+
+
+class TestOneFile(conformance(lambda path: OneFile(path / "my.store"), crash=copied)):  # type: ignore[misc]
+    """One of a user's own."""
+
+
+@pytest.mark.parametrize("kind", [SqliteJournal, OneFile])
+async def test_a_system_takes_an_engine_that_is_open(tmp_path: Path, kind: type[Any]) -> None:
     for life in range(2):
-        engine = SqliteJournal(tmp_path / "app.db")
+        engine: Journal = kind(tmp_path / "app.db")
         async with hf.ActorSystem("app", log=False, store=engine) as system:
             doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid()))
             await doer.ask(Note(str(life)))
