@@ -67,6 +67,19 @@ async def test_a_system_takes_an_engine_that_is_open(tmp_path: Path, kind: type[
             assert await doer.ask(Seen()) == ["0", "1"][: life + 1]
 
 
+async def test_a_store_of_another_system_is_refused_and_kept(tmp_path: Path) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    for name, count in (("app", 1), ("application", 0), ("app", 2)):
+        system = hf.ActorSystem(name, log=False, store=store)
+        if not count:
+            with pytest.raises(hf.SpecError, match="recorded in the system 'app', and nothing of 'application'"):
+                await system.__aenter__()
+            continue
+        async with system:
+            doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid()))
+            assert await doer.ask(Note("one")) == count
+
+
 @pytest.mark.parametrize("place", ["not/there/app.db", ""])
 def test_a_store_without_a_place_is_refused(tmp_path: Path, place: str) -> None:
     """Also a mistyped one: its folder is not made."""
