@@ -140,7 +140,7 @@ class ActorSystem(Recorded, Controls):
         engine = open_journal(self._store, takeover=self._takeover)
         try:
             check_system(engine, self.name)
-        except SpecError:
+        except HoldfastError:
             engine.close()
             raise
         self._homes = Homes(node, engine, durability=self._durability)
