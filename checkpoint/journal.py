@@ -112,7 +112,11 @@ class Journal(Protocol):
     """Rises at each opening of the store."""
 
     def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
-        """Append (address, entry) pairs as one: all or none. Returns their positions, rising ints."""
+        """Append (address, entry) pairs as one: all or none. Returns their positions, rising ints.
+
+        Raises:
+            TypeError: one is no entry. StoreFailed: nothing is written.
+        """
         ...
 
     def sync(self) -> None:
@@ -189,7 +193,7 @@ class Journal(Protocol):
         ...
 
     def close(self) -> None:
-        """Release the store; a second call does nothing."""
+        """Release the store; a second call does nothing. What is closed refuses to write, with a StoreError."""
         ...
 
 

@@ -47,6 +47,16 @@ class Segment:
         self.map = mmap.mmap(file, self.size, mmap.MAP_SHARED) if self.size else None
         self._freed: dict[int, int] = {}  # what has been given back, by offset
 
+    @classmethod
+    def of(cls, number: int, blocks: Iterable[tuple[int, bytes]]) -> Segment:
+        """Blocks in memory of their own, each at its offset: for engines that have read them."""
+        file, end = memory_file(number), 0
+        for offset, block in blocks:
+            os.pwrite(file, block, offset)
+            end = max(end, offset + len(block))
+        os.ftruncate(file, -(-end // PAGE) * PAGE)
+        return cls(number, file)
+
     def block(self, offset: int, length: int) -> memoryview:
         """One block, where it lies."""
         if self.map is None or not 0 <= offset <= offset + length <= self.size:

@@ -31,6 +31,18 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Jour
     return SqliteJournal(path, takeover=takeover)
 
 
+def check_system(journal: Journal, system: str) -> None:
+    """Refuse a store that another system has filled: under this name nothing of it would come back.
+
+    Raises:
+        SpecError: naming the systems whose it is.
+    """
+    names = {address.split("/")[1] for address in journal.addresses() if address.startswith("/")}
+    if names and system not in names:
+        known = ", ".join(map(repr, sorted(names)))
+        raise SpecError("store", f"it has what was recorded in the system {known}, and nothing of {system!r}")
+
+
 PARTS = (
     "append", "sync", "cut", "load", "erase", "keep_blocks", "read_blocks", "forget_blocks", "addresses",
     "note", "noted", "notes", "close", "durable", "epoch",

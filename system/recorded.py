@@ -125,7 +125,7 @@ class Recorded:
         for above in {above for path in paths for above in _ancestors(path)}:
             supervisor = ActorRef[Supervisor](self.homes.node.cell_at(above))
             children = await supervisor.ask(WhichChildren(), timeout)
-            places.update((f"{above}/{child.id}", place) for place, child in enumerate(children))
+            places.update((child.path, place) for place, child in enumerate(children))
         return sorted(paths, key=lambda path: [places[one] for one in (*_ancestors(path)[1:], path)])
 
 

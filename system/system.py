@@ -31,7 +31,7 @@ from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
 from ..checkpoint.records import Wanted
 from ..checkpoint.recovery.settings import RecoveryHooks
-from ..checkpoint.stores import check_durability, open_journal
+from ..checkpoint.stores import check_durability, check_system, open_journal
 from ..checkpoint.subtree import Lived, SubtreeHome, SubtreeHost
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.respec import respec
@@ -139,6 +139,11 @@ class ActorSystem(Recorded, Controls):
             file.check(self.name)
         node = self._node = Node(self.name, asyncio.get_running_loop(), seed=self._seed)
         engine = open_journal(self._store, takeover=self._takeover)
+        try:
+            check_system(engine, self.name)
+        except HoldfastError:
+            engine.close()
+            raise
         self._homes = Homes(node, engine, durability=self._durability)
         self._homes.recoveries.hooks = self._recovery_hooks
         self._recovery = RecoveryTree(node, self._homes)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,6 +13,7 @@ from holdfast.checkpoint.journal import Journal, MemoryJournal
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.stores import open_journal
 from holdfast.testing.stores import conformance
+from tests.checkpoint.one_file import OneFile
 from tests.checkpoint.players import Doer, Note, Seen
 from tests.checkpoint.sqlite.stores import disown
 
@@ -40,13 +42,37 @@ class TestMemory(conformance(lambda path: MemoryJournal())):  # type: ignore[mis
     """No store."""
 
 
-async def test_a_system_takes_an_engine_that_is_open(tmp_path: Path) -> None:
+def copied(journal: Journal, folder: Path) -> Path:
+    copy = folder.with_name(str(int(folder.name) + 1))
+    shutil.copytree(folder, copy)
+    return copy
+
+
+class TestOneFile(conformance(lambda path: OneFile(path / "my.store"), crash=copied)):  # type: ignore[misc]
+    """One of a user's own."""
+
+
+@pytest.mark.parametrize("kind", [SqliteJournal, OneFile])
+async def test_a_system_takes_an_engine_that_is_open(tmp_path: Path, kind: type[Any]) -> None:
     for life in range(2):
-        engine = SqliteJournal(tmp_path / "app.db")
+        engine: Journal = kind(tmp_path / "app.db")
         async with hf.ActorSystem("app", log=False, store=engine) as system:
             doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid()))
             await doer.ask(Note(str(life)))
             assert await doer.ask(Seen()) == ["0", "1"][: life + 1]
+
+
+async def test_a_store_of_another_system_is_refused_and_kept(tmp_path: Path) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    for name, count in (("app", 1), ("application", 0), ("app", 2)):
+        system = hf.ActorSystem(name, log=False, store=store)
+        if not count:
+            with pytest.raises(hf.SpecError, match="recorded in the system 'app', and nothing of 'application'"):
+                await system.__aenter__()
+            continue
+        async with system:
+            doer = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid()))
+            assert await doer.ask(Note("one")) == count
 
 
 @pytest.mark.parametrize("place", ["not/there/app.db", ""])
