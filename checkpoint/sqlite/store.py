@@ -19,8 +19,8 @@ from .files import SnapshotFiles, sync
 from .log import FrontLog, NoRoom, Row, Sealed
 from .mark import Mark
 
-_CHECKPOINT_BYTES: Final = 4 << 20
 INSERT: Final = "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)"
+_CHECKPOINT_BYTES: Final = 4 << 20
 _WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
 
 
@@ -52,8 +52,8 @@ class Store:
         self.log = FrontLog(path, is_used=not fsync)
         self._fsync = fsync
         self._mark = Mark(path)
-        self._wal = -1  # a descriptor of the WAL, once somebody has it synced
         self.in_doubt = False
+        self._wal = -1  # a descriptor of the WAL, once somebody has it synced
         self._is_unsynced = True  # Was anything committed since the last sync?
         self._sync_lock = threading.Lock()
         self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly

@@ -111,8 +111,8 @@ CHECKS = {
         "checkpoint/sqlite/log.py",
         "        self._file.is_promised = True\n",
         "",
-        "tests/checkpoint/sqlite/test_power.py",
-        "test_a_power_loss and fsync",
+        "tests/checkpoint/sqlite/test_log.py",
+        "test_what_was_promised",
     ),
     "log: it is on the disk": Check(
         "checkpoint/sqlite/log.py",
