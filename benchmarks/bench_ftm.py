@@ -31,12 +31,13 @@ import holdfast as hf
 from holdfast.ftm import host
 from holdfast.ftm.detector import Detection
 from holdfast.ftm.events import FailedOver
+from holdfast.ftm.sec.authority import CertificationAuthority
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 
 import ftm_timing
 from ftm_campaign import campaign, soaking
-from ftm_workload import Bump, Change, Count, Parts, Whole
+from ftm_workload import Bump, Change, Count, Parts, Second, Third, Whole, is_counted
 
 from tests.ftm import campaign as engine  # pyright: ignore[reportMissingImports]  # found by the line above
 
@@ -46,6 +47,11 @@ STACKS: dict[str, tuple[Any, ...]] = {
     "TR": (hf.TR(),),
     "PBR+TR": (hf.PBR(), hf.TR()),
     "LFR+TR": (hf.LFR(), hf.TR()),
+    "TMR": (hf.TMR(),),
+    "AD+PBR": (hf.AD(assertions=(is_counted,)), hf.PBR()),
+    "RB": (hf.RB(alternates=(Second,), test=is_counted),),
+    "NVP": (hf.NVP(versions=(Second, Third)),),
+    "SEC+PBR": (hf.SEC("/bench/ca"), hf.PBR()),
 }
 CHANGES: dict[str, tuple[tuple[Any, ...], tuple[Any, ...]]] = {
     "PBR to LFR and back": (STACKS["PBR"], STACKS["LFR"]),
@@ -65,6 +71,8 @@ async def _system() -> AsyncGenerator[hf.ActorSystem, None]:
 
 
 async def _protected(system: hf.ActorSystem, name: str, layers: Sequence[Any], start: Any = None) -> hf.ActorRef[Any]:
+    if any(layer.name == "sec" for layer in layers):
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
     ref = await system.start(hf.child(name, start or hf.start(Count), mechanism=tuple(layers)))
     await engine.whole(ref)
     return ref

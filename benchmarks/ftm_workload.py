@@ -21,6 +21,29 @@ class Count(hf.Actor):
         return self.count
 
 
+class Second(Count):
+    """Another version of it."""
+
+    @hf.on(Bump)
+    def bump(self, message: Bump) -> int:
+        self.count = sum((self.count, 1))
+        return self.count
+
+
+class Third(Count):
+    """And another one."""
+
+    @hf.on(Bump)
+    def bump(self, message: Bump) -> int:
+        self.count -= -1
+        return self.count
+
+
+def is_counted(reply: int) -> bool:
+    """Assertion and acceptance test."""
+    return reply > 0
+
+
 class Change(hf.Message[int]):
     """Change one entry."""
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ..actors.errors import type_name
 from ..actors.message import message_name
+from .declaration import BadDeclaration, Entry
 from .mechanism import Description, Mechanism, MechanismRefused, Part, Role, compose, find, load, load_module
 
 if TYPE_CHECKING:
@@ -57,8 +58,7 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
 
     above: Mechanism | None = None
     for one in layers:
-        if one.layer not in ORDER:
-            raise MechanismRefused(one.name, f"its layer is {one.layer!r}; there are {', '.join(ORDER)}")
+        check_declared(one)
         if above is not None and ORDER.index(one.layer) < ORDER.index(above.layer):
             why = f"({one.layer}) must stand outside of {above.name} ({above.layer}), not inside"
             raise MechanismRefused(one.name, f"it {why}")
@@ -77,6 +77,22 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
             one.check(kind, where)
     for leads in (True, False):
         weave(layers, leads=leads)
+
+
+def check_declared(one: Mechanism) -> None:
+    """Whether a mechanism says of itself what can be.
+
+    Raises:
+        MechanismRefused: it has no name or no replica, or names a fault, need, layer or level that there is not.
+    """
+    who = one.name or type_name(type(one))
+    if not one.name or one.replicas < 1:
+        problem = "a name" if not one.name else f"at least one replica, not {one.replicas}"
+        raise MechanismRefused(who, f"it must declare {problem}")
+    try:
+        Entry.of(one)
+    except BadDeclaration as error:
+        raise MechanismRefused(who, str(error)) from error
 
 
 def _both(one: Mechanism, above: Mechanism) -> str:

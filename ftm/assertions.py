@@ -13,6 +13,7 @@ from typing import Any
 
 from ..actors.errors import HoldfastError, type_name
 from ..checkpoint.records import FAILED, MESSAGE, OK, REPLY, TurnEnd
+from .mechanism import FILES, SCRIPTS
 from .server import Server
 
 PARAMETERS = frozenset({"reply", "message", "state"})
@@ -42,6 +43,8 @@ def name_of(value: Any) -> str:
     name = getattr(value, "__qualname__", "")
     if not name or "<" in name:
         raise ValueError(f"{value!r} has no name by which replicas could import it: define it in a module")
+    if value.__module__.startswith((SCRIPTS, FILES)):
+        raise ValueError(f"{name} stands in a file that replicas cannot import by a name: define it in a module")
     return f"{value.__module__}:{name}"
 
 

@@ -33,6 +33,8 @@ M = TypeVar("M", bound="Mechanism")
 Part = Literal["before", "proceed", "after"]
 SCRIPTS = "holdfast_script_"
 """How the modules of reconfiguration scripts are called: only the process that runs the script has them by name."""
+FILES = "holdfast_mechanism_"
+"""How the modules of mechanisms are called that were loaded from a file."""
 ENTRY_POINTS = "holdfast.mechanisms"
 BUILT_IN = ("pbr", "lfr", "tr", "ad", "rb", "nvp", "tmr", "sec")
 COMMON = tuple(f"{__package__}.mechanisms.{name}" for name in BUILT_IN if name != "sec")
@@ -304,7 +306,7 @@ def load_module(text: str, *, sha256: str = "") -> Any:
 def _run(path: Path, code: bytes, digest: str) -> Any:
     """The module that this very code makes; loaded once."""
     place = hashlib.sha256(str(path).encode()).hexdigest()
-    name = f"holdfast_mechanism_{path.stem}_{place[:8]}_{digest[:16]}"
+    name = f"{FILES}{path.stem}_{place[:8]}_{digest[:16]}"
     module = sys.modules.get(name)
     if module is not None:
         return module

@@ -130,6 +130,10 @@ class Sealing(After):
             )  # fmt: skip
 
 
+SUITES = ("aes-256-gcm", "chacha20-poly1305")
+"""Ciphers that there are."""
+
+
 @functools.cache
 def _folder_of(process: int) -> str:
     """The directory for keys that end with this process."""
@@ -174,10 +178,17 @@ class SEC(Mechanism):
     rotate_seconds: float = 3600.0
     lifetime: float = 86_400.0
     renew_days: float = 7.0
-    suites: tuple[str, ...] = ("aes-256-gcm", "chacha20-poly1305")
+    suites: tuple[str, ...] = SUITES
     is_per_start: bool = False
 
     def __post_init__(self) -> None:
+        if not str(self.authority).startswith("/"):
+            raise ValueError(f"SEC: authority must be an address such as '/app/authority', not {self.authority!r}")
+        for name in ("rotate_messages", "rotate_seconds", "lifetime"):
+            if getattr(self, name) <= 0:
+                raise ValueError(f"SEC: {name} must be > 0, not {getattr(self, name)!r}")
+        if unknown := [suite for suite in self.suites if suite not in SUITES]:
+            raise ValueError(f"SEC: unknown suites {', '.join(unknown)}; there are {', '.join(SUITES)}")
         if not self.keys:
             object.__setattr__(self, "keys", _folder_of(os.getpid()))
             object.__setattr__(self, "is_per_start", True)

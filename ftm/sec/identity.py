@@ -12,8 +12,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import ActorStopped, HoldfastError
 from ...actors.message import Message
+from ..mechanism import MechanismRefused
 from ..sealed import FrameRefused
 from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
 from .certificates import MOST_NAME, Trust, about, make_request, public_of
@@ -151,7 +152,13 @@ class Identity(Secret):
         self._enrolled.add(name)
 
     async def _authority(self, message: Message[Any]) -> Any:
-        return await self._node.cell_at(self.mechanism.authority).ref.ask(message, timeout=AUTHORITY_WITHIN)
+        where = self.mechanism.authority
+        try:
+            return await self._node.cell_at(where).ref.ask(message, timeout=AUTHORITY_WITHIN)
+        except ActorStopped as error:
+            raise MechanismRefused(
+                "sec", f"no authority lives at {where}: start a CertificationAuthority there"
+            ) from error
 
     def _refuse(self, reason: str) -> None:
         self._node.emit(FrameRefused(self._address, self.path, reason, self.rejected[reason]))

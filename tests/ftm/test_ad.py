@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import sys
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +14,7 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.alarms import Diverged, Objected
 from holdfast.ftm.assertions import AssertionFailed
-from holdfast.ftm.mechanism import MechanismRefused, find, revive
+from holdfast.ftm.mechanism import MechanismRefused, find, load, revive
 from holdfast.ftm.mechanisms.ad import AD
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
@@ -23,6 +25,8 @@ from tests.ftm.accounts import Account, Bank, Counter, Load, Put, Tags, Transfer
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Say, Total, pair
 from tests.ftm.test_failover import group_of, pid_of, two_again
 from tests.ftm.versions import FAULTY
+
+AUDIT = Path(__file__).parents[2] / "examples" / "mechanisms" / "audit_trail.py"
 
 CHECKS: Any = (versions.is_positive, versions.has_no_holes, versions.keeps_its_word)
 
@@ -151,6 +155,8 @@ def test_what_cannot_work_is_refused_with_the_reason() -> None:
         AD(versions.odd_name).check(Total)
     with pytest.raises(ValueError, match="at least one"):
         AD()
+    with pytest.raises(ValueError, match="write stands in a file that replicas cannot import"):
+        AD(sys.modules[load(AUDIT).__module__].write)
     assert revive(AD(CHECKS).describe()) == AD(CHECKS)
     assert find("ad") is AD
 

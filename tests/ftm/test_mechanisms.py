@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.adaptation_rules import check_stack
 from holdfast.ftm.bricks import After
 from holdfast.ftm.mechanism import BUILT_IN, Description, Mechanism, MechanismRefused, compose, find, load, revive
 from holdfast.ftm.mechanisms.lfr import LFR
@@ -64,6 +65,23 @@ def test_what_is_not_there_or_no_mechanism_is_refused(tmp_path: Path) -> None:
         compose(PBR(), ["tr"])  # type: ignore[list-item]
     with pytest.raises(MechanismRefused, match="unexpected keyword"):
         revive(Description("holdfast.ftm.mechanisms.pbr:PBR", {"none": 1}))
+
+
+@pytest.mark.parametrize(
+    ("declared", "why"),
+    [
+        ({"name": ""}, "must declare a name"),
+        ({"replicas": 0}, "at least one replica, not 0"),
+        ({"tolerates": frozenset({"crsh"})}, "unknown faults crsh; known: crash"),
+        ({"needs": frozenset({"luck"})}, "unknown needs luck"),
+        ({"layer": "cellar"}, "unknown layers cellar; known: link"),
+        ({"bandwidth": "some"}, "unknown levels of bandwidth some"),
+    ],
+)
+def test_a_declaration_that_means_nothing_is_refused_before_it_is_attached(declared: Any, why: str) -> None:
+    kind: Any = type("Own", (PBR,), declared)
+    with pytest.raises(MechanismRefused, match=why):
+        check_stack((kind(),), None, "/app/alice")
 
 
 def test_a_file_that_others_may_write_or_that_has_changed_is_refused(tmp_path: Path) -> None:

@@ -337,8 +337,30 @@ async def test_it_stands_outermost(secured: hf.ActorSystem) -> None:
 
 
 async def test_without_its_authority_it_does_not_start(system: hf.ActorSystem) -> None:
-    with pytest.raises(hf.HoldfastError):
+    with pytest.raises(hf.StartFailed, match=f"no authority lives at {CA}: start a CertificationAuthority there"):
         await system.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA), hf.PBR())))
+
+
+async def test_a_replica_joins_after_the_death_of_an_authority_that_is_saved(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """A68: its key is in a file, and what it has issued in a snapshot after each message."""
+    start, saved = hf.start(CertificationAuthority, str(tmp_path / "ca.key")), hf.checkpoint_only(every=1)
+    authority = await system.start(hf.child("ca", start, recovery=saved))
+    ref = await system.start(hf.child("c", hf.start(Counter), mechanism=(SEC(CA), hf.PBR())))
+    await joined(ref)
+    await system.terminate(authority, hf.Crash("ValueError", "boom"))
+    await kill_primary(system, ref)
+    assert await ref.ask(Add(1), timeout=20.0) == 1
+    await joined(ref)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"authority": "ca"}, {"rotate_messages": 0}, {"rotate_seconds": -1.0}, {"suites": ("rot13",)}]
+)
+def test_settings_that_mean_nothing_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"SEC: .*(must be|there are)"):
+        SEC(**{"authority": CA, **wrong})
 
 
 async def test_an_authority_that_is_another_one_is_not_believed(secured: hf.ActorSystem) -> None:
