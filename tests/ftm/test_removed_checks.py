@@ -283,8 +283,8 @@ CHECKS = {
         "ftm/replica.py",
         "                await brick.answered()  # Among",
         "                pass  # Among",
-        SEC,
-        "test_attached_composed_and_detached",
+        "tests/ftm/test_sec_orders.py",
+        "test_the_order_that_ends_a_link",
     ),
     "plain words are not admitted at the proxy": Check(
         "ftm/securing.py",

@@ -62,6 +62,19 @@ async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_repl
     assert names(ref) == ["sec", "lfr", "tr"]
 
 
+async def test_the_order_that_ends_a_link_is_answered_over_it(
+    secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tap = Tap().on_replicas(monkeypatch)
+    ref = await begun(secured)
+    tap.seen.clear()
+    async with secured.transaction(timeout=60) as change:
+        change.detach(ref, "sec")
+    assert not [one for _, one in tap.seen if isinstance(one, Commit)]  # Nobody has to ask in plain words.
+    assert names(ref) == ["pbr"]
+    assert await ref.ask(Add(1)) == 2
+
+
 async def test_an_engine_that_dies_before_it_knows_that_the_links_have_ended_learns_it(secured: hf.ActorSystem) -> None:
     ref = await begun(secured)
     seen = struck(ref, "switch", fails)
