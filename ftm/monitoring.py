@@ -232,14 +232,12 @@ class Watch:
         """The kinds of the signs that came since the last time; what mechanisms there are now is noted."""
         events = self._events.take() if self._events is not None else []
         for event in events:
-            if isinstance(event, (MechanismAttached, MechanismChanged, MechanismDetached)):
-                self._has_now(event)
+            if event.address == self.address and self.running is None:  # Else it may be the change that runs.
+                if isinstance(event, (MechanismAttached, MechanismChanged)):
+                    self.found = event.layers
+                elif isinstance(event, MechanismDetached):
+                    self.found = ()
         return [kind for event in events if (kind := self._kind(event)) is not None]
-
-    def _has_now(self, event: MechanismAttached | MechanismChanged | MechanismDetached) -> None:
-        layers = () if isinstance(event, MechanismDetached) else event.layers
-        if event.address == self.address and self.running is None:
-            self.found = layers
 
     def missed(self) -> int:
         """How many events could not be kept since the last time."""
@@ -249,8 +247,8 @@ class Watch:
     def _kind(self, event: Event) -> str | None:
         if event.address != self.address and not event.address.startswith(f"{self.address}/"):
             return None
-        if event.address.startswith(f"{self.address}/ftm/"):  # A replica that is lost is told at the address itself;
-            return None  # here, processes also end because of a change.
+        if event.address.startswith(f"{self.address}/ftm/"):  # Replicas that are lost are told at the address itself.
+            return None
         reason = getattr(event, "reason", None)
         if getattr(reason, "is_clean", False):  # A process that ended because it was to is no fault.
             return None

@@ -359,8 +359,9 @@ async def test_a_replica_joins_after_the_death_of_an_authority_that_is_saved(
     "wrong", [{"authority": "ca"}, {"rotate_messages": 0}, {"rotate_seconds": -1.0}, {"suites": ("rot13",)}]
 )
 def test_settings_that_mean_nothing_are_refused(wrong: dict[str, Any]) -> None:
+    settings: dict[str, Any] = {"authority": CA, **wrong}
     with pytest.raises(ValueError, match=r"SEC: .*(must be|there are)"):
-        SEC(**{"authority": CA, **wrong})
+        SEC(**settings)
 
 
 async def test_an_authority_that_is_another_one_is_not_believed(secured: hf.ActorSystem) -> None:
