@@ -29,7 +29,7 @@ from .rows import (
 )
 from .store import INSERT, Store
 
-_FEW: Final = 256  # More entries at a time, or more bytes, are worth a transaction of their own.
+_FEW: Final = 128  # More entries at a time, or more bytes, are worth a transaction of their own.
 _SMALL: Final = 64 << 10
 _INLINE_BYTES: Final = 1 << 20  # SQLite reads and writes larger blobs at less than half a file's speed.
 
