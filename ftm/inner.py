@@ -39,11 +39,11 @@ from ..checkpoint.records import (
     Returned,
     Returning,
     Started,
-    ToHome,
     Wanted,
 )
 from ..checkpoint.turns import StopRecorded
 from ..supervision.respec import replace_mechanism
+from .life import NOWHERE
 from .mechanism import Description, compose, revive
 from .unkept import UNKEPT
 
@@ -190,16 +190,6 @@ def respec(cell: Cell, described: list[Any]) -> None:
 # -- lives that are handed over while they are lived -----------------------------------------------------------------
 
 
-class Nowhere:
-    """The way home of a life that is not the one any more: nobody listens."""
-
-    def to_home(self, record: ToHome) -> None:
-        pass
-
-    def closed(self) -> None:
-        pass
-
-
 class Arriving(NamedTuple):
     """A life that was begun beside its address, and is not the one yet."""
 
@@ -230,7 +220,7 @@ def take(guest: Guest, path: str, record: Handover) -> None:
             if record.is_kept:
                 _returned(cell, arriving)
             else:
-                port_of(path).life, arriving.life.port = None, Nowhere()
+                port_of(path).life, arriving.life.port = None, NOWHERE
                 dispose(arriving.other)
 
 
@@ -239,7 +229,7 @@ def _attached(guest: Guest, cell: Cell, record: Attached) -> None:
     old_host = cell.host
     assert isinstance(old_host, InnerLifeHost)
     life = old_host.let_go()
-    life.port = Nowhere()
+    life.port = NOWHERE
     old = part(cell)
     _, commands = sorted_out(cell)  # What it was fed is at its home.
     life.cell = old
