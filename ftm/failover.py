@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from ..actors.actor import Actor, on
 from ..actors.cell import RUNNING
-from ..actors.errors import AskTimeout, HoldfastError
+from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
 from ..actors.exits import KILLED
 from ..actors.process.remote import ProcessHost
 from .events import FailedOver
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 ANSWERED_WITHIN = 1.0
 """Seconds after which a replica is looked at again that was told something: it may have been suspected meanwhile."""
+TOLD_WITHIN = 1.0
+"""Seconds until the end of a replica that has said so is known with its reason."""
 AGAIN_AFTER = 0.05
 """Seconds until something is tried again that a replica has refused."""
 
@@ -215,3 +217,13 @@ async def _killed(group: Group, name: str, life: int) -> None:
 
 def nothing(step: str) -> None:
     """Nobody wants to know of the steps."""
+
+
+async def why_ended(group: Group, name: str, life: int, error: HoldfastError) -> str:
+    """Why a replica has not done as it was told: if it has ended, it says soon of what."""
+    cell = group.cell_of(name)
+    if not isinstance(error, ActorStopped) or cell is None:
+        return str(error)
+    if group.life_of(name) == life:
+        await asyncio.wait((cell.ended(),), timeout=TOLD_WITHIN)
+    return str(cell.extra().reason)

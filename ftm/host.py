@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ..actors import lives
 from ..actors.actor import Start
 from ..actors.cell import DOWN, GONE, RUNNING, Cell
-from ..actors.errors import ActorStopped, HoldfastError, StartFailed
+from ..actors.errors import HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
 from ..checkpoint.homes import Homes, parent_ended, seen
@@ -27,7 +27,7 @@ from ..supervision.supervisor import Supervisor
 from .adaptation import REST_WITHIN, AdaptationEngine, CannotAdapt, Reconfiguration
 from .detector import Detection, Detector
 from .events import ReplicaLost
-from .failover import FailoverManager
+from .failover import FailoverManager, why_ended
 from .group import Group, Look
 from .join import Joiner
 from .mechanism import compose
@@ -46,8 +46,6 @@ LED_WITHIN = 60.0
 """Seconds that the first replica may take to take up its state."""
 JOINED_WITHIN = 10.0
 """Seconds that a start waits for another replica to catch up; after that the first one goes on alone."""
-TOLD_WITHIN = 1.0
-"""Seconds until the end of a replica that has said so is known with its reason."""
 FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
 BRICKS_INTENSITY = 100
@@ -280,7 +278,9 @@ class GroupHost(Steered):
                 )
             await protocol.ask(Lead(group.epoch, group.config), LED_WITHIN)
         except HoldfastError as error:
-            raise StartFailed(group.path, f"{first} cannot lead: {await _why(group, first, life, error)}") from error
+            raise StartFailed(
+                group.path, f"{first} cannot lead: {await why_ended(group, first, life, error)}"
+            ) from error
         group.members[first] = life
         group.primary, group.is_begun = first, True
         group.bind_proxy()
@@ -482,16 +482,6 @@ class GroupHost(Steered):
 
     def running(self, cell: Cell) -> int:
         return -1 if self.group is None else self.group.only_suspect_input()
-
-
-async def _why(group: Group, name: str, life: int, error: HoldfastError) -> str:
-    """Why a replica has not done as it was told: if it has ended, it says soon of what."""
-    cell = group.cell_of(name)
-    if not isinstance(error, ActorStopped) or cell is None:
-        return str(error)
-    if group.life_of(name) == life:
-        await asyncio.wait((cell.ended(),), timeout=TOLD_WITHIN)
-    return str(cell.extra().reason)
 
 
 def replica(setting: Setting, start: Start[Any] | bytes, layers: tuple[Any, ...]) -> Start[Any]:

@@ -43,7 +43,7 @@ from ..checkpoint.records import (
 )
 from ..checkpoint.turns import StopRecorded
 from ..supervision.respec import replace_mechanism
-from .life import Nowhere
+from .life import NOWHERE
 from .mechanism import Description, compose, revive
 from .unkept import UNKEPT
 
@@ -220,7 +220,7 @@ def take(guest: Guest, path: str, record: Handover) -> None:
             if record.is_kept:
                 _returned(cell, arriving)
             else:
-                port_of(path).life, arriving.life.port = None, Nowhere()
+                port_of(path).life, arriving.life.port = None, NOWHERE
                 dispose(arriving.other)
 
 
@@ -229,7 +229,7 @@ def _attached(guest: Guest, cell: Cell, record: Attached) -> None:
     old_host = cell.host
     assert isinstance(old_host, InnerLifeHost)
     life = old_host.let_go()
-    life.port = Nowhere()
+    life.port = NOWHERE
     old = part(cell)
     _, commands = sorted_out(cell)  # What it was fed is at its home.
     life.cell = old
