@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from ..actors.actor import Actor, on
 from ..actors.errors import SpecError
-from .orders import Beat
+from .orders import Beat, Broken
 
 if TYPE_CHECKING:
     import asyncio
@@ -160,6 +160,12 @@ class Detector(Actor):
         else:
             accrual.heard(now)
         group.heard(beat.name, life)
+
+    @on(Broken)
+    def broken(self, message: Broken) -> None:
+        """A replica is ending: nobody needs to wait for that."""
+        if self._group.life_of(message.name) == message.life:
+            self._group.broken(message.name, message.life, message.why)
 
     def _look(self) -> None:
         if self.ctx.closed:

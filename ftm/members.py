@@ -42,6 +42,7 @@ class Members(Securing):
         self.up: dict[str, int] = {}  # name to life, of those heard of
         self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}  # name to life
+        self.ending: dict[str, int] = {}  # lives that end by themselves: nobody waits for them
         self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
         self.is_over = False
@@ -86,7 +87,7 @@ class Members(Securing):
 
     def heard(self, name: str, life: int) -> None:
         """A replica has given a sign of life."""
-        if self.stuck.holds(name, life):
+        if self.stuck.holds(name, life) or self.ending.get(name) == life:
             return
         if self.suspects.get(name) == life:
             self.wrong += 1
@@ -115,6 +116,11 @@ class Members(Securing):
         if name in (self.primary, self.leading):
             self.why, self.noticed = why, time.monotonic()
         self.wake()
+
+    def broken(self, name: str, life: int, why: str) -> None:
+        """A replica ends by itself, and nobody needs to wait for that: no sign of life counts any more."""
+        self.ending[name] = life
+        self.suspect(name, life, why)
 
     def lost(self, name: str, why: str) -> None:
         """A replica does not count any more."""

@@ -122,6 +122,14 @@ class Beat(Message):
     epoch: int
 
 
+class Broken(Message):
+    """From a replica to the detector: a brick has crashed. It ends by itself, but what is in hand may hold that up."""
+
+    name: str
+    life: int
+    why: str
+
+
 class Stalled(Message):
     """From a replica to the proxy: the turn of this input takes too long."""
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 from ..actors.actor import Start, on, start
@@ -24,7 +25,7 @@ from ..supervision.supervisor import Supervisor
 from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
 from .heart import Heart
 from .mechanism import Description, Mechanism, MechanismRefused, revive
-from .orders import Abort, Commit, Prepare, Setting
+from .orders import Abort, Broken, Commit, Prepare, Setting
 from .protocol import InnerProtocol, RequestProtocol
 from .sealed import Opened, Refused
 from .server import Server
@@ -189,7 +190,10 @@ class Replica(Supervisor):
         return super().child_exited(cell, life, reason)
 
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
-        super()._give_up(one, reason, Shutdown(f"its {one.spec.id} has ended: {reason}"))
+        why, setting, cell = f"its {one.spec.id} has ended: {reason}", self._setting, self.ctx.cell
+        super()._give_up(one, reason, Shutdown(why))
+        with suppress(HoldfastError):  # It is between two lives: then it hears of our end.
+            cell.node.cell_at(f"{setting.address}/ftm/detector").ref.tell(Broken(setting.name, cell.life, why))
 
     def _cell(self, name: str) -> Cell:
         cell = self._children[name].cell

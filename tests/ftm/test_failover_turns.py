@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import os
 import signal
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.bricks import Before
+from holdfast.ftm.events import FailedOver
+from holdfast.ftm.mechanism import Role
+from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import Add, Boom, Counter, Tags, Total
 from tests.ftm.test_failover import group_of, pid_of, started
 
@@ -63,6 +68,57 @@ async def test_background_work_is_begun_again_or_said_to_be_lost(
                 await asyncio.sleep(0.005)
         assert lost == []
     events.close()
+
+
+class Break(hf.Message): ...
+
+
+class Breaking(Before):
+    """A brick with a bug."""
+
+    @hf.on(Break)
+    def fail(self, message: Break) -> None:
+        raise ValueError("a bug")
+
+
+@dataclasses.dataclass(frozen=True)
+class Fragile(PBR):
+    roles: ClassVar[dict[str, Role]] = {
+        **PBR.roles,
+        "primary": dataclasses.replace(PBR.roles["primary"], before=Breaking),
+    }
+
+
+class Stay(hf.Message[int]):
+    """Take for ever in the first process, and no time in any other."""
+
+    folder: str
+
+
+class Stayer(Counter):
+    @hf.on(Stay)
+    async def stay(self, message: Stay) -> int:
+        begun = Path(message.folder, "begun")
+        if not begun.exists():
+            begun.touch()
+            await asyncio.Event().wait()
+        self.total += 1
+        return self.total
+
+
+async def test_nobody_waits_for_the_turn_in_hand_of_a_replica_that_is_broken(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """A brick has crashed (A44-A59), and its replica would end with the turn: it is killed, another one leads."""
+    ref = await system.start(hf.child("alice", hf.start(Stayer), mechanism=Fragile()))
+    primary = group_of(ref).primary
+    with system.events() as events:
+        answer = ref.ask(Stay(str(tmp_path)), timeout=60)
+        await until_there(tmp_path / "begun")
+        system.node.cell_at(f"{ref.path}/ftm/{primary}/before").ref.tell(Break())
+        assert await answer == 1
+        (failover,) = [one for one in events.take() if isinstance(one, FailedOver)]
+    assert failover.why == "its before has ended: ValueError: a bug"
 
 
 class Ring(hf.Message[str]): ...
