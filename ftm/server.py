@@ -18,7 +18,6 @@ from ..actors.cell import RUNNING, Cell
 from ..actors.errors import StartFailed
 from ..actors.exits import ExitReason, pack_exit
 from ..actors.message import message_name
-from ..checkpoint.keys import save_state
 from ..checkpoint.records import (
     FAILED,
     START,
@@ -36,13 +35,12 @@ from ..checkpoint.records import (
     ToHome,
     TurnEnd,
     Unsaved,
-    pieces,
 )
 from ..checkpoint.turns import Fed, GoLive, StopRecorded
 from .life import BLOCKED, ENDED, OVER, UNDONE, ServerLife
 from .mechanism import has_state_access
-from .messages import Beside, Request, State
-from .points import Points
+from .messages import Request, State
+from .reports import Reports
 
 PART: Final = 0.001
 """Seconds of work after which the outcomes so far are handed over: a slow request does not hold up quick ones."""
@@ -50,7 +48,7 @@ MOST_CRASHES: Final = 8
 """Ends of the life outside any turn, one after another, after which the replica is given up."""
 
 
-class Server(Points):
+class Server(Reports):
     """The host of the protected actor, and its port home."""
 
     # -- as the host of its cell ------------------------------------------------------------------------------------
@@ -435,18 +433,6 @@ class Server(Points):
         if life is not None and cell is not None:
             cell.node.loop.call_soon(self._life_ended, life, cell.extra().reason)
 
-    def tell_more(self, record: Beside) -> None:
-        """Something goes home behind the ends of the part at hand, or by itself."""
-        self.more.append(record)
-        self.on_more()
-
-    def take_more(self) -> list[Beside]:
-        """What goes home behind the ends that are handed over now."""
-        if self._snapshot_wanted:
-            self._snapshot()
-        more, self.more = self.more, []
-        return more
-
     # -- records from home ------------------------------------------------------------------------------------------
 
     def inward(self, record: Outcome | SnapshotNow) -> None:
@@ -458,40 +444,6 @@ class Server(Points):
                 life.from_home(record)
         else:
             self.want_snapshot()
-
-    def want_snapshot(self) -> None:
-        """A snapshot goes home with the next part, or at once."""
-        self._snapshot_wanted = True
-        self.on_more()
-
-    def _snapshot(self) -> None:
-        life = self.life
-        if life is None or life.pipes or life.feed is not None or not life.is_live or not self.method.snapshots:
-            return
-        self._snapshot_wanted = False
-        try:
-            self._send_snapshot()
-        except Exception as error:  # What the user's own `get_state` raises is no reason to lose what it has.
-            self.more.append(Unsaved(str(error)))
-
-    def _send_snapshot(self) -> None:
-        life = self.life
-        assert life is not None
-        begin = time.perf_counter()
-        point = self.point
-        assert life.cell.actor is not None
-        is_known = point is not None and point.turn == life.turn and not point.deltas and not self.tail
-        data = point.data.whole() if point is not None and is_known else save_state(life.cell.actor)
-        stash = [fed.feed.id for fed in life.stash]
-        parts, pause = pieces(data), time.perf_counter() - begin
-        for index, one in enumerate(parts, 1):
-            self.more.append(Snapshot(life.turn, one, index == len(parts), stash, pause))
-
-    def last_snapshot(self) -> None:
-        """The life ends in good order."""
-        self._snapshot_wanted = True
-        self._snapshot()
-        self.on_more()
 
     async def go(self, go: Go) -> Live | None:
         """Replay is over: new inputs come from here on."""

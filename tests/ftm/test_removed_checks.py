@@ -356,6 +356,13 @@ CHECKS = {
         "tests/ftm/test_stuck.py",
         "test_a_message_that_hangs_again and tr",
     ),
+    "nobody waits for the end of a replica with a broken brick": Check(
+        "ftm/detector.py",
+        "        if self._group.life_of(message.name) == message.life:\n",
+        "        if False:\n",
+        "tests/ftm/test_failover_turns.py",
+        "test_nobody_waits_for_the_turn_in_hand",
+    ),
     "a message that kills is found out": Check(
         "ftm/group.py",
         "        return out.requests[0].feed.id\n",

@@ -1,0 +1,60 @@
+"""What goes home beside the ends of turns: what background work has brought, and snapshots."""
+
+from __future__ import annotations
+
+import time
+
+from ..checkpoint.keys import save_state
+from ..checkpoint.records import Snapshot, Unsaved, pieces
+from .messages import Beside
+from .points import Points
+
+
+class Reports(Points):
+    """Collects it until a part is handed over, or until somebody comes for it (`on_more`)."""
+
+    def tell_more(self, record: Beside) -> None:
+        """Something goes home behind the ends of the part at hand, or by itself."""
+        self.more.append(record)
+        self.on_more()
+
+    def take_more(self) -> list[Beside]:
+        """What goes home behind the ends that are handed over now."""
+        if self._snapshot_wanted:
+            self._snapshot()
+        more, self.more = self.more, []
+        return more
+
+    def want_snapshot(self) -> None:
+        """A snapshot goes home with the next part, or at once."""
+        self._snapshot_wanted = True
+        self.on_more()
+
+    def _snapshot(self) -> None:
+        life = self.life
+        if life is None or life.pipes or life.feed is not None or not life.is_live or not self.method.snapshots:
+            return
+        self._snapshot_wanted = False
+        try:
+            self._send_snapshot()
+        except Exception as error:  # What the user's own `get_state` raises is no reason to lose what it has.
+            self.more.append(Unsaved(str(error)))
+
+    def _send_snapshot(self) -> None:
+        life = self.life
+        assert life is not None
+        begin = time.perf_counter()
+        point = self.point
+        assert life.cell.actor is not None
+        is_known = point is not None and point.turn == life.turn and not point.deltas and not self.tail
+        data = point.data.whole() if point is not None and is_known else save_state(life.cell.actor)
+        stash = [fed.feed.id for fed in life.stash]
+        parts, pause = pieces(data), time.perf_counter() - begin
+        for index, one in enumerate(parts, 1):
+            self.more.append(Snapshot(life.turn, one, index == len(parts), stash, pause))
+
+    def last_snapshot(self) -> None:
+        """The life ends in good order."""
+        self._snapshot_wanted = True
+        self._snapshot()
+        self.on_more()
