@@ -17,7 +17,7 @@ from .codec import Codec
 from .deadlines import Deadlines
 from .errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
 from .events import DeadLetter, Event, EventHub, SupervisorGaveUp
-from .exits import ExitReason
+from .exits import KILLED, ExitReason
 from .keeper import Keeper, NothingKept
 from .lives import LOCAL
 from .loop import RunLoop
@@ -50,7 +50,7 @@ class Node(RunLoop):
         self.kept: weakref.WeakKeyDictionary[Cell, Any] = weakref.WeakKeyDictionary()  # what outlives an actor's lives
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
-        self.led: dict[str, dict[str, set[str]]] = {}  # by owner: where its bindings have led, by where they lead
+        self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead
         self.gave_up: SupervisorGaveUp | None = None  # the last supervisor here that did
         self.dead_letters = 0
         self.late_replies = 0
@@ -243,7 +243,7 @@ class Node(RunLoop):
         more = cell.extra()
         soon = more.turn.rebinds if more.turn is not None else None
         before = (soon or {}).get(port) or more.bindings.get(port)
-        if before is not None and before.path != target.path:
+        if before is not None and before.path != target.path and cell.host.recovers(KILLED):
             led = self.led.setdefault(cell.path, {})
             same = {before.path, target.path, *led.get(before.path, ()), *led.get(target.path, ())}
             led.update(dict.fromkeys(same, same))
