@@ -331,8 +331,9 @@ def from_group(cell: Cell, host: Host, timeout: float) -> FromGroup:
     old = cell.host
     if isinstance(old, SubtreeGroup):
         if is_unkept(old.method):
-            why = "its supervisor lives in another process, and it is not recorded: its life cannot go back there"
-            raise CannotMove(cell.path, f"{why}; stop it, and start it without mechanism=...")
+            from .carrying import IntoProcess
+
+            return IntoProcess(cell, timeout)
         from .handing_over import IntoSubtree
 
         return IntoSubtree(cell, timeout)
