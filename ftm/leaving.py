@@ -251,10 +251,11 @@ class ToPlainTask(FromGroup):
         cell.admit = mailbox.admit_first
         homed, switch.bound = switch.bound, None
         self._old.homes.released(cell.path)
-        queue = mailbox.queue_of(cell)
         if homed is not None and homed.capacity:
             more.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
             cell.admit = mailbox.admit_bounded
+        cell.queue = None  # All is at the home; the queue of a bounded mailbox is another one.
+        queue = mailbox.queue_of(cell)
         taken = (decoded(cell, item) for item in (*own, *items))
         queue.extend(item for item in taken if item is not None)
         if more.bound is not None:
