@@ -183,8 +183,12 @@ class Returned(msgspec.Struct, array_like=True, tag=33):
 
 
 class Carried(msgspec.Struct, array_like=True, tag=34):
-    """A step of handing over a life that is not recorded, and a piece of what is told with it. In both directions."""
+    """A step of handing over a life that is not recorded, and a piece of what is told with it. In both directions.
 
+    `attempt`: at which handing over; what an earlier one has left on its way counts for nothing.
+    """
+
+    attempt: int
     step: str
     data: bytes
     is_last: bool

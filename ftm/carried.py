@@ -63,13 +63,15 @@ class Carrier:
     def __init__(self, guest: Guest, path: str) -> None:
         self._guest, self._path = guest, path
         self._port = guest.recovery.port_of(path)
-        self._incoming = Incoming()
+        self._attempt, self._incoming = -1, Incoming()
         self._take: Take | None = None
         self._cell: Cell | None = None  # where a life is at rest, or comes back to
         self._other: Cell | None = None  # beside it: the life that comes back
         self._held: list[Any] | None = None  # what has been sent to it here meanwhile
 
     def hear(self, record: Carried) -> None:
+        if record.attempt != self._attempt:
+            self._attempt, self._incoming = record.attempt, Incoming()
         told = self._incoming.take(record)
         if told is None:
             return
@@ -88,7 +90,7 @@ class Carrier:
                 self._settle_in(told)
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_home, self._path, step, **told)
+        carry(self._port.to_home, self._path, self._attempt, step, **told)
 
     # -- leaving ----------------------------------------------------------------------------------------------------
 

@@ -8,6 +8,7 @@ meanwhile, the child begins afresh with the subtree.
 from __future__ import annotations
 
 import asyncio
+import itertools
 from collections import deque
 from typing import TYPE_CHECKING, Any, cast
 
@@ -39,6 +40,7 @@ from .unkept import UNKEPT
 if TYPE_CHECKING:
     from ..actors.cell import Admit
 
+ATTEMPTS = itertools.count()
 NUMBER = 0
 """Under which the supervisor there wants a life that it has not asked for: it counts its own from 1."""
 
@@ -70,7 +72,7 @@ class OutOfProcess(ToGroup):
         super().__init__(cell, host, timeout)
         self._new_host, self._place, self._spec, self._worker = host, place, spec, worker_of(place, cell)
         self._port = RemoteLife(cell.path, self._worker)
-        self._incoming = Incoming()
+        self._attempt, self._incoming = next(ATTEMPTS), Incoming()
         self._admit: Admit = cell.admit
         self._held: list[Any] = []  # what has been sent to it here meanwhile
         self._left: asyncio.Future[None] = self.node.loop.create_future()
@@ -91,12 +93,14 @@ class OutOfProcess(ToGroup):
         )
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_life, self.cell.path, step, **told)
+        carry(self._port.to_life, self.cell.path, self._attempt, step, **told)
         self._worker.connection.flush()
 
     def _said(self, record: ToHome) -> None:
-        told = self._incoming.take(record) if isinstance(record, Carried) else None
-        if told is None or not isinstance(record, Carried):
+        if not isinstance(record, Carried) or record.attempt != self._attempt:
+            return
+        told = self._incoming.take(record)
+        if told is None:
             return
         match record.step:
             case "refused":
@@ -228,11 +232,11 @@ class IntoProcess(ToPlainTask):
         super().__init__(cell, old.place, timeout)
         self._group_host, self._place, self._worker = old, old.place, worker_of(old.place, cell)
         self._port = RemoteLife(cell.path, self._worker)
-        self._incoming = Incoming()
+        self._attempt, self._incoming = next(ATTEMPTS), Incoming()
         self._up: asyncio.Future[None] = self.node.loop.create_future()
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_life, self.cell.path, step, **told)
+        carry(self._port.to_life, self.cell.path, self._attempt, step, **told)
         self._worker.connection.flush()
 
     async def carry(self) -> None:
@@ -243,8 +247,10 @@ class IntoProcess(ToPlainTask):
     def _said(self, record: ToHome) -> None:
         if isinstance(record, Closed):
             self._fail(str(unpack_exit(record.reason)))
-        told = self._incoming.take(record) if isinstance(record, Carried) else None
-        if told is None or not isinstance(record, Carried) or self._up.done() or self.given_up.done():
+        if not isinstance(record, Carried) or record.attempt != self._attempt:
+            return
+        told = self._incoming.take(record)
+        if told is None or self._up.done() or self.given_up.done():
             return
         if record.step == "failed":
             self._fail(str(told["why"]))

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..actors.cell import Cell
 
 
-def carry(say: Callable[[Carried], None], path: str, step: str, **told: Any) -> None:
+def carry(say: Callable[[Carried], None], path: str, attempt: int, step: str, **told: Any) -> None:
     """Say a step, and what is told with it, in pieces.
 
     Raises:
@@ -30,8 +30,8 @@ def carry(say: Callable[[Carried], None], path: str, step: str, **told: Any) -> 
     """
     *parts, last = pieces(encode_value(told, where=path))
     for part in parts:
-        say(Carried(step, part, is_last=False))
-    say(Carried(step, last, is_last=True))
+        say(Carried(attempt, step, part, is_last=False))
+    say(Carried(attempt, step, last, is_last=True))
 
 
 class Incoming:

@@ -68,10 +68,9 @@ class Talking:
         return list(range(self.first, self.next))
 
 
-@pytest.mark.parametrize("mailbox", [None, hf.bounded(64)], ids=["unbounded", "bounded"])
-async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.ActorSystem, mailbox: Any) -> None:
+async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.ActorSystem) -> None:
     """From outside and from a sibling, once and in order; nothing is left of a home."""
-    await system.start(bank(plain(mailbox=mailbox), plain("sibling", hf.start(Sibling))))
+    await system.start(bank(plain(mailbox=hf.bounded(64)), plain("sibling", hf.start(Sibling))))
     alice = at(system, "alice")
     load, talking = Load(alice), Talking(at(system, "sibling"), 1_000_000)
     for _ in range(2):
