@@ -219,6 +219,72 @@ async def test_what_was_attached_or_detached_holds_over_restarts(system: hf.Acto
     assert system.pid_of(ref) == bank_pid(system)
 
 
+class Keep(hf.Message[int]):
+    tag: int
+
+
+class Follow(hf.Message[None]): ...
+
+
+class News(hf.Message[None]):
+    text: str
+
+
+class Read(hf.Message[list[str]]): ...
+
+
+class Open(hf.Message[None]): ...
+
+
+class Keeper(hf.Actor):
+    """Puts aside what comes until it is opened, and follows the news."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        self.read: list[str] = []
+
+    @hf.on(Keep)
+    def keep(self, message: Keep) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+        self.read.append(str(message.tag))
+        return message.tag
+
+    @hf.on(Open)
+    def open(self, message: Open) -> None:
+        self.is_open = True
+        self.read.clear()
+        self.ctx.unstash()
+
+    @hf.on(Follow)
+    def follow(self, message: Follow) -> None:
+        self.ctx.subscribe("/news")
+
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        self.read.append(message.text)
+
+    @hf.on(Read, readonly=True)
+    def said(self, message: Read) -> list[str]:
+        return [one for one in self.read if not one.isdigit()] if not self.is_open else self.read
+
+
+async def test_what_is_put_aside_and_subscribed_to_goes_along(system: hf.ActorSystem) -> None:
+    await system.start(bank(plain(recipe=hf.start(Keeper))))
+    alice = at(system, "alice")
+    await alice.ask(Follow())
+    kept = []
+    for tag, change in enumerate((attach, detach, None)):
+        kept.append(asyncio.ensure_future(alice.ask(Keep(tag), timeout=30.0)))
+        await system.publish("/news", News("abc"[tag]))
+        assert await alice.ask(Read()) == list("abc"[: tag + 1])
+        if change is not None:
+            await change(system, alice)
+    await alice.ask(Open())
+    assert await asyncio.gather(*kept) == [0, 1, 2]
+    assert await alice.ask(Read()) == ["0", "1", "2"]
+
+
 @pytest.mark.parametrize("victim", ["subtree", "replica"])
 async def test_whatever_dies_while_it_is_handed_over_it_is_there_again(system: hf.ActorSystem, victim: str) -> None:
     """With a replica nothing is lost; with the subtree the child begins afresh, as the specs say then."""
