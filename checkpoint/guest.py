@@ -24,6 +24,7 @@ from .method import Method
 from .records import (
     Attached,
     Begin,
+    Carried,
     Closed,
     Handover,
     Over,
@@ -50,7 +51,7 @@ class RecordedGuest:
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
         self._ports: dict[str, Port] = {}
-        self.on_handover: Callable[[str, Handover], None] = lambda path, record: None
+        self.on_handover: Callable[[str, Handover | Carried], None] = lambda path, record: None
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
@@ -161,7 +162,7 @@ class Port:
             case Over() | Respec():
                 if self.on_group is not None:
                     self.on_group(record)
-            case Attached() | Returning() | Returned():
+            case Attached() | Returning() | Returned() | Carried():
                 self._guest.recovery.on_handover(self._path, record)
             case _:
                 if self.life is not None:

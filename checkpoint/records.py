@@ -182,8 +182,20 @@ class Returned(msgspec.Struct, array_like=True, tag=33):
     is_kept: bool
 
 
+class Carried(msgspec.Struct, array_like=True, tag=34):
+    """A step of handing over a life that is not recorded, and a piece of what is told with it. In both directions.
+
+    `attempt`: at which handing over; what an earlier one has left on its way counts for nothing.
+    """
+
+    attempt: int
+    step: str
+    data: bytes
+    is_last: bool
+
+
 Handover = Attached | Returning | Returned
-ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Handover
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Handover | Carried
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------
@@ -297,7 +309,7 @@ class Ignored(msgspec.Struct, array_like=True, tag=19):
     why: str
 
 
-ToHome = Ignored | Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked
+ToHome = Ignored | Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked | Carried
 
 
 class LifePort(Protocol):

@@ -73,13 +73,17 @@ class SubtreeHost(ProcessHost):
         slots = Slots(len(worker.page))
 
         def taker(path: str) -> frames.TakeRecord:
-            home = self._below.get(path)
-            if home is None:
-                home = self._below[path] = SubtreeHome(self._homes, path, self._protect)
-            return home.joined(cell, worker, slots.of(path))
+            return self.at(path).joined(cell, worker, slots.of(path))
 
         worker.record_taker = taker
         return worker, recipe
+
+    def at(self, path: str) -> SubtreeHome:
+        """The home of an address below."""
+        home = self._below.get(path)
+        if home is None:
+            home = self._below[path] = SubtreeHome(self._homes, path, self._protect)
+        return home
 
     def died(self, cell: Cell, reason: ExitReason) -> None:
         worker = self._workers.of(cell)
@@ -123,7 +127,8 @@ class SubtreeHome(HomeHost):
         self._protect = protect
         self._group: Lived | None = None  # has the lives of a protected child
         self._next: Wanted | None = None  # begins when nothing is left of a group
-        self.arriving: Callable[[ToHome], None] | None = None  # hears a life that is to come back into the process
+        self.arriving: Callable[[ToHome], None] | None = None  # hears a life that is being handed over
+        self.on_lost: Callable[[ExitReason], None] | None = None  # hears that the process of such a life has died
         self.switch: Switch | None = None
         self.clock = None
         self.recovery = None
@@ -227,6 +232,14 @@ class SubtreeHome(HomeHost):
         self._wanted, self._group, self.clock = wanted, None, None
         cell.spec = wanted
 
+    def found(self, cell: Cell, group: Lived) -> None:
+        """A life that was not recorded is lived at the root from now on."""
+        self.cell, self._group = cell, group
+
+    def forget(self) -> None:
+        """It is lived in the process again, and there is no home."""
+        self.cell = self._group = self.switch = None
+
     # -- lives at the root ------------------------------------------------------------------------------------------
 
     def _begin_protected(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
@@ -318,6 +331,8 @@ class SubtreeHome(HomeHost):
         """The process is gone, and the life with it."""
         if worker is self._worker:
             self._next = None
+            if self.on_lost is not None:
+                self.on_lost(reason)
         if worker is self._worker and self._group is not None and self.cell is not None:
             self._group.lost(self.cell, reason)
         elif worker is self._worker and self._wanted is not None:

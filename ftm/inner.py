@@ -62,7 +62,7 @@ class InnerGroupHost:
         recovery = spec.recovery
         self._method: Method = recovery if recovery is not None and recovery.records else UNKEPT
         self._port: Port | None = None
-        self._bound: Bounded | None = None
+        self.bound: Bounded | None = None
         self._number = 0
         self._up: asyncio.Future[None] | None = None
 
@@ -76,9 +76,9 @@ class InnerGroupHost:
             raise StartFailed(cell.path, why)
         if isinstance(node.keeper, GuestKeeper):
             node.keeper.begins(cell.path)
-        cell.table, cell.admit = start.kind._table, self._admit
+        cell.table, cell.admit = start.kind._table, self.way_home
         if more.bound is not None:  # The home counts.
-            self._bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
+            self.bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
         self._number += 1
         self._up = node.loop.create_future()
         port = self._port = self._joined(cell)
@@ -86,7 +86,7 @@ class InnerGroupHost:
         bindings = {name: target.path for name, target in more.bindings.items()}
         made = Protected(pack_recipe(start, cell.path), layers, bindings)
         kind, topics = message_name(start.kind), list(start.kind._topics)
-        port.to_home(Wanted(self._number, kind, topics, self._method, self._bound, made))
+        port.to_home(Wanted(self._number, kind, topics, self._method, self.bound, made))
         return self._up
 
     def _joined(self, cell: Cell) -> Port:
@@ -99,7 +99,7 @@ class InnerGroupHost:
     def take_up(self, cell: Cell, number: int) -> None:
         """A life that was lived here goes on at the root, as that which was wanted as `number`."""
         self._number, self._port = number, self._joined(cell)
-        cell.host, cell.admit = self, self._admit
+        cell.host, cell.admit = self, self.way_home
 
     def _started(self, cell: Cell, record: Started) -> None:
         if record.number != self._number or self._up is None or self._up.done():
@@ -152,7 +152,7 @@ class InnerGroupHost:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
 
-    def _admit(self, cell: Cell, item: Any) -> None:
+    def way_home(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: the home numbers, and feeds the replicas."""
         if not isinstance(item, Item) and type(item) not in cell.table:
             cell.require(item)

@@ -251,10 +251,11 @@ class ToPlainTask(FromGroup):
         cell.admit = mailbox.admit_first
         homed, switch.bound = switch.bound, None
         self._old.homes.released(cell.path)
-        queue = mailbox.queue_of(cell)
         if homed is not None and homed.capacity:
             more.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
             cell.admit = mailbox.admit_bounded
+        cell.queue = None  # All is at the home; the queue of a bounded mailbox is another one.
+        queue = mailbox.queue_of(cell)
         taken = (decoded(cell, item) for item in (*own, *items))
         queue.extend(item for item in taken if item is not None)
         if more.bound is not None:
@@ -331,8 +332,9 @@ def from_group(cell: Cell, host: Host, timeout: float) -> FromGroup:
     old = cell.host
     if isinstance(old, SubtreeGroup):
         if is_unkept(old.method):
-            why = "its supervisor lives in another process, and it is not recorded: its life cannot go back there"
-            raise CannotMove(cell.path, f"{why}; stop it, and start it without mechanism=...")
+            from .carrying import IntoProcess
+
+            return IntoProcess(cell, timeout)
         from .handing_over import IntoSubtree
 
         return IntoSubtree(cell, timeout)

@@ -260,10 +260,9 @@ def to_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> ToGrou
 
         return OutOfSubtree(cell, old, mechanism, timeout)
     if isinstance(old, OutsideHost):
-        why = (
-            "it lives in the process of its supervisor, and is not recorded: give it recovery=..., or stop it and start"
-        )
-        raise CannotMove(cell.path, f"{why} it with mechanism=...")
+        from .carrying import OutOfProcess
+
+        return OutOfProcess(cell, old, mechanism, timeout)
     if old is not LOCAL:
         raise CannotMove(cell.path, "only an actor that lives as a task can be given a mechanism")
     return ToGroup(cell, GroupHost(homes, None, mechanism), timeout)

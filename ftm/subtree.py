@@ -90,8 +90,12 @@ class SubtreeGroup(GroupHost):
 
     def take_up(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
         """A life that was lived in the process is lived here from now on; its supervisor wants it as before."""
+        self.found(wanted, port)
+        port.to_life(Attached(wanted.number, self.described()))
+
+    def found(self, wanted: Wanted, port: RemoteLife) -> None:
+        """The life that is lived here already is the one that is wanted."""
         self._wanted, self._port = wanted, port
-        port.to_life(Attached(wanted.number, self._described()))
 
     @property
     def number(self) -> int:
@@ -104,7 +108,8 @@ class SubtreeGroup(GroupHost):
         assert wanted is not None
         return wanted
 
-    def _described(self) -> list[Any]:
+    def described(self) -> list[Any]:
+        """The mechanisms as data."""
         return [msgspec.to_builtins(layer.describe()) for layer in self.layers]
 
     def left(self) -> list[asyncio.Task[None]]:
@@ -195,7 +200,7 @@ class SubtreeGroup(GroupHost):
         def also_there() -> None:
             switched()
             if self._port is not None:
-                self._port.to_life(Respec(self._described()))
+                self._port.to_life(Respec(self.described()))
 
         return await super().adapt(cell, mechanism, also_there, rest_within)
 

@@ -11,7 +11,7 @@ from ..actors.cell import Cell, Host
 from ..actors.process import frames, guest
 from ..checkpoint.file import RecoveryFile
 from ..checkpoint.guest import GuestKeeper, RecordedGuest
-from ..checkpoint.records import Handover
+from ..checkpoint.records import Carried, Handover
 from ..supervision.respec import respec
 
 
@@ -37,11 +37,14 @@ def host_for(host: guest.Guest, spec: Any) -> Host:
     return InnerGroupHost(host, spec, host.recovery.port_of)
 
 
-def handed_over(host: guest.Guest, path: str, record: Handover) -> None:
+def handed_over(host: guest.Guest, path: str, record: Handover | Carried) -> None:
     """A live child of this process's supervisor gets a mechanism, or loses it."""
-    from ..ftm.inner import take
+    from ..ftm import carried, inner
 
-    take(host, path, record)
+    if isinstance(record, Carried):
+        carried.hear(host, path, record)
+    else:
+        inner.take(host, path, record)
 
 
 def launch(host: guest.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:

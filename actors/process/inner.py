@@ -54,6 +54,11 @@ class Inner:
         self._cells[path] = cell
         return cell
 
+    def lived_there(self, cell: Cell) -> Host:
+        """What is sent to an address goes into the process from now on; returns its host."""
+        cell.admit = self._admit
+        return self._host
+
     def _place(self, home: Cell, path: str) -> tuple[Cell, str]:
         """The cell above an address, and its name there."""
         above, _, name = path.rpartition("/")

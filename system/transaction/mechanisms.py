@@ -24,8 +24,6 @@ PROTECT_TIMEOUT = 60.0
 class OnProtection(OnLiving):
     """Base: the way in and the way out, each of which undoes the other."""
 
-    _carries: ClassVar[bool] = True  # the life goes to another place
-
     def __init__(self, target: Target) -> None:
         super().__init__(target)
         self._under_way: asyncio.Task[None] | None = None
@@ -54,10 +52,6 @@ class OnProtection(OnLiving):
         if place.spec is None:
             why = "its supervisor lives in another process, and no recipe here has its spec: add it by a transaction"
             raise wrong(self.target, why)
-        recovery = place.spec.recovery
-        if self._carries and (recovery is None or not recovery.records):
-            why = "its supervisor lives in another process, and it is not recorded: give it recovery=..., or stop it"
-            raise wrong(self.target, f"{why} and add it again with the mechanism that it is to have")
 
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
         """Change it; whoever is cancelled gives up waiting, the change comes to its end."""
@@ -181,8 +175,6 @@ class Detach(OnProtection):
 
 class Adapt(OnProtection):
     """Base: a protected actor goes on with another stack of mechanisms; its replicas live on."""
-
-    _carries: ClassVar[bool] = False
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)

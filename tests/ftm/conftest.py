@@ -36,7 +36,8 @@ async def secured(system: hf.ActorSystem) -> hf.ActorSystem:
 ON_ONE_LOOP = {
     "test_ad", "test_attach", "test_campaign", "test_composed", "test_failover", "test_failover_turns", "test_images",
     "test_in_processes", "test_lfr", "test_nvp", "test_pbr", "test_pbr_joining", "test_post", "test_rb", "test_sec",
-    "test_sec_orders", "test_strays", "test_stuck", "test_subtree", "test_subtree_changes", "test_tmr", "test_tr",
+    "test_sec_orders", "test_strays", "test_stuck", "test_subtree", "test_subtree_changes", "test_subtree_handing",
+    "test_tmr", "test_tr",
 }  # fmt: skip
 
 

@@ -227,17 +227,6 @@ async def all_again(ref: hf.ActorRef[Any]) -> Stack:
 # -- elsewhere --------------------------------------------------------------------------------------------------------
 
 
-async def test_in_a_subtree_without_recovery_it_is_refused_with_the_reason(system: hf.ActorSystem) -> None:
-    """Its state is not at home, and does not come out of the process of its supervisor."""
-    far = hf.supervisor("far", isolation="process", children=[hf.child("alice", hf.start(Counter))])
-    await system.start(far)
-    why = "its supervisor lives in another process, and it is not recorded: give it recovery="
-    with pytest.raises(hf.TransactionRefused, match=why):
-        async with system.transaction() as change:
-            change.attach("/app/far/alice", hf.PBR())
-    assert await system.ref("/app/far/alice", Counter).ask(Tags()) == []
-
-
 SCRIPT = """
 import asyncio
 import holdfast as hf

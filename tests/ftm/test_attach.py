@@ -78,6 +78,17 @@ async def gone(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> bool:
     return True
 
 
+async def test_a_bounded_mailbox_is_one_again(system: hf.ActorSystem, recovery: Any) -> None:
+    """What was taken out of it makes room."""
+    spec = hf.child("alice", hf.start(Counter), recovery=recovery, mechanism=PBR(), mailbox=hf.bounded(2))
+    ref = await system.start(spec)
+    await detach(system, ref)
+    assert [await ref.ask(Add(tag)) for tag in range(6)] == [1, 2, 3, 4, 5, 6]
+    with pytest.raises(hf.MailboxFull):
+        for tag in range(6, 12):
+            ref.tell(Add(tag))
+
+
 async def test_an_attached_actor_survives_the_death_of_its_primary(system: hf.ActorSystem, recovery: Any) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), recovery=recovery))
     load = Load(ref)

@@ -337,10 +337,17 @@ CHECKS = {
     ),
     "a supervisor in a process hears what its child is protected by now": Check(
         "ftm/subtree.py",
-        "                self._port.to_life(Respec(self._described()))\n",
+        "                self._port.to_life(Respec(self.described()))\n",
         "                pass\n",
         "tests/ftm/test_subtree_changes.py",
         "test_the_new_stack_holds",
+    ),
+    "what waits in the mailbox of a life that leaves its process goes along": Check(
+        "ftm/carried.py",
+        "        queue = pack(guest, cell, (*items, *waiting))\n",
+        "        queue: list[Any] = []\n",
+        "tests/ftm/test_subtree_handing.py",
+        "test_what_waits_goes_along",
     ),
     "a detach that has the state looks whether that still counts": Check(
         "ftm/leaving.py",

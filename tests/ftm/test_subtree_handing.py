@@ -1,0 +1,437 @@
+"""Children without recovery below a supervisor in another process: a mechanism is attached to them and detached again.
+
+They have no home before, and none afterwards: what they have goes along.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import random
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.actors.process.relay import OutsideHost
+from holdfast.checkpoint.subtree import SubtreeHost
+from holdfast.ftm.carrying import IntoProcess, OutOfProcess
+from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.subtree import SubtreeGroup
+from tests.ftm.accounts import Add, Boom, Counter, Later, Load, Tags
+from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
+from tests.ftm.test_subtree import Heard, Watch, Watcher, at, bank, bank_pid
+from tests.ftm.test_subtree_changes import Bad, Slow, Wait, attach, detach, kill_subtree, names_of
+
+# A refused or failed transaction ends with its block.
+# ruff: noqa: PT012
+
+
+def plain(name: str = "alice", recipe: Any = None, **options: Any) -> hf.ChildSpec:
+    return hf.child(name, recipe or hf.start(Counter), **options)
+
+
+class Talk(hf.Message[int]):
+    tag: int
+
+
+class Sibling(hf.Actor):
+    """Tells and asks from within the process."""
+
+    @hf.on(Talk)
+    async def talk(self, message: Talk) -> int:
+        alice = self.ctx.find("/app/bank/alice", Counter)
+        alice.tell(Add(message.tag))
+        return await alice.ask(Add(message.tag + 1), timeout=30.0)
+
+
+class Talking:
+    """One after the other, until it is stopped."""
+
+    def __init__(self, sibling: hf.ActorRef[Any], first: int) -> None:
+        self.first = self.next = first
+        self._stopping = False
+        self._task = asyncio.create_task(self._talk(sibling))
+
+    async def _talk(self, sibling: hf.ActorRef[Any]) -> None:
+        while not self._stopping:
+            await sibling.ask(Talk(self.next), timeout=40.0)
+            self.next += 2
+
+    async def stop(self) -> list[int]:
+        self._stopping = True
+        await self._task
+        return list(range(self.first, self.next))
+
+
+async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.ActorSystem) -> None:
+    """From outside and from a sibling, once and in order; nothing is left of a home."""
+    await system.start(bank(plain(mailbox=hf.bounded(64)), plain("sibling", hf.start(Sibling))))
+    alice = at(system, "alice")
+    load, talking = Load(alice), Talking(at(system, "sibling"), 1_000_000)
+    for _ in range(2):
+        await load.reached(30)
+        await attach(system, alice)
+        assert isinstance(alice._cell.host, SubtreeGroup)
+        await load.reached(30)
+        await two_again(alice)
+        os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+        await load.reached(30)
+        await two_again(alice)
+        await detach(system, alice)
+        assert isinstance(alice._cell.host, OutsideHost)
+        assert system.homes.at(alice.path) is None
+    await load.reached(30)
+    said = await talking.stop()
+    await load.stop()
+    tags = await alice.ask(Tags())
+    assert [tag for tag in tags if tag >= 1_000_000] == said
+    assert not load.failed
+    assert sorted(tag for tag in tags if tag < 1_000_000) == list(range(load.sent))
+    place = {tag: index + 1 for index, tag in enumerate(tags)}
+    assert {tag: place[tag] for tag in load.answered} == load.answered
+    assert system.pid_of(alice) == bank_pid(system)
+
+
+def is_to_rest(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> bool:
+    """Whether whoever lives there has been told to come to rest."""
+    if isinstance(ref._cell.host, SubtreeGroup):
+        return group_of(ref).is_stopping
+    top = system.node.cell_at("/app/bank").host
+    assert isinstance(top, SubtreeHost)
+    return top.at(ref.path).arriving is not None
+
+
+async def test_what_waits_goes_along_in_order_both_ways(system: hf.ActorSystem, tmp_path: Path) -> None:
+    file = tmp_path / "slow"
+    slow = plain(recipe=hf.start(Slow, str(file)))
+    await system.start(bank(slow, plain("sibling", hf.start(Sibling)), plain("other")))
+    alice, sibling = at(system, "alice"), at(system, "sibling")
+    tag = 0
+    for change in (attach, detach):
+        file.touch()
+        waiting: list[Any] = [asyncio.ensure_future(alice.ask(Wait(), timeout=30.0))]
+        alice.tell(Add(tag))
+        waiting.append(asyncio.ensure_future(sibling.ask(Talk(tag + 1), timeout=30.0)))
+        changing = asyncio.ensure_future(change(system, alice))
+        waiting.append(asyncio.ensure_future(alice.ask(Add(tag + 3), timeout=30.0)))
+        async with asyncio.timeout(30):
+            while not is_to_rest(system, alice):
+                await asyncio.sleep(0.005)
+        await at(system, "other").ask(Tags())  # It has been told by now; there is one turn that it waits for.
+        file.unlink()
+        await asyncio.gather(changing, *waiting)
+        tag += 4
+    tags = await alice.ask(Tags())
+    assert sorted(tags) == list(range(8))
+    for first in (0, 4):
+        assert tags.index(first) < tags.index(first + 3)
+        assert tags.index(first + 1) < tags.index(first + 2)
+
+
+async def test_timers_and_ties_go_along(system: hf.ActorSystem) -> None:
+    """Who watches it, inside or outside, hears once of its end; it hears of those it watches."""
+    await system.start(bank(plain(recipe=hf.start(Watching)), plain("inside", hf.start(Watcher))))
+    outside = await system.start(hf.child("outside", hf.start(Watcher)))
+    alice, inside = at(system, "alice"), at(system, "inside")
+    target = await system.start(hf.child("target", hf.start(Counter)))
+    await inside.ask(Watch("monitor"))
+    await outside.ask(Watch("monitor"))
+    await alice.ask(See("/app/target"))
+    await alice.ask(Later(0.3, 7))
+    await attach(system, alice)
+    await system.terminate(target)
+    await seen(alice, ["/app/target"])
+    await ticked(alice, [7])
+    await alice.ask(Later(0.3, 8))
+    await alice.ask(See("/app/target"))
+    await detach(system, alice)
+    await system.terminate(target)
+    await seen(alice, ["/app/target"] * 2)
+    await ticked(alice, [7, 8])
+    house = system.ref("/app/bank", hf.Supervisor)
+    await house.ask(hf.TerminateChild("alice"))
+    for watcher in (inside, outside):
+        assert await watcher.ask(Heard()) == ["down False"]
+
+
+class See(hf.Message[None]):
+    path: str
+
+
+class Seen(hf.Message[list[str]]): ...
+
+
+class Watching(Counter):
+    """Watches others."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.ended: list[str] = []
+
+    @hf.on(See)
+    def see(self, message: See) -> None:
+        self.ctx.monitor(self.ctx.find(message.path, Counter))
+
+    def on_down(self, source: Any, reason: hf.ExitReason, recovering: bool) -> None:
+        self.ended.append(source.path)
+
+    @hf.on(Seen, readonly=True)
+    def told(self, message: Seen) -> list[str]:
+        return self.ended
+
+
+async def seen(ref: hf.ActorRef[Any], paths: list[str]) -> None:
+    async with asyncio.timeout(20):
+        while await ref.ask(Seen()) != paths:
+            await asyncio.sleep(0.01)
+
+
+async def ticked(ref: hf.ActorRef[Any], tags: list[int]) -> None:
+    async with asyncio.timeout(20):
+        while await ref.ask(Tags()) != tags:
+            await asyncio.sleep(0.01)
+
+
+async def test_what_was_attached_or_detached_holds_over_restarts(system: hf.ActorSystem) -> None:
+    """Each life begins afresh, as its spec says then."""
+    await system.start(bank(hf.supervisor("inner", children=[plain("deep")], intensity=1000)))
+    ref = at(system, "inner/deep")
+    assert await ref.ask(Add(0)) == 1
+    await attach(system, ref, LFR())
+    assert await ref.ask(Add(1)) == 2
+    await system.terminate(ref)
+    assert await ref.ask(Add(2), timeout=30.0) == 1
+    assert names_of(ref) == ["lfr"]
+    await kill_subtree(system)
+    ref = at(system, "inner/deep")
+    assert await ref.ask(Add(3), timeout=30.0) == 1
+    assert names_of(ref) == ["lfr"]
+    await detach(system, ref)
+    assert await ref.ask(Add(4)) == 2
+    with pytest.raises(hf.RemoteCrash, match="boom"):
+        await ref.ask(Boom())
+    assert await ref.ask(Add(5), timeout=30.0) == 1
+    assert system.pid_of(ref) == bank_pid(system)
+
+
+class Keep(hf.Message[int]):
+    tag: int
+
+
+class Follow(hf.Message[None]): ...
+
+
+class News(hf.Message[None]):
+    text: str
+
+
+class Read(hf.Message[list[str]]): ...
+
+
+class Open(hf.Message[None]): ...
+
+
+class Keeper(hf.Actor):
+    """Puts aside what comes until it is opened, and follows the news."""
+
+    def __init__(self) -> None:
+        self.is_open = False
+        self.read: list[str] = []
+
+    @hf.on(Keep)
+    def keep(self, message: Keep) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+        self.read.append(str(message.tag))
+        return message.tag
+
+    @hf.on(Open)
+    def open(self, message: Open) -> None:
+        self.is_open = True
+        self.read.clear()
+        self.ctx.unstash()
+
+    @hf.on(Follow)
+    def follow(self, message: Follow) -> None:
+        self.ctx.subscribe("/news")
+
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        self.read.append(message.text)
+
+    @hf.on(Read, readonly=True)
+    def said(self, message: Read) -> list[str]:
+        return [one for one in self.read if not one.isdigit()] if not self.is_open else self.read
+
+
+async def test_what_is_put_aside_and_subscribed_to_goes_along(system: hf.ActorSystem) -> None:
+    await system.start(bank(plain(recipe=hf.start(Keeper))))
+    alice = at(system, "alice")
+    await alice.ask(Follow())
+    kept = []
+    for tag, change in enumerate((attach, detach, None)):
+        kept.append(asyncio.ensure_future(alice.ask(Keep(tag), timeout=30.0)))
+        await system.publish("/news", News("abc"[tag]))
+        assert await alice.ask(Read()) == list("abc"[: tag + 1])
+        if change is not None:
+            await change(system, alice)
+    await alice.ask(Open())
+    assert await asyncio.gather(*kept) == [0, 1, 2]
+    assert await alice.ask(Read()) == ["0", "1", "2"]
+
+
+@pytest.mark.parametrize("victim", ["subtree", "replica"])
+async def test_whatever_dies_while_it_is_handed_over_it_is_there_again(system: hf.ActorSystem, victim: str) -> None:
+    """With a replica nothing is lost; with the subtree the child begins afresh, as the specs say then."""
+    rng = random.Random(f"{SEED} {victim}")
+    await system.start(bank(plain()))
+    tag = 0
+    for change in (attach, detach, attach, detach):
+        alice = at(system, "alice")
+        before = await alice.ask(Tags(), timeout=30.0)
+        answering = [asyncio.ensure_future(alice.ask(Add(tag + number), timeout=30.0)) for number in range(5)]
+        changing = asyncio.ensure_future(change(system, alice))
+        await asyncio.sleep(rng.random() * 0.4)
+        path = "/app/bank" if victim == "subtree" else f"/app/bank/alice/ftm/{rng.choice(['r1', 'r2'])}"
+        pid = system._workers.processes().get(path)
+        if pid is not None:
+            with contextlib.suppress(ProcessLookupError):  # It has just ended.
+                os.kill(pid, signal.SIGKILL)
+        with contextlib.suppress(hf.TransactionFailed, hf.TransactionRefused):
+            await changing
+        said = await asyncio.gather(*answering, return_exceptions=True)
+        alice = await back(system)
+        tags = await alice.ask(Tags(), timeout=30.0)
+        assert len(set(tags)) == len(tags)
+        if victim == "replica":
+            assert said == [len(before) + 1 + number for number in range(5)]
+            assert tags == [*before, *range(tag, tag + 5)]
+        tag += 5
+        with contextlib.suppress(hf.TransactionRefused):  # Then it is as it should be already.
+            await change(system, alice)
+        assert isinstance(alice._cell.host, SubtreeGroup) is (change is attach)
+
+
+@pytest.mark.parametrize("step", ["take", "leave", "come", "settle"])
+async def test_the_process_dies_at_a_step_and_the_child_begins_afresh(
+    system: hf.ActorSystem, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing of the group is left if it was not to be, and nobody who has asked waits for ever."""
+    change, mover = (attach, OutOfProcess) if step in ("take", "leave") else (detach, IntoProcess)
+    await system.start(bank(plain(mechanism=None if change is attach else PBR())))
+    alice, pid, say = at(system, "alice"), bank_pid(system), mover._say
+    asking: list[asyncio.Future[int]] = []
+
+    async def ask(tag: int) -> int:
+        return await alice.ask(Add(tag), timeout=30.0)
+
+    def said(self: Any, which: str, **told: Any) -> None:
+        if which == step and not asking:  # Else it is done again, of the next life.
+            asking.extend(asyncio.ensure_future(ask(tag)) for tag in (1, 2))
+            os.kill(pid, signal.SIGKILL)
+        say(self, which, **told)
+
+    monkeypatch.setattr(mover, "_say", said)
+    assert await alice.ask(Add(0)) == 1
+    with contextlib.suppress(hf.TransactionFailed):
+        await change(system, alice)
+    said_to = await asyncio.gather(*asking, return_exceptions=True)
+    assert not [one for one in said_to if isinstance(one, hf.AskTimeout)]
+    alice = await back(system)
+    tags = await alice.ask(Tags())
+    assert tags in ([], [1], [2], [1, 2])
+    monkeypatch.undo()
+    if not isinstance(alice._cell.host, SubtreeGroup):  # Each step is done, or is not.
+        async with asyncio.timeout(20):
+            while [path for path in system._workers.processes() if path.startswith("/app/bank/alice/ftm")]:
+                await asyncio.sleep(0.01)
+        await attach(system, alice)
+    await detach(system, alice)
+    assert await alice.ask(Add(3)) == len(tags) + 1
+
+
+async def back(system: hf.ActorSystem) -> hf.ActorRef[Any]:
+    """Whoever lives there, when somebody does again."""
+    async with asyncio.timeout(30):
+        while True:
+            with contextlib.suppress(hf.HoldfastError):
+                await at(system, "alice").ask(Tags(), timeout=5.0)
+                return at(system, "alice")
+            await asyncio.sleep(0.01)
+
+
+async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSystem) -> None:
+    await system.start(bank(plain(), plain("bob", mechanism=PBR())))
+    alice, bob = at(system, "alice"), at(system, "bob")
+    loads = Load(alice, clients=2), Load(bob, clients=2)
+    for load in loads:
+        await load.reached(10)
+    with pytest.raises(hf.TransactionFailed):
+        async with system.transaction(timeout=30) as change:
+            change.attach(alice, LFR())
+            change.detach(bob)
+            change.add("/app/bank", hf.child("bad", hf.start(Bad)))
+    assert isinstance(alice._cell.host, OutsideHost)
+    assert names_of(bob) == ["pbr"]
+    for load, ref in zip(loads, (alice, bob), strict=True):
+        await load.reached(10)
+        await load.stop()
+        load.check(await ref.ask(Tags()))
+
+
+@pytest.mark.parametrize("verb", ["attach", "detach"])
+async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tmp_path: Path, verb: str) -> None:
+    file = tmp_path / "slow"
+    file.touch()
+    mechanism = None if verb == "attach" else PBR()
+    await system.start(bank(plain(recipe=hf.start(Slow, str(file)), mechanism=mechanism)))
+    alice = at(system, "alice")
+    waiting = [asyncio.ensure_future(alice.ask(message, timeout=30)) for message in (Wait(), Add(0))]
+
+    async def change(seconds: float) -> None:
+        async with system.transaction(timeout=seconds) as collected:
+            if verb == "attach":
+                collected.attach(alice, PBR())
+            else:
+                collected.detach(alice)
+
+    with pytest.raises(hf.TransactionFailed):
+        await change(1.0)
+    file.unlink()
+    assert await asyncio.gather(*waiting) == [0, 1]
+    await change(30.0)
+    assert await alice.ask(Add(1)) == 2
+
+
+class Unfit(Counter):
+    """Cannot begin a second time as long as there is a file."""
+
+    def __init__(self, file: str) -> None:
+        super().__init__()
+        self._file = file
+        if Path(file).exists():
+            raise RuntimeError("not now")
+
+
+async def test_a_new_life_that_cannot_begin_leaves_the_old_one(system: hf.ActorSystem, tmp_path: Path) -> None:
+    file = tmp_path / "veto"
+    await system.start(bank(plain(recipe=hf.start(Unfit, str(file))), plain("sibling", hf.start(Sibling))))
+    alice, sibling = at(system, "alice"), at(system, "sibling")
+    for number, change in enumerate((attach, detach)):
+        file.touch()
+        load, talking = Load(alice, clients=2), Talking(sibling, 1_000_000 * (number + 1))
+        await load.reached(5)
+        with pytest.raises(hf.TransactionFailed, match="not now"):
+            await change(system, alice)
+        await load.reached(5)
+        said = await talking.stop()
+        await load.stop()
+        assert not load.failed
+        assert [tag for tag in await alice.ask(Tags()) if tag >= 1_000_000 * (number + 1)] == said
+        file.unlink()
+        await change(system, alice)
