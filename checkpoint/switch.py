@@ -41,6 +41,7 @@ from .records import (
     STASHED,
     TICK,
     Answer,
+    Carried,
     Closed,
     Go,
     Ignored,
@@ -389,8 +390,8 @@ class Switch:
                 case Ignored():
                     if self.live is not None and not self.live.done():
                         self.live.set_exception(StartIgnored(self.path, record.why))
-                case Wanted() | Closed():
-                    pass  # for whoever begins lives
+                case Wanted() | Closed() | Carried():
+                    pass  # for whoever begins lives, or hands them over
         except ReplayDiverged as error:
             self.diverged = error
             if self.live is not None and not self.live.done():

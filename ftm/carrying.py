@@ -8,12 +8,11 @@ meanwhile, the child begins afresh with the subtree.
 from __future__ import annotations
 
 import asyncio
-import itertools
 from collections import deque
 from typing import TYPE_CHECKING, Any, cast
 
 from ..actors.cell import GONE, RUNNING, Cell, Host
-from ..actors.control.moving import now
+from ..actors.control.moving import ATTEMPTS, now
 from ..actors.errors import CannotMove, HoldfastError, StartFailed, error_text
 from ..actors.exits import ExitReason, unpack_exit
 from ..actors.mail import Item
@@ -40,7 +39,7 @@ from .unkept import UNKEPT
 if TYPE_CHECKING:
     from ..actors.cell import Admit
 
-ATTEMPTS = itertools.count()
+
 NUMBER = 0
 """Under which the supervisor there wants a life that it has not asked for: it counts its own from 1."""
 

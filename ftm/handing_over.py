@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..actors.cell import RUNNING, Cell
-from ..actors.control.moving import Transit, now
+from ..actors.control.moving import ATTEMPTS, Transit, now
 from ..actors.errors import CannotMove, StartFailed
 from ..actors.exits import unpack_exit
 from ..actors.process import frames
@@ -51,7 +51,7 @@ class OutOfSubtree(ToGroup):
         super().__init__(cell, host, timeout)
         self._new_host = host
         self._place, self._spec, self._worker = place, spec, worker_of(place, cell)
-        self._switch = place.switch
+        self._switch, self._attempt = place.switch, next(ATTEMPTS)
 
     @property
     def is_recorded(self) -> bool:
@@ -71,10 +71,13 @@ class OutOfSubtree(ToGroup):
 
     def _say(self, step: str) -> None:
         connection = self._worker.connection
-        connection.send(frames.Command(connection.name_out(self.cell.path), "move", {"step": step}))
+        data = {"step": step, "attempt": self._attempt}
+        connection.send(frames.Command(connection.name_out(self.cell.path), "move", data))
         connection.flush()
 
     def _said(self, data: dict[str, Any]) -> None:
+        if data.get("attempt") != self._attempt:
+            return
         if data.get("step") == "refused":
             self.give_up(str(data["why"]))
         elif data.get("step") == "taken" and not self.given_up.done():

@@ -5,6 +5,7 @@ What both sides of a process border need is here; who decides is `system/moving.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from ..actor import Actor
     from ..exits import ExitReason
 
+ATTEMPTS = itertools.count(1)
+"""Numbers of attempts to have an actor in another process come to rest: what it says to an earlier one is void."""
 LOOK_AGAIN = 0.005
 """Seconds between two looks at whether background work is over."""
 

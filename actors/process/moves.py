@@ -87,7 +87,7 @@ class GuestMoves:
             case "go":
                 self._go(cell, suspended=bool(data["suspended"]))
             case "take":
-                take = self._take = Take(_number, self._taken, lambda why: self._say("refused", why=why))
+                take = self._take = self._taking(data["attempt"])
                 if cell.state is RUNNING:
                     lives.urge(cell, take)
             case "pack":
@@ -161,10 +161,14 @@ class GuestMoves:
 
     # -- leaving ----------------------------------------------------------------------------------------------------
 
-    def _taken(self, actor: Actor, state: bytes) -> None:
-        self._state = state
-        more = actor.ctx.cell.extra()
-        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=more.suspended)
+    def _taking(self, attempt: int) -> Take:
+        def taken(actor: Actor, state: bytes) -> None:
+            self._state = state
+            more = actor.ctx.cell.extra()
+            rest = {"trap_exits": more.trap_exits, "suspended": more.suspended}
+            self._say("taken", attempt=attempt, at=now(), **rest)
+
+        return Take(_number, taken, lambda why: self._say("refused", attempt=attempt, why=why))
 
     def _pack(self, cell: Cell) -> None:
         """Nothing comes any more: send what there is."""

@@ -11,7 +11,7 @@ from ..cell import RUNNING, Cell, Host
 from ..context import ActorContext
 from ..control.calls import OrderAsk
 from ..control.luggage import unpack, unpack_items
-from ..control.moving import decoded, now, obey_commands, settle, sorted_out, twin
+from ..control.moving import ATTEMPTS, decoded, now, obey_commands, settle, sorted_out, twin
 from ..errors import AskFailed, StartFailed, error_text
 from ..exits import KILLED, ExitReason
 from ..links import Monitor
@@ -34,7 +34,7 @@ class FromProcess(Move):
 
     def __init__(self, cell: Cell, host: Host, timeout: float, worker: Worker) -> None:
         super().__init__(cell, host, timeout)
-        self.worker = worker
+        self.worker, self.attempt = worker, next(ATTEMPTS)
         self.taken: asyncio.Future[None] = self.node.loop.create_future()
         self.dead: ExitReason | None = None  # the old process has died meanwhile
         self.trap_exits = self.suspended = False
@@ -49,10 +49,13 @@ class FromProcess(Move):
     def say(self, step: str) -> None:
         """Tell the old process."""
         connection = self.worker.connection
-        connection.send(frames.Command(connection.name_out(self.cell.path), "move", {"step": step}))
+        data = {"step": step, "attempt": self.attempt}
+        connection.send(frames.Command(connection.name_out(self.cell.path), "move", data))
         connection.flush()
 
     def _said(self, data: dict[str, Any]) -> None:
+        if data.get("attempt", self.attempt) != self.attempt:
+            return
         match data.get("step"):
             case "refused":
                 self.give_up(str(data["why"]))

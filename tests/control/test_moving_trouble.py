@@ -15,6 +15,7 @@ from tests.control.movers import (
     Fussy,
     Leaves,
     Work,
+    Worker,
     lives_in,
     moved,
 )
@@ -167,3 +168,28 @@ async def test_the_old_process_ends_after_a_move(system: hf.ActorSystem, recover
                 break
             await asyncio.sleep(0.01)
     assert await one.ask(Add(1)) == 1
+
+
+async def test_what_was_said_of_an_earlier_attempt_counts_for_nothing(
+    system: hf.ActorSystem, recovery: Any, tmp_path: Path
+) -> None:
+    """An attempt that was given up has the word "at rest" on its way, when the next one begins."""
+    one = await system.start(hf.child("one", hf.start(Worker), recovery=recovery, isolation="process"))
+    gate = tmp_path / "gate"
+    one.tell(Work(str(gate)))
+    assert await one.ask(Add(1)) == 1
+    process = system._workers.of(one._cell)
+    assert process is not None
+    nobody = process.on_move
+    moving = asyncio.ensure_future(system.set_isolation(one, "task", timeout=30.0))
+    while process.on_move is nobody:
+        await asyncio.sleep(0)
+    process.on_move({"step": "taken", "attempt": 0, "at": 0.0, "trap_exits": False, "suspended": False})
+    assert await one.ask(Add(1)) == 2
+    assert lives_in(system, one) == "process"
+    gate.touch()
+    await moving
+    async with asyncio.timeout(30):
+        while await one.ask(Add(0)) != 102:
+            await asyncio.sleep(0.005)
+    assert lives_in(system, one) == "task"

@@ -97,9 +97,10 @@ async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) ->
                 await protocol.ask(order)
             with pytest.raises(hf.HoldfastError):
                 await replica.ask(order)
-        for order in (Assume(False), EndBricks(["before"])):
+        own: tuple[Any, ...] = (Assume(False), EndBricks(["before"]))
+        for its in own:
             with pytest.raises(hf.HoldfastError):
-                await replica.ask(order)  # type: ignore[type-var]
+                await replica.ask(its)
         with pytest.raises(Refused, match="forged"):
             await replica.ask(Opened(0))
         node.cell_at("/app/c/ftm/proxy").ref.tell(Stalled(group.primary, group.epoch, 0))
