@@ -28,6 +28,7 @@ from holdfast.actors.errors import (
     MailboxFull,
     NameTaken,
     NoSuchActor,
+    NotGranted,
     NotSuspended,
     ProcessUnavailable,
     Quarantined,
@@ -41,6 +42,7 @@ from holdfast.actors.errors import (
     TreeFailed,
     UnknownMessage,
     WrongActor,
+    WrongThread,
 )
 from holdfast.actors.events import (
     ActorCrashed,
@@ -69,6 +71,7 @@ from holdfast.actors.events import (
     RecoveryFailed,
     RecoveryHookFailed,
     RecoveryPhase,
+    RecoveryTableUnused,
     ReplayPaced,
     RolledBack,
     SafeStateEntered,
@@ -80,8 +83,10 @@ from holdfast.actors.events import (
     SnapshotDamaged,
     SnapshotFailed,
     SnapshotTaken,
+    StopOverdue,
     StoreRefused,
     SupervisorGaveUp,
+    TrustBreached,
     TurnBegan,
     TurnEnded,
     TurnsLost,
@@ -117,7 +122,7 @@ from holdfast.checkpoint.compared import StateDiverged
 from holdfast.checkpoint.due import CheckpointFailed
 from holdfast.checkpoint.file import RecoveryFile, load_recovery
 from holdfast.checkpoint.groups import NoSuchGroup
-from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed, StoreInUse
+from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StaleEpoch, StoreFailed, StoreInUse
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
 from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.checkpoint.readonly import NotReadonly
@@ -138,6 +143,7 @@ from holdfast.supervision.admin import (
     ChildBusy,
     ChildCounts,
     ChildInfo,
+    ChildParked,
     CountChildren,
     DeleteChild,
     GetChildSpec,
@@ -173,6 +179,7 @@ from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, ch
 from holdfast.supervision.supervisor import Supervisor
 from holdfast.supervision.tasks import Tasks, tasks
 from holdfast.supervision.tree import supervisor
+from holdfast.system.portal import ThreadPortal
 from holdfast.system.run import run
 from holdfast.system.script import UntrustedFile
 from holdfast.system.system import ActorSystem
@@ -196,6 +203,7 @@ if TYPE_CHECKING:
         MechanismAttached,
         MechanismChanged,
         MechanismDetached,
+        MechanismSettled,
         ReplicaFaulty,
         ReplicaJoined,
         ReplicaLost,
@@ -211,10 +219,13 @@ if TYPE_CHECKING:
     from holdfast.ftm.mechanisms.sec import SEC
     from holdfast.ftm.mechanisms.tmr import TMR
     from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.protected import ProtectionStatus
     from holdfast.ftm.sealed import FrameRefused
-    from holdfast.ftm.sec.authority import CertificationAuthority
+    from holdfast.ftm.sec.authority import CertificationAuthority as CertificationAuthority  # not in `__all__`
     from holdfast.ftm.voters import NoMajority
     from holdfast.system.protection import AdaptationUndone
+
+__version__ = "0.1.0"
 
 __all__ = [
     "AD",
@@ -242,13 +253,13 @@ __all__ = [
     "Calls",
     "CannotAdapt",
     "CannotMove",
-    "CertificationAuthority",
     "Change",
     "ChangeSupervisor",
     "CheckpointFailed",
     "ChildBusy",
     "ChildCounts",
     "ChildInfo",
+    "ChildParked",
     "ChildRestarted",
     "ChildSpec",
     "ChildStartFailed",
@@ -270,6 +281,7 @@ __all__ = [
     "Failed",
     "FailedOver",
     "Flags",
+    "ForeignStore",
     "FrameRefused",
     "GetChildSpec",
     "Held",
@@ -299,6 +311,7 @@ __all__ = [
     "MechanismChanged",
     "MechanismDetached",
     "MechanismRefused",
+    "MechanismSettled",
     "Message",
     "MessageIn",
     "MessageOut",
@@ -320,6 +333,7 @@ __all__ = [
     "Normal",
     "NotAnActor",
     "NotDeterministic",
+    "NotGranted",
     "NotQuarantined",
     "NotReadonly",
     "NotSupported",
@@ -344,6 +358,7 @@ __all__ = [
     "ProgramInput",
     "ProgramStatus",
     "ProtectionLost",
+    "ProtectionStatus",
     "Quarantined",
     "QuarantinedMessage",
     "RB",
@@ -354,6 +369,7 @@ __all__ = [
     "RecoveryHooks",
     "RecoveryPhase",
     "RecoveryStep",
+    "RecoveryTableUnused",
     "Refusal",
     "Registry",
     "RegistryActor",
@@ -397,6 +413,7 @@ __all__ = [
     "Statistics",
     "Status",
     "Step",
+    "StopOverdue",
     "StoreError",
     "StoreFailed",
     "StoreInUse",
@@ -408,6 +425,7 @@ __all__ = [
     "TaskSupervisor",
     "Tasks",
     "TerminateChild",
+    "ThreadPortal",
     "Timer",
     "TransactionBegan",
     "TransactionCommitted",
@@ -415,6 +433,7 @@ __all__ = [
     "TransactionRefused",
     "TransactionRolledBack",
     "TreeFailed",
+    "TrustBreached",
     "TurnBegan",
     "TurnEnded",
     "TurnHung",
@@ -428,6 +447,8 @@ __all__ = [
     "Wrapped",
     "WrongActor",
     "WrongSuspicion",
+    "WrongThread",
+    "__version__",
     "bounded",
     "calls",
     "check_children",
@@ -460,7 +481,8 @@ __all__ = [
     "wrap",
 ]
 
-# Most programs protect nobody: what they do not use is not imported.
+# Most programs protect nobody: what they do not use is not imported. What needs an extra is not in `__all__`, so that
+# `from holdfast import *` needs none.
 _LAZY = {
     "AD": "holdfast.ftm.mechanisms.ad",
     "CertificationAuthority": "holdfast.ftm.sec.authority",
@@ -478,10 +500,12 @@ _LAZY = {
     "MechanismChanged": "holdfast.ftm.events",
     "AdaptationUndone": "holdfast.system.protection",
     "MechanismRefused": "holdfast.ftm.mechanism",
+    "MechanismSettled": "holdfast.ftm.events",
     "NVP": "holdfast.ftm.mechanisms.nvp",
     "NoMajority": "holdfast.ftm.voters",
     "PBR": "holdfast.ftm.mechanisms.pbr",
     "ProtectionLost": "holdfast.ftm.alarms",
+    "ProtectionStatus": "holdfast.ftm.protected",
     "RB": "holdfast.ftm.mechanisms.rb",
     "ReplicaFaulty": "holdfast.ftm.events",
     "ReplicaJoined": "holdfast.ftm.events",

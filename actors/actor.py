@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 import typing
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast, overload
 
 import msgspec
@@ -110,14 +110,32 @@ class Actor:
     """What a snapshot saves; None saves every instance attribute without a leading underscore."""
     schema_version: ClassVar[int] = 1
     """Raise it when the saved state changes its shape."""
+    formerly: ClassVar[tuple[str, ...]] = ()
+    """Classes, as "module:Class", whose records this one takes over: its own earlier names, or what it replaces."""
 
+    _keeps_promises: ClassVar[bool] = False
+    """Whether its reply handles belong to the address: the next life answers, or whatever `node.kept` has of it."""
     _table: ClassVar[Table] = Table()
     _declared: ClassVar[dict[type, Handles]] = {}
     _topics: ClassVar[tuple[str, ...]] = ()
     _bindings: ClassVar[frozenset[str]] = frozenset()
+    _is_part: ClassVar[bool] = False
+    """Whether it is a part of the runtime: from another process only who was granted its address speaks to it."""
+
+    @classmethod
+    def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
+        """Addresses to which an actor that begins so may give orders from its process, besides what it starts."""
+        return ()
+
+    @classmethod
+    def _speaks_for(cls, start: Start[Any]) -> tuple[str, ...]:
+        """Addresses besides its own of which an actor that begins so may tell events from its process."""
+        return ()
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
+        if inspect.iscoroutinefunction(cls.__init__):
+            raise TypeError(f"{type_name(cls)}.__init__ cannot be async: what has to be awaited goes into on_start")
         table, declared, topics = Table(), dict[type, Handles](), list[str]()
         for name in dir(cls):
             handler = inspect.getattr_static(cls, name)
@@ -127,6 +145,8 @@ class Actor:
                     raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
                 table[handles.kind] = in_thread(handler) if handles.to_thread else handler
                 declared[handles.kind] = handles
+            if getattr(handler, "__topics__", ()) and not getattr(handler, "__handles__", ()):
+                raise TypeError(f"{type_name(cls)}.{name} has @subscribe without @on: nothing would ever reach it")
             topics.extend(getattr(handler, "__topics__", ()))
         _check_state(cls)
         cls._table, cls._declared, cls._topics = table, declared, tuple(topics)
@@ -136,7 +156,11 @@ class Actor:
         """Called first at each life, `restored` says whether state came back; may be async. Turn 0."""
 
     def on_stop(self, reason: ExitReason) -> Any:
-        """Called last, also after a crash, but not when killed; may be async."""
+        """Called last, at every end in good order and after a crash; may be async.
+
+        Not called when the life is killed, when its start failed, or when an EXIT ends it that it does not trap. If it
+        returns an exit reason, that becomes the life's own; if it raises, so does the crash, unless there was one.
+        """
 
     def on_exit(self, source: ActorRef[Any], reason: ExitReason) -> Any:
         """A linked actor ended, and this one traps exits (`ctx.trap_exits`)."""
@@ -165,6 +189,14 @@ class Actor:
     def _state_root(self) -> Any:
         """Whose attributes the key variables are."""
         return self
+
+    def _outside(self) -> Iterable[Coroutine[Any, Any, Any]]:
+        """What it does outside its turns, and waits."""
+        return ()
+
+    def _is_starting(self) -> bool:
+        """Whether the start goes on though `on_start` has returned; the end of it is `lives.came_up`."""
+        return False
 
     async def _stop_children(self) -> None:
         """The life ends: its children go first, newest first."""

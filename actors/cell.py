@@ -9,10 +9,10 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from . import mailbox
-from .errors import ActorStopped, UnknownMessage, type_name
+from .errors import ActorStopped, BadMessage, UnknownMessage, type_name
 from .exits import SHUTDOWN, ExitReason
-from .mail import AnyTable, Item, Table
-from .message import Message
+from .mail import AnyTable, Ask, Item, Table
+from .message import Message, Order, why_no_message
 from .ref import ActorRef
 
 if TYPE_CHECKING:
@@ -64,6 +64,11 @@ class Host(Protocol):
         """Put an item of the runtime's own in its place behind the messages."""
         ...
 
+    def progress(self, cell: Cell) -> object:
+        """How far the start that is under way has come: it is another value when it has come further, and while it
+        waits for somebody else. None: it has no steps."""
+        ...
+
     def recovers(self, reason: ExitReason) -> bool:
         """Whether a life that ended for this reason is brought back with its state."""
         ...
@@ -80,8 +85,16 @@ class Host(Protocol):
         """Whether a life takes messages now: it has started, and is not being recovered."""
         ...
 
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
+        ...
+
     def backlog(self, cell: Cell) -> int:
         """Messages that wait, as far as is known in this process."""
+        ...
+
+    def load(self, cell: Cell) -> int:
+        """Messages that wait and those in hand, as far as is known in this process; cheap, for it may be a guess."""
         ...
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
@@ -137,7 +150,7 @@ class More:
         self.enders: list[asyncio.Future[ExitReason]] | None = None
         self.has_ties = False  # whether any of the collections was made
         self.last: Actor | None = None  # the actor of the ended life, if it wants what stays undelivered
-        self.outlet: Any = None  # the way into another process (process.remote.Outlet)
+        self.outlet: Any = None  # what messages go through: the way into another process, or the actor's home
         self.reason: ExitReason = SHUTDOWN
         self.start: Start[Any] | None = None
         self.start_error: StartFailed | None = None  # why `on_start` of this life failed; told when it has ended
@@ -240,9 +253,15 @@ class Cell(_Hot):
         """Refuse what no handler is there for.
 
         Raises:
-            UnknownMessage: the class is known and handles nothing of this type.
+            UnknownMessage: the class is known and handles nothing of this type. BadMessage: this is no message.
+            NotGranted: it is an order, and this process may give none there.
         """
+        if isinstance(message, Order) and self.node.uplink is not None:
+            self.node.uplink.require_granted(self.path, type_name(type(message)))
         if not self.table.knows(type(message)):
+            problem = why_no_message(message)
+            if problem:
+                raise BadMessage(self.path, type_name(type(message)), problem)
             raise UnknownMessage(self.path, type_name(type(message)))
 
     def push(self, item: Item) -> None:
@@ -279,14 +298,30 @@ class Cell(_Hot):
             self.scheduled = True
             self.node.make_ready(self)
 
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now, wherever and however the actor lives; nobody begins to wait.
+
+        Only a mailbox whose policy is to wait, a journal at its limit and a process that does not keep up say no.
+        """
+        more = self.more
+        if more is None:
+            return True
+        if more.outlet is not None and not more.outlet.has_room:
+            return False
+        return more.bound is None or more.bound.has_room(self)
+
     def room(self) -> asyncio.Future[None] | None:
         """None when a message would be taken now; else a future that ends when it is worth trying again.
 
         Raises:
             ActorStopped: the address has ended for good.
         """
-        if self.state is GONE and self.node.successor(self) is None:
-            raise ActorStopped(self.path)
+        if self.state is GONE:
+            successor = self.node.successor(self)
+            if successor is None:
+                raise ActorStopped(self.path)
+            return successor.room()
         more = self.more
         if more is None:
             return None

@@ -6,6 +6,8 @@ what was asked. Nothing that comes over a wire makes this process import or cons
 
 from __future__ import annotations
 
+import copy
+import functools
 import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol
@@ -15,15 +17,18 @@ import msgspec
 from .errors import (
     AskFailed,
     BadMessage,
+    DamagedValue,
     HoldfastError,
     RemoteCrash,
     UnknownMessage,
+    error_text,
     rebuild_error,
     remote_crash,
     type_name,
 )
 from .message import Message, Refusal, UnknownRefusal, find_refusal, message_name, reply_type
 from .ref import ActorRef
+from .values.arrays import described_dtype
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -32,6 +37,9 @@ MAX_BYTES = 16 * 1024 * 1024
 """The largest message, in bytes of payload."""
 
 REF, ARRAY, PACKED, EXTENSIONS = 1, 2, 3, (1, 2, 3)
+
+LONGEST_HEAD = 64 * 1024
+"""Bytes that dtype and shape of an array may take."""
 
 Raw = msgspec.Raw
 
@@ -90,6 +98,25 @@ class Codec:
             raise BadMessage(actor, type_name(type(value)), too_large(value, len(body)))
         return body
 
+    def encode_alike(self, value: object, actor: str, declared: Any = None) -> bytes:
+        """As `encode`, and the same bytes in each process: a set's are in the order of its members' own bytes.
+
+        Args:
+            value: what is sent. A set counts where a type declares one, not where it says Any or nothing.
+            actor: for whom it is.
+            declared: the type that it was declared with; that of the value if left out.
+
+        Raises:
+            BadMessage: as `encode`.
+        """
+        if not holds_set(type(value) if declared is None else declared):
+            return self.encode(value, actor)
+        try:
+            same = alike(value)
+        except Exception as error:  # As in `encode`.
+            raise BadMessage(actor, type_name(type(value)), unencodable(value, error)) from error
+        return self.encode(same, actor)
+
     def parcel(self, message: Message[Any], actor: str) -> Parcel:
         """A message, encoded."""
         return Parcel(message_name(type(message)), self.encode(message, actor))
@@ -135,6 +162,15 @@ class Codec:
         except msgspec.DecodeError as error:
             raise BadMessage(cell.path, name.replace(":", "."), str(error)) from error
 
+    def opened(self, cell: Cell, message: object) -> object:
+        """A message for a cell, decoded if it is still packed; as it is if the cell's class does not know its type."""
+        if type(message) is not Parcel:
+            return message
+        try:
+            return self.decode(cell.table.kind_named(message.name), message.body)
+        except (UnknownMessage, msgspec.DecodeError):
+            return message
+
     def reply_decoder(self, message: type[Message[Any]]) -> Callable[[Any], Any]:
         """What decodes the reply to one message type, made once; it may raise more than `decode_reply` does."""
         decode = self._reply_decoders.get(message)
@@ -162,14 +198,20 @@ class Codec:
         if isinstance(error, Refusal):
             schema = type(error).schema()
             fields = schema(*(getattr(error, name) for name in schema.__struct_fields__))
-            return "refusal", message_name(type(error)), self.encode(fields, "")
+            return "refusal", message_name(type(error)), self.encode_alike(fields, "", schema)
         if isinstance(error, HoldfastError) and not isinstance(error, RemoteCrash):
             return "error", type_name(type(error)), self.encode(error.args, "")
         crash = remote_crash(error)
         return "crash", "", self.encode((crash.type_name, crash.text, crash.traceback), "")
 
     def decode_error(self, kind: str, name: str, body: Any) -> HoldfastError:
-        """The error that another process sent."""
+        """The error that another process sent; if it is none that can be made here, that is said."""
+        try:
+            return self._decode_error(kind, name, body)
+        except Exception as error:  # It is made of what another process says: the parameters need not fit.
+            return BadMessage("reply", name or kind, f"an error that cannot be made: {error_text(error)}")
+
+    def _decode_error(self, kind: str, name: str, body: Any) -> HoldfastError:
         if kind == "refusal":
             found = find_refusal(name)
             if found is None:
@@ -198,6 +240,52 @@ def encode_special(value: Any) -> Any:
     raise TypeError(f"a value of type {type_name(type(value))} cannot be sent")
 
 
+def _holds_set(declared: Any) -> bool:
+    """Whether there is a set somewhere in what this type declares.
+
+    >>> holds_set(dict[str, list[frozenset[str]]]), holds_set(dict[str, float]), holds_set(Any), holds_set(set)
+    (True, False, False, True)
+    """
+    try:
+        waiting: list[Any] = [msgspec.inspect.type_info(declared)]
+    except Exception:  # It is no type that a payload is decoded as: the codec says so, in its own words.
+        return False
+    seen: set[int] = set()
+    while waiting:
+        part = waiting.pop()
+        if isinstance(part, (msgspec.inspect.SetType, msgspec.inspect.FrozenSetType)):
+            return True
+        if isinstance(part, (msgspec.inspect.Type, msgspec.inspect.Field)) and id(part) not in seen:
+            seen.add(id(part))
+            waiting.extend(getattr(part, name) for name in part.__struct_fields__)
+        elif isinstance(part, tuple):
+            waiting.extend(part)
+    return False
+
+
+holds_set: Callable[[Any], bool] = functools.cache(_holds_set)
+"""Whether there is a set somewhere in what a type declares."""
+
+
+def alike(value: Any) -> Any:
+    """The value with each set as a list in the order of its members' bytes; what holds none may be the same object."""
+    if isinstance(value, (set, frozenset)):
+        members = [alike(member) for member in value]
+        return sorted(members, key=lambda member: msgspec.msgpack.encode(member, enc_hook=encode_special))
+    if isinstance(value, (list, tuple)):
+        return [alike(part) for part in value]
+    if isinstance(value, dict):
+        return {key: alike(part) for key, part in value.items()}
+    kind = type(value)
+    if not holds_set(kind):
+        return value
+    made = copy.copy(value)
+    put = msgspec.structs.force_setattr if isinstance(value, msgspec.Struct) else object.__setattr__
+    for field in msgspec.inspect.type_info(kind).fields:  # type: ignore[attr-defined]
+        put(made, field.name, alike(getattr(value, field.name)))
+    return made
+
+
 def encode_array(array: Any) -> bytes:
     """dtype, shape and the elements in C order, in one copy."""
     if array.dtype.hasobject:
@@ -217,10 +305,17 @@ def decode_array(data: memoryview) -> Any:
     import numpy as np
 
     length = int.from_bytes(data[:4], "little")
+    if length > LONGEST_HEAD:
+        raise msgspec.ValidationError(f"the head of an array has {length} bytes")
     kind, shape = msgspec.msgpack.decode(data[4 : 4 + length], type=tuple[Any, tuple[int, ...]])
-    dtype = np.dtype(kind if isinstance(kind, str) else [tuple(field) for field in kind])
+    try:
+        dtype = described_dtype(kind)
+    except DamagedValue as error:
+        raise msgspec.ValidationError(error.problem) from error
     if dtype.hasobject:
         raise msgspec.ValidationError("an array of objects is not accepted")
+    if min(shape, default=0) < 0:
+        raise msgspec.ValidationError(f"an array cannot have the shape {shape}")
     count = 1
     for extent in shape:
         count *= extent

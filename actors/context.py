@@ -10,13 +10,13 @@ from collections.abc import Awaitable, Callable, Coroutine
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 from . import links, mailbox
-from .errors import ActorStopped, AskDeadlock, HoldfastError
+from .errors import ActorStopped, AskDeadlock, HoldfastError, remote_crash
 from .exits import NORMAL, ExitReason
 from .links import Monitor
 from .mail import Ask, Chain, Envelope, Item, ReplyHandle
 from .message import Message
 from .timers import Timer
-from .topics import NOT_TAKEN
+from .topics import NOT_TAKEN, publish
 
 if TYPE_CHECKING:
     from .actor import Actor, Start
@@ -104,7 +104,7 @@ class ActorContext:
         """Send and wait until it is accepted."""
         self._alive()
         while (room := cell.room()) is not None:
-            await mailbox.wait_for(cell, room)
+            await room
             self._alive()
         if type(message) not in cell.table:
             cell.require(message)
@@ -188,20 +188,26 @@ class ActorContext:
         """The asks for which there are reply handles; those that are over may be among them."""
         return tuple(self._promised or ())
 
+    def hand_on_promises(self) -> None:
+        """The actor lives elsewhere now, and answers from there."""
+        self._promised = None
+
     async def publish(self, topic: str, message: Message[Any]) -> None:
-        """Publish from this actor; waits for room at bounded subscribers."""
+        """Publish from this actor, and return when every subscriber has accepted; it waits for room at bounded ones."""
         uplink = self.cell.node.uplink
         if uplink is not None:  # The subscribers are known to the root only.
             self._alive()
             await uplink.publish(topic, message, self.cell)
             return
-        node = self.cell.node
-        for cell in node.topics.subscribers(topic):
+
+        async def send(cell: Cell) -> None:
             try:
                 await self.send(cell, message)
-            except NOT_TAKEN as error:
-                self._alive()
-                node.not_taken(cell, message, error)
+            except NOT_TAKEN:
+                self._alive()  # Else it is this life that is over, and no fault of the subscriber's.
+                raise
+
+        await publish(self.cell.node, topic, message, send)
 
     async def flush(self) -> None:
         """Release what this turn has sent so far (a journaled actor otherwise releases at the end of the turn)."""
@@ -229,7 +235,8 @@ class ActorContext:
         Args:
             work: what is awaited, in a task that ends with this life.
             then: makes the message from the result.
-            failed: makes a message from an exception; without it an exception crashes this actor.
+            failed: makes a message from what the work raised, CancelledError if it was cancelled; without it that
+                crashes this actor. What `then` or `failed` raises does too, and so does what is no message of its.
         """
         self._alive()
         tasks = self.cell.extra().tasks
@@ -239,15 +246,35 @@ class ActorContext:
 
     async def _pipe(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> None:
         try:
-            result = await work
-        except asyncio.CancelledError:
-            raise
+            outcome = Piped(await self._outcome(work, then, failed), None)
         except BaseException as error:
-            outcome: Item = Piped(None if failed is None else failed(error), error)
-        else:
-            outcome = Piped(then(result), None)
+            outcome = Piped(None, self._uncaught(error))
         if not self.closed:
             self.cell.push(outcome)
+
+    async def _outcome(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> Message[Any]:
+        """The message that background work ends with, whatever becomes of it.
+
+        Raises what the work raised, if nobody takes that, or what a callback did.
+        """
+        try:
+            result = await work
+        except BaseException as error:
+            if self.closed or failed is None:
+                raise
+            message: Message[Any] = failed(error)
+        else:
+            message = then(result)
+        self.cell.require(message)
+        return message
+
+    def _uncaught(self, error: BaseException) -> BaseException:
+        """What the end of background work crashes this actor with; raises it if this life is over."""
+        if self.closed:
+            raise error
+        if isinstance(error, asyncio.CancelledError):  # By whoever else had the work in hand; that is no result.
+            return HoldfastError(f"{self.path}: work that was given to pipe_to_self was cancelled")
+        return error
 
     # -- stash ------------------------------------------------------------------------------------------------------
 
@@ -384,15 +411,28 @@ class ActorContext:
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         """A background task that ends with this life; an exception in it crashes the actor."""
         self._alive()
-        task = self.cell.node.loop.create_task(work, name=f"task of {self.path}")
+        task = self.cell.node.loop.create_task(contained(work), name=f"task of {self.path}")
         self.cell.extra().tasks.add(task)
         task.add_done_callback(self._task_done)
+        task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
         return task
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         self.cell.extra().tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
-            self.cell.push(Piped(None, error))
+            self.cell.push(Piped(None, error.__cause__ if isinstance(error.__cause__, SystemExit) else error))
+
+
+async def contained(work: Coroutine[Any, Any, T]) -> T:
+    """Run `work` in a task: what asyncio would let end the whole program ends whoever waits for this.
+
+    Raises:
+        RemoteCrash: in place of SystemExit and KeyboardInterrupt.
+    """
+    try:
+        return await work
+    except (SystemExit, KeyboardInterrupt) as error:
+        raise remote_crash(error) from error
 
 
 class Stashed(Envelope, eq=False):
@@ -415,6 +455,8 @@ class Piped(Item):
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         if item.message is None:
+            if isinstance(item.error, KeyboardInterrupt):
+                raise remote_crash(item.error) from item.error
             raise item.error
         return actor._table[type(item.message)](actor, item.message)
 

@@ -7,7 +7,8 @@ HoldfastError
 │   ├── UnknownMessage   the receiver has no handler for this type
 │   ├── BadMessage       a field cannot be coded, or has the wrong type, or the frame is too large
 │   ├── AskDeadlock      the receiver waits, directly or not, for this very asker
-│   └── ActorRestarting  the receiver is between two lives, and the asker did not want to wait
+│   ├── ActorRestarting  the receiver is between two lives, and the asker did not want to wait
+│   └── WrongThread      called from another thread than the system's
 ├── AskTimeout           no reply before the deadline (`handled` says whether the turn may have run)
 ├── AskFailed            the receiver ended in the middle of the turn
 ├── RemoteCrash          the receiver's handler raised
@@ -19,6 +20,7 @@ HoldfastError
 ├── ControlFailed        an order to a live actor could not be carried out; the actor is as before
 │   └── NotSuspended     the order is for suspended actors only
 ├── CannotMove           an actor cannot be moved to another task or process; it goes on where it lives
+├── NotGranted           an actor in a process gave an order to one that it has neither started nor is bound to
 ├── NameTaken            a living actor has this name already
 ├── NoSuchActor          nobody lives at this address
 ├── WrongActor           another class lives at this address
@@ -118,6 +120,20 @@ class ActorRestarting(SendError):
         return f"{self.actor} is being restarted; the message was not sent, try again"
 
 
+class WrongThread(SendError):
+    """An actor was called from another thread than its system's: nothing was sent. Use `system.from_thread()` there."""
+
+    def __init__(self, actor: str, thread: str) -> None:
+        super().__init__(actor, thread)
+        self.actor, self.thread = actor, thread
+
+    def __str__(self) -> str:
+        return (
+            f"{self.actor} was called from thread {self.thread!r}, but its system runs in another one, and nothing was "
+            "sent: use a handle made by system.from_thread() in threads"
+        )
+
+
 class AskTimeout(HoldfastError):
     """No reply before the deadline.
 
@@ -147,13 +163,16 @@ class AskFailed(HoldfastError):
 class RemoteCrash(HoldfastError):
     """The receiver's handler raised; the actor crashed.
 
-    The same class in one process and across processes, so that isolation changes nothing.
+    The same class in one process and across processes, so that isolation changes nothing. Where it is printed, the
+    receiver's traceback is printed with it: as its cause, or, from another process, as a note.
     """
 
     def __init__(self, type_name: str, text: str, traceback: str = "") -> None:
         super().__init__(type_name, text, traceback)
         self.type_name, self.text = type_name, text
         self._traceback = traceback
+        if traceback:
+            self.add_note(f"The actor's traceback, in its process:\n\n{traceback.rstrip()}")
 
     @property
     def traceback(self) -> str:
@@ -168,17 +187,27 @@ class RemoteCrash(HoldfastError):
 
 
 class ReplayDiverged(HoldfastError):
-    """A replayed turn released an output that differs from the one released before the crash."""
+    """A replayed turn went another way than before the crash: another output or reply, or no end at all.
 
-    def __init__(self, actor: str, turn: int, output: int) -> None:
-        super().__init__(actor, turn, output)
-        self.actor, self.turn, self.output = actor, turn, output
+    `cause` says what it did, where that is known; else its `output` differs, counted from 1.
+    """
+
+    def __init__(self, actor: str, turn: int, output: int, cause: str = "") -> None:
+        super().__init__(actor, turn, output, cause)
+        self.actor, self.turn, self.output, self.cause = actor, turn, output, cause
 
     def __str__(self) -> str:
-        return (
-            f"replay of {self.actor} diverged at turn {self.turn}, output {self.output}: the handler is not "
-            "deterministic; use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
-        )
+        where = f"replay of {self.actor} diverged at turn {self.turn}"
+        if self.cause:
+            return f"{where}: {self.cause}"
+        return f"{where}, output {self.output}: it is not what it was before the crash; {DIVERGES}"
+
+
+DIVERGES = (
+    "the handler's code was changed, or it reads what no snapshot holds (an attribute with a leading underscore that a "
+    "turn has set, or the world): use ctx.now(), ctx.random and ctx.uuid(), or set deterministic = False"
+)
+"""Why a replay goes another way."""
 
 
 class Quarantined(HoldfastError):
@@ -255,6 +284,20 @@ class CannotMove(HoldfastError):
 
     def __str__(self) -> str:
         return f"{self.actor} cannot be moved: {self.why}"
+
+
+class NotGranted(HoldfastError):
+    """An actor in a process gave an order (stop, start a child) to one it has not started: bind it to that one."""
+
+    def __init__(self, actor: str, order: str, by: str) -> None:
+        super().__init__(actor, order, by)
+        self.actor, self.order, self.by = actor, order, by
+
+    def __str__(self) -> str:
+        return (
+            f"{self.by} lives in a process and may not order {self.actor} ({self.order}): orders go to what it has "
+            f"started and to what it is bound to, child(..., bindings={{'port': {self.actor!r}}})"
+        )
 
 
 class NameTaken(HoldfastError):

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import functools
+import typing
 from collections import deque
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -11,6 +13,8 @@ import msgspec
 
 from .errors import portable
 from .exits import ExitReason, pack_exit, unpack_exit
+from .mail import Item, item_name
+from .message import Message, MessageText, message_of
 
 
 class Event(msgspec.Struct, frozen=True, eq=False):
@@ -26,7 +30,7 @@ class ActorStarted(Event, frozen=True, eq=False):
 
 
 class ActorCrashed(Event, frozen=True, eq=False):
-    """User code raised; `item` is what was being handled."""
+    """User code raised; `item` is what was being handled (from another process: as text that knows its type)."""
 
     life: int
     reason: ExitReason
@@ -54,16 +58,25 @@ class DeadLetter(Event, frozen=True, eq=False):
 
 
 class ChildRestarted(Event, frozen=True, eq=False):
-    """A supervisor started a child again; `attempt` counts within one failure."""
+    """A supervisor starts a child again.
+
+    `attempt` counts the restarts of all its children within its period, this one included; `allowed` is its intensity.
+    """
 
     reason: ExitReason
     attempt: int
+    allowed: int = 0
 
 
 class ChildTerminated(Event, frozen=True, eq=False):
-    """A child ended by itself: told of every end of a permanent child, and of abnormal ends of the others."""
+    """A child ended by itself: told of every end of a permanent child, and of abnormal ends of the others.
+
+    `restarts` are those of its supervisor's children within the period so far, `allowed` is its intensity.
+    """
 
     reason: ExitReason
+    restarts: int = 0
+    allowed: int = 0
 
 
 class ChildStartFailed(Event, frozen=True, eq=False):
@@ -76,6 +89,16 @@ class ShutdownError(Event, frozen=True, eq=False):
     """A child that was told to stop ended for another reason than it was told; the shutdown went on."""
 
     reason: ExitReason
+
+
+class StopOverdue(Event, frozen=True, eq=False):
+    """An actor has not ended in the time that those below it have for it, and is killed with all of them.
+
+    `stacks` tells where each turn below it waits, as far as it is in the same process.
+    """
+
+    seconds: float
+    stacks: str
 
 
 class AutoShutdown(Event, frozen=True, eq=False):
@@ -103,6 +126,13 @@ class ProcessDied(Event, frozen=True, eq=False):
 
     pid: int
     reason: ExitReason
+
+
+class TrustBreached(Event, frozen=True, eq=False):
+    """An actor process said what it may not, or what cannot be; it is ended, and nobody else."""
+
+    pid: int
+    problem: str
 
 
 class Recovered(Event, frozen=True, eq=False):
@@ -248,6 +278,13 @@ class SnapshotDamaged(Event, frozen=True, eq=False):
 
     turn: int
     reason: str
+
+
+class RecoveryTableUnused(Event, frozen=True, eq=False):
+    """Nobody has been started yet whom this table of the recovery file is for; `where` is its file and line."""
+
+    table: str
+    where: str
 
 
 class SnapshotFailed(Event, frozen=True, eq=False):
@@ -444,10 +481,28 @@ def event_from(kind: str, data: dict[str, Any]) -> Event | None:
         if event.__name__ == kind:
             try:
                 fields = {name: _field_in(data[name]) for name in event.__struct_fields__}
+                told = event(**fields)
             except (KeyError, msgspec.ValidationError):
                 return None
-            return event(**fields)
+            return told if _fits(told) else None
     return None
+
+
+@functools.cache
+def _kinds(event: type[Event]) -> dict[str, Any]:
+    """What the fields of an event have to be; those that may be anything are left out."""
+    hints = typing.get_type_hints(event)
+    kinds = {name: typing.get_origin(hints[name]) or hints[name] for name in event.__struct_fields__}
+    return {
+        name: (int, float) if kind is float else kind
+        for name, kind in kinds.items()
+        if type(kind) is type or kind is ExitReason
+    }
+
+
+def _fits(event: Event) -> bool:
+    """Whether the fields of an event that another process told are what they have to be."""
+    return all(isinstance(getattr(event, name), kind) for name, kind in _kinds(type(event)).items())
 
 
 def event_data(event: Event) -> dict[str, Any]:
@@ -460,8 +515,23 @@ def _field_out(value: Any) -> Any:
         return {"exit reason": pack_exit(value)}
     if isinstance(value, (int, float, dict)) or value is None:
         return value
+    if isinstance(value, (Message, Item, MessageText)):
+        message = message_of(value)
+        return {"item": item_name(value), "text": portable(str(value if message is None else message))}
     return portable(str(value))
 
 
 def _field_in(value: Any) -> Any:
-    return unpack_exit(value["exit reason"]) if isinstance(value, dict) and "exit reason" in value else value
+    match value:
+        case str():
+            return value.translate(_UNPRINTED)
+        case {"exit reason": reason}:
+            return unpack_exit(reason)
+        case {"item": str(name), "text": str(text)}:
+            return MessageText(text.translate(_UNPRINTED), name.translate(_UNPRINTED))
+        case _:
+            return value
+
+
+_UNPRINTED = {code: "?" for code in (*range(32), *range(127, 160)) if chr(code) not in "\n\t"}
+"""Characters that make a terminal do something: another process may not send them to whoever looks."""

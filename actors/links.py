@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from .exits import NOPROC, NORMAL, ExitReason
-from .mail import Item
+from .mail import LEAVE, Item
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -157,9 +157,15 @@ class Exit(Item):
             return None
         if cell.more is not None and cell.more.trap_exits:
             return actor.on_exit(item.source.ref, item.reason)
-        if item.reason != NORMAL:
-            cell.request_stop(item.reason)  # A command: it comes before anything else that is queued.
-        return None
+        if item.reason == NORMAL:
+            return None
+        from . import lives
+
+        lives.finish(cell, item.reason, is_orderly=False)
+        return LEAVE
+
+    def hook(self) -> str:
+        return "on_exit"
 
 
 class Down(Item):
@@ -175,3 +181,6 @@ class Down(Item):
         if not item.watch.active or item.watch.life != actor.ctx.life:
             return None
         return actor.on_down(item.watch.target.ref, item.reason, item.recovering)
+
+    def hook(self) -> str:
+        return "on_down"

@@ -1,7 +1,7 @@
 """Lives: how an actor in this process begins, crashes, is stopped or killed, and what follows from its end.
 
-The order of an end: children (newest first), `on_stop`, timers and tasks, names, links and monitors, then the
-supervisor is told, or the address is given up.
+The order of an end: children (newest first), `on_stop`, replies that were promised, timers and tasks, names, links and
+monitors, then the supervisor is told, or the address is given up.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from . import exits, links, mailbox
 from .actor import Actor
 from .cell import DOWN, ENDING, GONE, RUNNING, Cell
 from .context import ActorContext
-from .errors import AskFailed, Ignore, StartFailed, StartIgnored, remote_crash
+from .errors import ActorStopped, AskFailed, Ignore, StartFailed, StartIgnored, remote_crash
 from .events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
-from .exits import KILLED, NORMAL, SHUTDOWN, ExitReason
+from .exits import KILLED, NORMAL, SHUTDOWN, Crash, ExitReason
 from .mail import LEAVE, Ask, Item
 from .message import Refusal
 from .ref import current
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 
 GRACE = 1.0
 """Seconds a killed turn may take to end after its cancellation, before its life is abandoned."""
+KILLED_WITHIN = 5.0
+"""Seconds until a killed child is given up that has not ended; a process that was sent SIGKILL takes less."""
 
 
 class LocalHost:
@@ -37,8 +39,14 @@ class LocalHost:
 
     takes_parcels = False
 
+    def progress(self, cell: Cell) -> object:
+        return None
+
     def recovers(self, reason: ExitReason) -> bool:
         return False
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
@@ -85,6 +93,9 @@ class LocalHost:
 
     def backlog(self, cell: Cell) -> int:
         return sum(map(mailbox.counts, cell.queue or ()))
+
+    def load(self, cell: Cell) -> int:
+        return len(cell.queue or ()) + (cell.more is not None and cell.more.turn is not None)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         pass
@@ -135,8 +146,8 @@ def begin(
         up(cell)
         return None
     started: asyncio.Future[None] = node.loop.create_future()
-    if cell.more is not None:  # Supervised: somebody waits, also if the life ends before its first turn has.
-        cell.more.starting = started
+    if cell.more is not None or getattr(start.kind, "_supervises", False):
+        cell.extra().starting = started  # Somebody waits, also if the life ends before its first turn has.
     mailbox.queue_of(cell).appendleft(FirstTurn(restored, started))
     up(cell)
     return started
@@ -192,6 +203,9 @@ class FirstTurn(Item):
     def __init__(self, restored: bool, started: asyncio.Future[None]) -> None:
         self.restored, self.started = restored, started
 
+    def is_start(self) -> bool:
+        return True
+
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         try:
@@ -200,12 +214,11 @@ class FirstTurn(Item):
             raise StartFailed(actor.ctx.path, str(no)) from no
         if asyncio.iscoroutine(result):
             return _first(actor, result, item.started)
-        item.done()
+        _first_over(actor, item.started)
         return None
 
-    def done(self) -> None:
-        if not self.started.done():
-            self.started.set_result(None)
+    def hook(self) -> str:
+        return "on_start"
 
     def ignored(self, cell: Cell, why: str) -> bool:
         start_fails(cell, self, StartIgnored(cell.path, why))
@@ -226,8 +239,20 @@ async def _first(actor: Actor, hook: Any, started: asyncio.Future[None]) -> None
         await hook
     except Refusal as no:
         raise StartFailed(actor.ctx.path, str(no)) from no
-    if not started.done():
+    _first_over(actor, started)
+
+
+def _first_over(actor: Actor, started: asyncio.Future[None]) -> None:
+    """`on_start` has returned; the start may go on without it, and then ends with `came_up`, or with the life."""
+    if not actor._is_starting() and not started.done():
         started.set_result(None)
+
+
+def came_up(cell: Cell) -> None:
+    """A start that went on after `on_start` is over: whoever waits for it hears of it."""
+    starting = cell.more.starting if cell.more is not None else None
+    if starting is not None and not starting.done():
+        starting.set_result(None)
 
 
 class Stop(Item):
@@ -240,7 +265,7 @@ class Stop(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        finish(actor.ctx.cell, item.reason)
+        stop(actor.ctx.cell, item.reason, item)
         return LEAVE
 
 
@@ -258,8 +283,9 @@ class Kill(Item):
 def crash(cell: Cell, item: Any, error: BaseException) -> None:
     """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
     if isinstance(error, Ignore) and hasattr(item, "ignored") and item.ignored(cell, error.why):
-        finish(cell, NORMAL)  # No crash: it does not want to live.
+        finish(cell, NORMAL, is_orderly=False)  # No crash: it does not want to live.
         return
+    is_start = isinstance(item, Item) and item.is_start()
     reason = exits.crash(error)
     fail = getattr(item, "fail", None)
     if fail is not None:
@@ -269,10 +295,15 @@ def crash(cell: Cell, item: Any, error: BaseException) -> None:
         if isinstance(error, StartFailed) and getattr(type(cell.actor), "_supervises", False):
             finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).
             return
+    tell_crash(cell, reason, item)
+    finish(cell, reason, is_orderly=not is_start)
+
+
+def tell_crash(cell: Cell, reason: ExitReason, item: object) -> None:
+    """The life ends by a crash, be it that its code raised or that it says so."""
     node = cell.node
     if node.watched:
         node.emit(ActorCrashed(cell.path, cell.life, reason, item))
-    finish(cell, reason)
 
 
 def start_fails(cell: Cell, item: FirstTurn, error: StartFailed) -> None:
@@ -286,7 +317,7 @@ def start_fails(cell: Cell, item: FirstTurn, error: StartFailed) -> None:
 def killed(cell: Cell) -> None:
     """The life ends without hooks; its children are killed with it."""
     if cell.children:
-        _wind_down(cell, KILLED, _kill_children(cell))
+        _wind_down(cell, End(KILLED), _kill_children(cell))
     else:
         ended(cell, KILLED)
 
@@ -297,44 +328,76 @@ def cut_off(cell: Cell, item: Any) -> None:
         item.fail(AskFailed(cell.path, str(KILLED)))
 
 
-def finish(cell: Cell, reason: ExitReason) -> None:
-    """End a life in good order: children, `on_stop`, then `ended`. Called in the actor's own context."""
+def stop(cell: Cell, reason: ExitReason, item: Item) -> None:
+    """A life was told to stop, by itself or by others. Called in the actor's own context."""
+    if isinstance(reason, Crash):
+        tell_crash(cell, reason, item)
+    finish(cell, reason)
+
+
+def finish(cell: Cell, reason: ExitReason, *, is_orderly: bool = True) -> None:
+    """End a life: children, `on_stop`, then `ended`. Called in the actor's own context.
+
+    `on_stop` is left out where nothing was built up that it could take down (a start that failed), and where the life
+    is cut off (an EXIT that is not trapped): `is_orderly` is False then.
+    """
     actor: Any = cell.actor
-    if cell.children or type(actor).on_stop is not Actor.on_stop:
-        _wind_down(cell, reason, _farewell(cell, reason))
+    says = is_orderly and type(actor).on_stop is not Actor.on_stop
+    if cell.children or says:
+        end = End(reason)
+        _wind_down(cell, end, _farewell(cell, end, says))
     else:
         ended(cell, reason)
 
 
-def _wind_down(cell: Cell, reason: ExitReason, farewell: Any) -> None:
+class End:
+    """Why a life ends; `on_stop` may say otherwise."""
+
+    __slots__ = ("reason",)
+
+    def __init__(self, reason: ExitReason) -> None:
+        self.reason = reason
+
+
+def _wind_down(cell: Cell, end: End, farewell: Any) -> None:
     cell.state = ENDING
     cell.scheduled = True
     if cell.node.step(cell, None, farewell):
-        ended(cell, reason)
+        ended(cell, end.reason)
         return
     turn = cell.extra().turn
     assert turn is not None
-    turn.then = lambda: ended(cell, KILLED if turn.killed else reason)
+    turn.then = lambda: ended(cell, KILLED if turn.killed else end.reason)
 
 
-async def _farewell(cell: Cell, reason: ExitReason) -> None:
+async def _farewell(cell: Cell, end: End, says: bool) -> None:
     """Stop the children, then say good-bye."""
     actor = cell.actor
     assert actor is not None
     await actor._stop_children()
+    if not says:
+        return
     try:
-        result = actor.on_stop(reason)
+        result = actor.on_stop(end.reason)
         if asyncio.iscoroutine(result):
-            await result
+            result = await result
     except BaseException as error:  # A failing hook must not keep the end from being told.
-        cell.node.emit(HookFailed(cell.path, "on_stop", exits.crash(error)))
+        result = exits.crash(error)
+        cell.node.emit(HookFailed(cell.path, "on_stop", result))
+        if isinstance(end.reason, Crash):
+            return  # The first cause is told.
+    else:
+        if isinstance(result, Crash):
+            tell_crash(cell, result, None)
+    if isinstance(result, ExitReason):
+        end.reason = result
 
 
 async def _kill_children(cell: Cell) -> None:
     for child in reversed(list((cell.children or {}).values())):
         gone = child.ended()
         child.kill()
-        await gone
+        await asyncio.wait((gone,), timeout=KILLED_WITHIN)  # Whatever holds it, it does not hold us.
         retire(child, "its parent was killed")
 
 
@@ -368,6 +431,9 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     if more is not None:
         more.reason = reason
     if ctx is not None:
+        if not getattr(type(cell.actor), "_keeps_promises", False):
+            for ask in ctx.promised():  # Nobody else can answer these.
+                ask.fail(AskFailed(cell.path, str(reason)))
         ctx.close()
     actor = cell.actor
     if actor is not None and type(actor).on_undelivered is not Actor.on_undelivered:
@@ -401,7 +467,10 @@ def tell_enders(more: Any, reason: ExitReason) -> None:
 
 
 def _undo(cell: Cell) -> None:
-    """Timers, tasks, subscriptions, names and the suspension end with the life; the stash goes back to the queue."""
+    """Whatever belongs to the life ends with it: timers, tasks, subscriptions, names, trapping, the suspension.
+
+    The stash goes back to the queue.
+    """
     more = cell.extra()
     if more.has_ties:
         for timer in list(more.timers):
@@ -415,7 +484,7 @@ def _undo(cell: Cell) -> None:
             cell.node.names.pop(name, None)
         more.names.clear()
         more.watching.clear()
-    more.suspended = False
+    more.suspended = more.trap_exits = False
     queue = cell.queue
     if queue:
         kept = deque.copy(queue) if type(queue) is deque else deque(queue)
@@ -439,6 +508,9 @@ def retire(cell: Cell, why: object) -> None:
     cell.state = GONE
     cell.admit = mailbox.admit_gone  # Closed before it is drained, so that no ask waits on the dead.
     cell.host.retired(cell)
+    kept = cell.node.kept.pop(cell, None)
+    if kept is not None:
+        kept.given_up(ActorStopped(cell.path, str(why)))
     parent = cell.parent
     if parent is not None and parent.children is not None and parent.children.get(cell.name) is cell:
         del parent.children[cell.name]
@@ -466,6 +538,18 @@ def retire(cell: Cell, why: object) -> None:
             item.undelivered(cell, str(why))
         else:
             cell.undelivered(item, str(why))
+
+
+def parent_ended(cell: Cell) -> bool:
+    """Whether it is the supervisor of a retired cell that has ended, and both may be started again."""
+    if cell.parent is None or cell.parent.state is RUNNING:
+        return False
+    above: Cell | None = cell
+    while above is not None and above.state is not RUNNING:
+        if above.spec is not None and not above.spec.comes_back:
+            return False
+        above = above.parent
+    return True
 
 
 class ChildExit(Item):

@@ -8,6 +8,7 @@ in the name of a runner, an idle task; if it suspends, the runner stays with it 
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 import types
 from asyncio.tasks import _enter_task, _leave_task  # the documented hooks for stepping coroutines in a task's name
@@ -16,6 +17,7 @@ from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any
 
 from . import lives, mailbox
+from .errors import WrongThread
 from .mail import LEAVE, Item
 from .message import Refusal
 
@@ -41,6 +43,7 @@ class RunLoop:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.loop = loop
+        self.thread = threading.get_ident()
         self.ready: deque[Cell] = deque()
         self.awake = False
         self.now = loop.time()
@@ -60,7 +63,14 @@ class RunLoop:
             self.wake()
 
     def wake(self) -> None:
-        """One callback drains every ready actor."""
+        """One callback drains every ready actor.
+
+        Raises:
+            WrongThread: by a `tell` from another thread, which nobody would notice before the loop wakes by itself. It
+                is found here, where it costs nothing while actors are busy; what it has queued is taken back.
+        """
+        if get_ident() != self.thread:
+            self._take_back()
         self.awake = True
         self.loop.call_soon(self._drain)
 
@@ -76,7 +86,8 @@ class RunLoop:
             context = cell.context
             if context is None:
                 context = lives.open_context(cell)
-            if context.run(run_turns, cell, self.most):
+            ran = context.run(run_turns, cell, self.most)
+            if ran:
                 if cell.queue:
                     ready.append(cell)
                 else:
@@ -88,14 +99,13 @@ class RunLoop:
             now = clock()
             if now > end:
                 if now - begin > SLICE:
-                    self._shorten()
+                    self._shorten(ran)
+                else:
+                    self._lengthen()
                 break
             begin = now
         else:
-            if stride < STRIDE:
-                self.stride += 1
-            if self.most < MOST:
-                self.most += 1
+            self._lengthen()
         if self.entered is not None:
             self._leave()
         elif self._struck is not None:
@@ -107,17 +117,50 @@ class RunLoop:
             if self._idlers and not self.turns_held:
                 self._tell_idlers()
 
+    def _take_back(self) -> None:
+        if not self.ready:
+            raise WrongThread("the system", threading.current_thread().name)
+        cell = self.ready.pop()
+        cell.scheduled = False
+        if cell.queue:
+            mailbox.take_back(cell, cell.queue)
+        raise WrongThread(cell.path, threading.current_thread().name)
+
+    def is_own_thread(self) -> bool:
+        """Whether this is the thread that the actors of the node run in."""
+        return get_ident() == self.thread
+
+    def check_thread(self, path: str) -> None:
+        """Refuse a call from another thread.
+
+        Raises:
+            WrongThread: naming the actor that was called.
+        """
+        if get_ident() != self.thread:
+            raise WrongThread(path, threading.current_thread().name)
+
     def run_now(self) -> None:
         """Run what is ready at once instead of in the next tick: for callbacks of the loop that bring messages."""
         if self.awake:
             self._drain()
 
-    def _shorten(self) -> None:
-        """Handlers are slow: look at the clock more often, so that the host's own callbacks wait for few of them."""
+    def _shorten(self, ran: int) -> None:
+        """Handlers are slow: look at the clock more often, so that the host's own callbacks wait for few of them.
+
+        `ran` is how many turns the last actor had. One long turn alone is no reason to give everybody fewer at a time:
+        it would not be shorter, and what others gather for one write would be written in as many.
+        """
         if self.stride > 1:
             self.stride = 1
-        elif self.most > 1:
-            self.most //= 2
+        elif ran > 1:
+            self.most = max(1, self.most // 2)
+
+    def _lengthen(self) -> None:
+        """Handlers are quick, or were all along, and something else took the time: bit by bit as it was before."""
+        if self.stride < STRIDE:
+            self.stride += 1
+        if self.most < MOST:
+            self.most += 1
 
     def settled(self) -> asyncio.Future[None]:
         """A future that ends when no actor of this node has anything to do (suspended turns included)."""
@@ -220,6 +263,16 @@ class RunLoop:
         if self._idlers and not self.awake:
             self.wake()
 
+    def errand_waits(self) -> None:
+        """What an actor does outside its turns has to wait: until it goes on, the node has something to do."""
+        self.turns_held += 1
+
+    def errand_goes_on(self) -> None:
+        """It waits no longer, or is given up."""
+        self.turns_held -= 1
+        if self._idlers and not self.awake:
+            self.wake()
+
     def idle_again(self, runner: Runner) -> bool:
         """Whether the runner shall wait for another turn."""
         if len(self._idle) >= RUNNERS or runner.task.cancelling():
@@ -248,17 +301,20 @@ class RunLoop:
 
 
 clock: Callable[[], float] = time.monotonic
+get_ident: Callable[[], int] = threading.get_ident
 
 
-def run_turns(cell: Cell, most: int) -> bool:
-    """Run up to `most` turns of one actor, in its own context. False: it left the run queue."""
+def run_turns(cell: Cell, most: int) -> int:
+    """Run up to `most` turns of one actor, in its own context. Returns how many, at least 1; 0: it left the queue."""
     queue, actor, table = cell.queue, cell.actor, cell.table
     if queue is None or actor is None:
-        return True
+        return 1
     count = len(queue)
+    if count > most:
+        count = most
     item: Any = None
     try:
-        for _ in range(count if count < most else most):
+        for _ in range(count):
             cell.item = item = queue.popleft()
             result = table[type(item)](actor, item)
             if result is None:
@@ -272,18 +328,18 @@ def run_turns(cell: Cell, most: int) -> bool:
                 except StopIteration:
                     continue
                 node.hold(cell, item, result, waiting)
-                return False
+                return 0
             if result is LEAVE:
-                return False
+                return 0
     except Refusal as no:  # Refused a tell: nobody waits for the answer.
         cell.node.refused(cell, item, no)
-        return True
+        return 1
     except BaseException as error:  # Whatever user code raises ends this life, and only this life.
         if isinstance(error, KeyboardInterrupt):
             raise
         lives.crash(cell, cell.item, error)  # Not `item`: that may have been forwarded or stashed.
-        return False
-    return True
+        return 0
+    return count or 1
 
 
 class TurnEnded(Item):

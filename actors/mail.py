@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 import msgspec
 
 from .errors import AskTimeout, HoldfastError, UnknownMessage, type_name
-from .message import Message, Refusal, by_name
+from .message import Message, MessageText, Refusal, by_name, message_of
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -47,8 +47,26 @@ class Item:
     def undelivered(self, cell: Cell, reason: str) -> None:
         """The address is gone before the item's turn came."""
 
+    def hook(self) -> str:
+        """The actor's hook that it calls, if that is what it does."""
+        return ""
+
     def stashed(self) -> None:
         """Its turn puts it aside: it will come again, out of its order."""
+
+    def is_start(self) -> bool:
+        """Whether its turn is the start of a life: if that fails, there is nothing that `on_stop` could take down."""
+        return False
+
+
+def item_name(item: object) -> str:
+    """What a mailbox item is, in a word: the type of the message in it, or the hook that it runs."""
+    if isinstance(item, MessageText):
+        return item.type_name
+    message = message_of(item)
+    if message is not None:
+        return type_name(type(message))
+    return (item.hook() if isinstance(item, Item) else "") or type_name(type(item))
 
 
 Handler = Callable[[Any, Any], object]
@@ -138,7 +156,7 @@ class Ask(Item, msgspec.Struct, eq=False):
     deadline: float  # on the loop's clock
     future: Any  # asyncio.Future; what else there may be has `done()` too
     to: Any = None  # the Cell that is asked
-    started: bool = False  # whether a turn may have begun; whoever hands it to another process sets it
+    started: int = False  # True: a turn may have begun; a number: it was handed on so, and the host of `to` may know
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -184,8 +202,10 @@ class Ask(Item, msgspec.Struct, eq=False):
 
     def expire(self) -> None:
         """The deadline has passed; a turn that has not begun will not begin."""
+        started = self.started
+        is_sure = not started or (started is not True and not self.to.host.may_have_begun(self.to, self))
         self.deadline = 0.0
-        self.fail(AskTimeout(self.to.path, self.timeout, None if self.started else False))
+        self.fail(AskTimeout(self.to.path, self.timeout, False if is_sure else None))
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         self.fail(cell.stopped_error(reason))

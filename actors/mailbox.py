@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from .errors import MailboxFull, SpecError
@@ -90,6 +90,51 @@ def put_back(cell: Cell, items: Iterable[Any]) -> None:
     queue.extendleft(reversed(commands))
 
 
+class Senders:
+    """Who waits for room to send, first in, first served: one wakes for each free place, and tries again.
+
+    Whoever has woken need not take the place: it may have been cancelled, have lost its life, or have gone elsewhere.
+    Then it is the next one's, and nobody has to remember to say so.
+    """
+
+    __slots__ = ("_waiting",)
+
+    def __init__(self) -> None:
+        self._waiting: deque[asyncio.Future[None]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def wait(self, loop: asyncio.AbstractEventLoop) -> asyncio.Future[None]:
+        """A future that ends when it is worth trying again."""
+        future: asyncio.Future[None] = loop.create_future()
+        self._waiting.append(future)
+        return future
+
+    def wake(self, has_room: Callable[[], bool]) -> None:
+        """Wake the first one, if there is room, and when it has had its turn the next one, if there still is."""
+        while self._waiting and has_room():
+            sender = self._waiting.popleft()
+            if not sender.done():
+                sender.set_result(None)
+                sender.get_loop().call_soon(self.wake, has_room)
+                break
+
+    def release(self) -> None:
+        """Wake them all."""
+        waiting, self._waiting = self._waiting, deque()
+        for sender in waiting:
+            if not sender.done():
+                sender.set_result(None)
+
+
+def take_back(cell: Cell, queue: deque[Any]) -> None:
+    """Take the newest item out of a queue again: its sender is told that it was refused."""
+    item = deque.pop(queue)
+    if counts(item) and cell.more is not None and cell.more.bound is not None:
+        cell.more.bound.count -= 1
+
+
 class Bound:
     """A mailbox's capacity, its overflow policy, and who waits for room.
 
@@ -103,7 +148,7 @@ class Bound:
         self.overflow: Overflow = overflow
         self.count = 0
         self.waiting: deque[Ask] = deque()  # asks that wait for room, first in, first served
-        self.senders: deque[asyncio.Future[None]] = deque()  # `send`s that wait for room
+        self.senders = Senders()
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Take the item, or let the policy decide."""
@@ -142,33 +187,25 @@ class Bound:
             ask = self.waiting.popleft()
             if not ask.is_done:  # Expired or given up while it waited: never admitted.
                 self.put(cell, ask)
-        self.wake_sender()
-
-    def wake_sender(self) -> None:
-        """One wakes for each free place; it tries again and may find the place taken, then it waits once more."""
-        while self.senders and self.count < self.capacity:
-            sender = self.senders.popleft()
-            if not sender.done():
-                sender.set_result(None)
-                break
+        self.senders.wake(self._is_below)
 
     def moved(self, cell: Cell) -> None:
         """The actor, in another process, has begun or ended turns."""
 
+    def has_room(self, cell: Cell) -> bool:
+        """Whether a message would be taken now (or lost: only the policy "block" has a sender wait)."""
+        return self.overflow != "block" or (self._is_below() and not self.waiting)
+
+    def _is_below(self) -> bool:
+        return self.count < self.capacity
+
     def room(self, cell: Cell) -> asyncio.Future[None] | None:
-        """For `send`: None if there is room (or the policy never waits)."""
-        if self.overflow != "block" or (self.count < self.capacity and not self.waiting):
-            return None
-        future: asyncio.Future[None] = cell.node.loop.create_future()
-        self.senders.append(future)
-        return future
+        """For `send`: None if there is room."""
+        return None if self.has_room(cell) else self.senders.wait(cell.node.loop)
 
     def release(self) -> None:
         """The address is gone: whoever waits shall see it."""
-        for sender in self.senders:
-            if not sender.done():
-                sender.set_result(None)
-        self.senders.clear()
+        self.senders.release()
 
     def _refuse(self, cell: Cell, item: Any) -> None:
         error = MailboxFull(cell.path, self.capacity)
@@ -195,16 +232,6 @@ class Bound:
             else:
                 kept.append(item)
         queue.extendleft(reversed(kept))
-
-
-async def wait_for(cell: Cell, room: asyncio.Future[None]) -> None:
-    """Wait until it is worth trying again to send."""
-    try:
-        await room
-    except asyncio.CancelledError:
-        if room.done() and not room.cancelled() and cell.more is not None and cell.more.bound is not None:
-            cell.more.bound.wake_sender()  # The place that was meant for us is the next one's.
-        raise
 
 
 def counts(item: Any) -> bool:

@@ -33,6 +33,49 @@ class Message(msgspec.Struct, Generic[R], frozen=True, array_like=True):
     """
 
 
+class Order(Message[R], Generic[R]):
+    """Base of messages that are orders of the runtime: they start or end lives, or change what runs.
+
+    From another process only whoever was granted the receiver's address may send them there.
+    """
+
+
+def why_no_message(value: object) -> str:
+    """Why something is no message, and what to send instead; nothing if it is one.
+
+    >>> class Ping(Message[str]): ...
+    >>> why_no_message(Ping)
+    'this is the class of a message; send an instance, Ping(...)'
+    """
+    if isinstance(value, Message):
+        return ""
+    if isinstance(value, type) and issubclass(value, Message):
+        return f"this is the class of a message; send an instance, {value.__name__}(...)"
+    return (
+        "messages are instances of a class of their own: class MyMessage(hf.Message[...]), "
+        "and a handler with @on(MyMessage)"
+    )
+
+
+def message_of(item: object) -> Message[Any] | None:
+    """The user's message inside a mailbox item, if there is one."""
+    found = item if isinstance(item, Message) else getattr(item, "message", None)
+    return found if isinstance(found, Message) else None
+
+
+class MessageText(str):
+    """A message, or another item, of another process: its text, and what it is (`item_name`)."""
+
+    __slots__ = ("type_name",)
+
+    type_name: str
+
+    def __new__(cls, text: str, type_name: str) -> MessageText:
+        made = super().__new__(cls, text)
+        made.type_name = type_name
+        return made
+
+
 def _message_name(kind: type) -> str:
     module = kind.__module__
     # A process that was forked for an actor knows the classes of the user's script by another module name.

@@ -9,7 +9,7 @@ import random
 import time
 import weakref
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from . import lives, stopping
 from .cell import DOWN, GONE, RUNNING, Cell, Host
@@ -22,7 +22,8 @@ from .keeper import Keeper, NothingKept
 from .lives import LOCAL
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
-from .message import Message, Refusal
+from .message import Refusal
+from .threads import Threads
 from .topics import Topics
 
 if TYPE_CHECKING:
@@ -30,6 +31,14 @@ if TYPE_CHECKING:
     from .ref import ActorRef
 
 A = TypeVar("A", bound="Actor")
+
+
+class Kept(Protocol):
+    """What belongs to an address, whoever lives there."""
+
+    def given_up(self, error: ActorStopped) -> None:
+        """The address is gone for good: whoever waits for something there hears of it."""
+        ...
 
 
 class Node(RunLoop):
@@ -46,8 +55,9 @@ class Node(RunLoop):
         self.watched = False  # whether anybody looks at events: else they are not even made
         self.events = EventHub(self._watch)
         self.topics = Topics()
+        self.threads = Threads()
         self.names: dict[str, Cell] = {}
-        self.kept: weakref.WeakKeyDictionary[Cell, Any] = weakref.WeakKeyDictionary()  # what outlives an actor's lives
+        self.kept: weakref.WeakKeyDictionary[Cell, Kept] = weakref.WeakKeyDictionary()  # outlives an actor's lives
         self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
         self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead
@@ -74,6 +84,7 @@ class Node(RunLoop):
         for timer in self.safe.values():
             timer.cancel()
         self.safe.clear()
+        self.threads.close()
         await super().close()
 
     # -- events -----------------------------------------------------------------------------------------------------
@@ -86,12 +97,12 @@ class Node(RunLoop):
         self.events.emit(event)
 
     def dead_letter(self, cell: Cell, message: object, why: str) -> None:
-        """A message that nobody handles: counted, and told to who looks."""
+        """A message that nobody handles: counted, and told to who looks, opened if it came packed."""
         self.dead_letters += 1
         if self.watched:
-            self.events.emit(DeadLetter(cell.path, message, why))
+            self.events.emit(DeadLetter(cell.path, self.codec.opened(cell, message), why))
 
-    def not_taken(self, cell: Cell, message: Message[Any], error: HoldfastError) -> None:
+    def not_taken(self, cell: Cell, message: object, error: HoldfastError) -> None:
         """A subscriber could not take what was published; one that has ended meanwhile is no subscriber any more."""
         if not isinstance(error, ActorStopped):
             self.dead_letter(cell, message, str(error))
@@ -265,9 +276,3 @@ def cell_kind(cell: Cell) -> type[Actor] | None:
         return type(cell.actor)
     start = cell.more.start if cell.more is not None else None
     return None if start is None else start.kind
-
-
-def message_of(item: object) -> Message[Any] | None:
-    """The user's message inside a mailbox item, if there is one."""
-    found = item if isinstance(item, Message) else getattr(item, "message", None)
-    return found if isinstance(found, Message) else None

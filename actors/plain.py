@@ -173,20 +173,22 @@ class Wrapped(Actor):
             for number, (seconds, _) in enumerate(self._bus.timers):
                 self.ctx.every(seconds, BusTick(number))
 
-    async def _called(self, callbacks: Iterable[Callable[..., Any]], *args: Any) -> None:
-        """Call them in turn, then let out what they have sent."""
+    async def _called(self, callbacks: Iterable[Callable[..., Any]], *args: Any) -> Any:
+        """Call them in turn, then let out what they have sent; returns what the last one returned."""
         bus = self._bus
         bus.sent.clear()  # Of a callback that raised.
+        result = None
         for callback in callbacks:
             result = callback(*args)
             if inspect.isawaitable(result):
-                await result
+                result = await result
         for to, message in bus.sent:
             if isinstance(to, str):
                 await self.ctx.publish(to, message)
             else:
                 to.tell(message)
         bus.sent.clear()
+        return result
 
 
 def wrap(
@@ -241,19 +243,22 @@ def wrap(
         "deterministic": deterministic,
         "key_variables": None if key_variables is None else tuple(key_variables),
     }
+    has_bus = any(not isinstance(fed, tuple) for fed in (callbacks or {}).values())
+    namespace["_has_bus"] = has_bus
     for number, (kind, method) in enumerate((methods or {}).items()):
-        namespace[f"_call_{number}"] = on(kind)(_caller(factory, kind, method))
+        caller = _caller(factory, kind, method)
+        namespace[f"_call_{number}"] = on(kind)(_sending(caller) if has_bus else caller)
     kinds: dict[str, type[Message[Any]]] = {}
     for number, (topic, fed) in enumerate((callbacks or {}).items()):
         if isinstance(fed, tuple):
-            kind, handler = fed[0], _caller(factory, *fed, is_callback=True)
+            kind, caller = fed[0], _caller(factory, *fed, is_callback=True)
+            handler = _sending(caller) if has_bus else caller
         else:
             kind, handler = fed, _fed(topic)
-            namespace["_has_bus"] = True
         kinds[topic] = kind
         namespace[f"_feed_{number}"] = subscribe(topic)(on(kind)(handler))
     namespace["_kinds"] = kinds
-    if namespace.get("_has_bus"):
+    if has_bus:
         namespace["_tick"] = on(BusTick)(_ticking())
     made = types.new_class(name, (Wrapped,), {}, lambda body: body.update(namespace))
     made.__qualname__ = name
@@ -294,6 +299,15 @@ def _misfit(parameters: list[Parameter], kind: type[Message[Any]]) -> str:
     if missing:
         return f"it has no field {missing[0]!r}"
     return f"there is no parameter {unknown[0]!r}" if unknown else ""
+
+
+def _sending(caller: Callable[[Wrapped, Any], Any]) -> Any:
+    """A handler that lets out what the method it calls has sent."""
+
+    def call(self: Wrapped, message: Any) -> Any:
+        return self._called([functools.partial(caller, self)], message)
+
+    return call
 
 
 def _fed(topic: str) -> Any:

@@ -6,7 +6,6 @@ import asyncio
 import contextvars
 from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
 
-from . import mailbox
 from .errors import ActorRestarting, SpecError
 from .mail import Ask
 from .message import Message
@@ -50,8 +49,11 @@ class ActorRef(Generic[A_co]):
 
         Raises:
             UnknownMessage: the actor's class is known and has no handler for it.
-            MailboxFull: the mailbox is bounded and refuses.
+            MailboxFull: the mailbox is bounded and refuses. Who cannot be told, because the mailbox is in another
+                process, or the sender a recorded turn whose sends leave later, has a dead letter made of the message.
             BadMessage: the message cannot be coded and has to be.
+            WrongThread: the system runs in another thread, and this call would have to wake it; see
+                `ActorSystem.from_thread`. (While it is awake a call from another thread may pass unnoticed.)
         """
         cell = self._cell
         sender = current.get(None)
@@ -72,8 +74,9 @@ class ActorRef(Generic[A_co]):
         if sender is not None:
             await sender.send(cell, message)
             return
+        cell.node.check_thread(cell.path)
         while (room := cell.room()) is not None:
-            await mailbox.wait_for(cell, room)
+            await room
         accepted = cell.host.offer(cell, message)
         if accepted is not None:
             await accepted
@@ -106,6 +109,7 @@ class ActorRef(Generic[A_co]):
         if type(message) not in cell.table:
             cell.require(message)
         node = cell.node
+        node.check_thread(cell.path)
         future: asyncio.Future[R] = node.loop.create_future()
         ask = Ask(message, None, (), timeout, node.loop.time() + timeout, future, cell)
         node.deadlines.add(ask)
@@ -118,10 +122,12 @@ class ActorRef(Generic[A_co]):
 
     def stop(self) -> None:
         """Ask the actor to stop after what it has begun; a second stop is no error."""
+        self._cell.node.check_thread(self.path)
         self._cell.request_stop()
 
     def kill(self) -> None:
         """End this life at once, without its hooks. A supervisor treats it as a crash."""
+        self._cell.node.check_thread(self.path)
         self._cell.kill()
 
     def __repr__(self) -> str:

@@ -2,15 +2,22 @@
 
 It is a turn like any other: one at a time, in the actor's own context. What it does through `self.ctx` or a ref is done
 on the event loop, and the thread waits for it.
+
+The threads are a node's own, for a thread cannot be stopped: one that hangs keeps its place among the few there may be,
+whoever has given up on it, and does not keep the program alive.
 """
 
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
+import contextvars
 import functools
+import inspect
+import queue
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from .errors import HoldfastError
 from .ref import current
@@ -23,6 +30,62 @@ if TYPE_CHECKING:
     from .message import Message
 
 
+T = TypeVar("T")
+
+MOST = 40
+"""Threads of one node; what comes when all are busy waits for one."""
+
+
+class Threads(concurrent.futures.Executor):
+    """The worker threads of a node: started when first needed, reused, never more than `MOST`."""
+
+    def __init__(self) -> None:
+        self._work: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._idle = threading.Semaphore(0)
+        self._count = 0
+
+    def run(self, function: Callable[..., T], *args: Any) -> asyncio.Future[T]:
+        """Run a function in a thread, with the caller's context variables. Cancelling leaves a begun one behind."""
+        # By way of the loop, for one with a virtual clock must know that a thread is at work.
+        context = contextvars.copy_context()
+        return asyncio.get_running_loop().run_in_executor(self, lambda: context.run(function, *args))
+
+    def submit(self, fn: Callable[..., T], /, *args: Any, **kwargs: Any) -> concurrent.futures.Future[T]:
+        """As `Executor` has it; called on the event loop."""
+        done: concurrent.futures.Future[T] = concurrent.futures.Future()
+        work = functools.partial(fn, *args, **kwargs)
+
+        def answer() -> None:
+            if done.set_running_or_notify_cancel():
+                _answer(done, work)
+
+        self._work.put(answer)
+        if not self._idle.acquire(blocking=False) and self._count < MOST:
+            self._count += 1
+            threading.Thread(target=self._serve, name="holdfast worker", daemon=True).start()
+        return done
+
+    def _serve(self) -> None:
+        while (work := self._work.get()) is not None:
+            work()
+            del work  # Or what it holds would live until there is more to do.
+            self._idle.release()
+
+    def close(self) -> None:
+        """End the threads that have nothing to do; those that hang are left behind."""
+        for _ in range(self._count):
+            self._work.put(None)
+
+
+def _answer(done: concurrent.futures.Future[Any], work: Callable[[], Any]) -> None:
+    try:
+        value = work()
+    except BaseException as error:  # Whoever waits for it gets it.
+        done.set_exception(error)
+    else:
+        done.set_result(value)
+
+
 def in_thread(handler: Callable[[Any, Any], Any]) -> Handler:
     """A handler that has `handler` run in a worker thread.
 
@@ -32,14 +95,12 @@ def in_thread(handler: Callable[[Any, Any], Any]) -> Handler:
 
     @functools.wraps(handler)
     async def turn(actor: Actor, message: Message[Any]) -> Any:
-        from anyio import to_thread  # Not needed by most, and slow to import.
-
         ctx = actor.ctx
         threaded = ThreadContext(ctx)
         actor.ctx = cast("ActorContext", threaded)
         is_left_behind = False
         try:
-            return await to_thread.run_sync(_run, threaded, handler, actor, message, abandon_on_cancel=True)
+            return await ctx.cell.node.threads.run(_run, threaded, handler, actor, message)
         except asyncio.CancelledError:
             is_left_behind = True  # The thread goes on, and has to be told no: `ctx` stays what it is.
             raise
@@ -100,12 +161,25 @@ class ThreadContext:
     def _on_loop(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         if threading.get_ident() != self._thread:
             return function(*args, **kwargs)
-        from anyio import from_thread
-
-        return from_thread.run_sync(functools.partial(self._checked, function, *args, **kwargs))
+        done: concurrent.futures.Future[Any] = concurrent.futures.Future()
+        work = functools.partial(_answer, done, functools.partial(self._checked, function, *args, **kwargs))
+        try:
+            self._ctx.cell.node.loop.call_soon_threadsafe(work, context=contextvars.copy_context())
+        except RuntimeError as error:  # The loop is closed: nobody is left to do it.
+            raise HoldfastError(
+                f"{self._ctx.path}: the system has ended, and with it the turn of this thread"
+            ) from error
+        return done.result()
 
     def _checked(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
         if self._is_over:
             self._ctx._alive()
             raise HoldfastError(f"{self._ctx.path}: the turn of this thread is over")
         return function(*args, **kwargs)
+
+
+def is_async(function: Callable[..., Any]) -> bool:
+    """Whether calling it gives a coroutine; anything else may block."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(getattr(function, "__call__", None))  # noqa: B004

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import asyncio
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
 
 from .errors import ActorStopped, MailboxFull, StoreError, UnknownMessage
 
 if TYPE_CHECKING:
     from .cell import Cell
+    from .message import Message
+    from .node import Node
 
 NOT_TAKEN = (ActorStopped, MailboxFull, StoreError, UnknownMessage)
 """Why one subscriber may not take what is published; the others get it all the same."""
@@ -40,6 +44,45 @@ class Topics:
         """In the order of subscription."""
         return tuple(self._cells.get(topic, ()))
 
+    def has(self, topic: str, cell: Cell) -> bool:
+        """Whether `cell` gets what is published there now."""
+        return cell in self._cells.get(topic, ())
+
     def names(self) -> list[str]:
         """Topics that have subscribers."""
         return sorted(self._cells)
+
+
+async def publish(node: Node, topic: str, message: Message[Any], send: Callable[[Cell], Awaitable[None]]) -> None:
+    """Send to every subscriber, and return when each has accepted.
+
+    Each gets it as soon as it has room: one that is full holds the publisher back, not the others. Whoever does not
+    subscribe any more when its room has come does not get it.
+
+    Args:
+        send: sends the message to one cell; raises one of `NOT_TAKEN` if that does not take it.
+    """
+
+    async def send_to(cell: Cell) -> None:
+        try:
+            while node.topics.has(topic, cell):
+                room = cell.room()
+                if room is None:
+                    await send(cell)
+                    break
+                await room
+        except NOT_TAKEN as error:
+            node.not_taken(cell, message, error)
+
+    waiting: list[asyncio.Task[None]] = []
+    try:
+        for cell in node.topics.subscribers(topic):
+            if cell.has_room:
+                await send_to(cell)
+            else:
+                waiting.append(node.loop.create_task(send_to(cell), name=f"publish to {cell.path}"))
+        if waiting:
+            await asyncio.gather(*waiting)
+    finally:
+        for task in waiting:
+            task.cancel()

@@ -355,7 +355,7 @@ async def loop_of_repair(run: Run) -> None:
         faults: dict[str, Callable[[], Awaitable[object]]] = {
             "silent": lambda: source.send(Fail()),
             "hangs in a turn": lambda: source.send(Fail(hangs=True)),
-            "stopped by hand": lambda: keeper.ask(TerminateChild("source")),
+            "stopped by hand": lambda: keeper.ask(TerminateChild("source", parks=False)),
         }
         for name, fault in faults.items():
             times = [await seconds(fault) for _ in range(1 if run.quick else 3)]

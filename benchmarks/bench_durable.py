@@ -88,6 +88,45 @@ async def fsync(run: Run) -> None:
         commit.close()
 
 
+async def os_turns(run: Run) -> None:
+    """The same flood, until the end of the last turn is written, too: what a recorded message costs in all."""
+    count = run.size(20_000)
+    with tempfile.TemporaryDirectory() as folder:
+        async with running(folder, "os") as (system, echo):
+            spent: list[float] = []
+            for _ in range(run.n):
+                began = time.perf_counter()
+                for i in range(count):
+                    echo.tell(DATA)
+                    if not i % BURST:
+                        await asyncio.sleep(0)
+                await echo.ask(Told(), timeout=600.0)
+                await system.homes.settled()
+                spent.append((time.perf_counter() - began) / count * 1e6)
+            run.bound("a whole turn that outlives the root, pipelined", min(spent), unit="us", target=25.0)
+
+
+async def fsync_turns(run: Run) -> None:
+    """Each caller asks and waits for the reply, which leaves when message and turn would outlive the machine."""
+    count = run.size(10_000)
+    with tempfile.TemporaryDirectory(dir=Path.cwd()) as folder:  # /tmp may be in memory.
+        commit = limits.GroupCommit(f"{folder}/limit")
+        async with running(folder, "fsync") as (_, echo):
+
+            async def twice() -> None:
+                await commit.append(DATA.data)  # the message
+                await commit.append(DATA.data)  # the end of its turn
+
+            await run.compare(
+                "whole asks that outlive the machine, 100 callers",
+                lambda: _callers(lambda: echo.ask(DATA, timeout=600.0), count),
+                lambda: _callers(twice, count),
+                unit="msg/s",
+                target=0.2,
+            )
+        commit.close()
+
+
 async def restart(run: Run) -> None:
     """A tree of recorded tasks, each with a snapshot and ten messages since, comes back from its store."""
     children = run.size(CHILDREN)
@@ -116,4 +155,4 @@ async def restart(run: Run) -> None:
 
 
 if __name__ == "__main__":
-    main([os_level, fsync, restart])
+    main([os_level, os_turns, fsync, fsync_turns, restart])

@@ -55,6 +55,9 @@ class Admission:
             self._accepted.exception()  # The sender may have gone.
         return True
 
+    def abandoned(self, error: HoldfastError) -> None:
+        """Nobody waits for what comes from the runtime itself."""
+
 
 def submit(home: Switch, source: Input, entry: Entry) -> None:
     """Have an input journaled.

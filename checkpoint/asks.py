@@ -15,6 +15,7 @@ from .inputs import Batch
 from .records import REPLY, Answer, Out, Outcome
 
 if TYPE_CHECKING:
+    from ..actors.codec import Codec
     from .switch import Switch
 
 
@@ -43,6 +44,7 @@ class SwitchAsk(RelayedAsk, eq=False):
     """
 
     switch: Any = None
+    asker: str = ""
     turn: int = 0
     k: int = 0
 
@@ -51,8 +53,14 @@ class SwitchAsk(RelayedAsk, eq=False):
         """The ask that was output (turn, k)."""
         deadline = switch.node.loop.time() + out.seconds
         ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, deadline, None, to)
-        ask.future, ask.switch, ask.turn, ask.k = ask, switch, turn, out.k
+        ask.future, ask.switch, ask.asker, ask.turn, ask.k = ask, switch, switch.path, turn, out.k
         return ask
+
+    @property
+    def codec(self) -> Codec:
+        """What encodes its outcome."""
+        codec: Codec = self.switch.node.codec
+        return codec
 
     def done(self) -> bool:
         """As a future has it."""
@@ -62,7 +70,7 @@ class SwitchAsk(RelayedAsk, eq=False):
         if isinstance(reply, ReplyHandle):
             return
         try:
-            body = self.switch.node.codec.encode(reply, self.switch.path)
+            body = self.codec.encode(reply, self.asker)
         except BadMessage as error:
             self.fail(BadMessage("reply", error.message, error.problem))
         else:
@@ -73,7 +81,7 @@ class SwitchAsk(RelayedAsk, eq=False):
         self.give(Answer(REPLY, "", body))
 
     def fail(self, error: BaseException) -> None:
-        self.give(Answer(*self.switch.node.codec.encode_error(error)))
+        self.give(Answer(*self.codec.encode_error(error)))
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:
         """An encoded error."""
@@ -125,7 +133,7 @@ class Calls:
         """An ask or send that was made before the crash: answered from the journal, or when its pending call is."""
         k, rejoin = out.k, self._home.rejoin
         answer = self.outcomes.get((turn, k))
-        if answer is None and out.verb == "send":
+        if answer is None and out.verb in ("send", "publish"):
             answer = None if (turn, k) in self.sends else ACCEPTED
         elif (
             answer is None
@@ -157,15 +165,16 @@ class Calls:
         self.asks.clear()
         self.sends.clear()
 
-    def accepted(self, turn: int, k: int) -> None:
-        """A `send` of ours was accepted. (Not journaled: under replay it is accepted unless it still waits.)"""
-        self.sends.discard((turn, k))
-        self._tell(turn, k, ACCEPTED)
+    def sent(self, turn: int, k: int, error: HoldfastError | None) -> None:
+        """A `send` or `publish` of ours was accepted, or not.
 
-    def refused(self, turn: int, k: int, error: HoldfastError, batch: Batch | None = None) -> None:
-        """A `send` of ours was not."""
+        (The former is not journaled: under replay it is accepted unless it still waits.)
+        """
         self.sends.discard((turn, k))
-        self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), batch)
+        if error is None:
+            self._tell(turn, k, ACCEPTED)
+        else:
+            self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), None)
 
     def _tell(self, turn: int, k: int, answer: Answer) -> None:
         if self._home.port is not None:

@@ -11,7 +11,7 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from ..actors.errors import MailboxFull
-from ..actors.mailbox import Bound
+from ..actors.mailbox import Bound, Senders
 from .inputs import Batch, Input
 from .records import MESSAGE, START, Answer
 
@@ -32,7 +32,7 @@ class HomeBound:
             key: source for key, source in home.open.items() if source.kind == MESSAGE and key not in stashed
         }
         self.waiting: deque[tuple[Ask, str, bytes, str | None]] = deque()  # asks that wait for room
-        self.senders: deque[asyncio.Future[None]] = deque()
+        self.senders = Senders()
         self._fed = -1  # one at a time: the input in hand
         self._behind: dict[int, Input] = {}  # and those that wait for it
 
@@ -98,13 +98,14 @@ class HomeBound:
                 home.ends.without_turn(source, error, batch)
         batch.commit(home.journal)
 
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now (or lost: only the policy "block" has a sender wait)."""
+        return self.overflow != "block" or not self.is_full
+
     def room(self) -> asyncio.Future[None] | None:
-        """For `send`: None if there is room, or the policy never waits."""
-        if self.overflow != "block" or not self.is_full:
-            return None
-        future: asyncio.Future[None] = self._home.node.loop.create_future()
-        self.senders.append(future)
-        return future
+        """For `send`: None if there is room."""
+        return None if self.has_room else self.senders.wait(self._home.node.loop)
 
     # -- what the home tells of its inputs --------------------------------------------------------------------------
 
@@ -129,21 +130,14 @@ class HomeBound:
             ask, name, body, sender = self.waiting.popleft()
             if not ask.is_done:  # Expired or given up while it waited: never admitted.
                 home.take(ask, name, body, sender)
-        while self.senders and not self.is_full:
-            waiter = self.senders.popleft()
-            if not waiter.done():
-                waiter.set_result(None)
-                break  # One for each free place: it tries again.
+        self.senders.wake(lambda: not self.is_full)
 
     def release(self, error: MailboxFull | Exception) -> None:
         """The address is given up: whoever waits shall see it."""
         waiting, self.waiting = self.waiting, deque()
         for ask, *_ in waiting:
             ask.fail(error)
-        senders, self.senders = self.senders, deque()
-        for sender in senders:
-            if not sender.done():
-                sender.set_result(None)
+        self.senders.release()
 
     def in_hand(self) -> tuple[int, dict[int, Input]]:
         """What the life has been fed, and what waits for that."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Protocol
 
 from ..actors.errors import HoldfastError
 from ..actors.events import Event, JournalBlocked, JournalGoesOn, JournalStopped
-from .journal import Entry, Journal, MemoryJournal, Saved, StoreFailed
+from .journal import Entry, InHand, Journal, MemoryJournal, Saved, StoreFailed
 from .method import Durability
 
 if TYPE_CHECKING:
@@ -54,6 +54,10 @@ class Submission(Protocol):
         """It was not written. False: it has happened, and must be written when that is possible again."""
         ...
 
+    def abandoned(self, error: HoldfastError) -> None:
+        """It has happened, and will never be written: who waits for it is told."""
+        ...
+
 
 class Commits:
     """The journal of a root's homes: an engine, and what waits for it.
@@ -76,6 +80,7 @@ class Commits:
         where: str = "/",
     ) -> None:
         self.engine, self.durable, self.epoch = engine, engine.durable, engine.epoch
+        self.in_hand: InHand | None = getattr(engine, "in_hand", None)
         self.commits = self
         self.durability: Durability = durability if engine.durable else "memory"
         self.wake_handler: Callable[[], None] | None = None  # has the message handler come, if there is one
@@ -131,8 +136,9 @@ class Commits:
 
     def submit(self, submission: Submission) -> None:
         """Take in what has happened: it is written at the end of this tick, or when the store has room again."""
-        if self.stopped is not None:
-            return  # It never leaves: what is open now is taken up again when the store is.
+        if self.stopped is not None:  # It never leaves: what is open now is taken up again when the store is.
+            submission.abandoned(self.stopped)
+            return
         number = 0
         if self._synced_paths and self._is_slow(submission.entries):
             self._count = number = self._count + 1
@@ -284,7 +290,8 @@ class Commits:
         self._unsynced.clear()
         self._pending = []
         for submission in waiting:
-            submission.refused(error)
+            if not submission.refused(error):
+                submission.abandoned(error)
         self._emit(JournalStopped(self._where, str(error)))
 
     # -- syncing ----------------------------------------------------------------------------------------------------
@@ -399,7 +406,11 @@ class Commits:
             if self._overdue is not None:
                 self._overdue.cancel()
                 self._overdue = None
-            self.engine.close()
+            try:
+                self.engine.close()
+            except HoldfastError as error:  # Only now it has turned out that it is not there any more.
+                self._stop(error)
+                raise
 
 
 class Unkept(MemoryJournal):

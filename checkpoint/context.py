@@ -19,7 +19,7 @@ from ..actors.mail import Ask, Item, ReplyHandle
 from ..actors.message import Message, message_name
 from ..actors.ref import ActorRef, current
 from .records import Feed, PipeDone
-from .turns import Fed
+from .turns import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
     from .life import Life
@@ -37,22 +37,23 @@ class RecordedReplyHandle(ReplyHandle[R]):
 
     def reply(self, value: R) -> None:
         """Answer, from a turn of the same actor."""
-        life = _life_of_turn()
-        answer = life.answer_value(value)
+        life = _own_life("answers later")
+        answer = life.answer_value(value, set)  # What was declared is not known here: sets are looked for.
         life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
 
     def fail(self, error: HoldfastError) -> None:
         """Answer with a Refusal or another typed error, from a turn of the same actor."""
-        life = _life_of_turn()
+        life = _own_life("answers later")
         answer = life.answer_error(error)
         life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
 
 
-def _life_of_turn() -> Life:
+def _own_life(what: str) -> Life:
+    """The life whose turn or hook this is."""
     ctx = current.get(None)
-    if not isinstance(ctx, RecordedContext) or not ctx.in_turn():
-        raise HoldfastError("a recorded actor answers later from one of its own turns")
-    return ctx.recorded
+    if not isinstance(ctx, RecordedContext):
+        raise HoldfastError(f"a recorded actor {what} from one of its own turns")
+    return ctx.acting()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,7 +64,7 @@ class RecordedTimer:
 
     def cancel(self) -> None:
         """The message does not come any more, not even one that is queued already."""
-        _life_of_turn().cancel_timer(self.id)
+        _own_life("cancels its timers").cancel_timer(self.id)
 
 
 class RecordedContext(ActorContext):
@@ -78,18 +79,26 @@ class RecordedContext(ActorContext):
 
     def in_turn(self) -> bool:
         """Whether this code runs in the turn in hand, not in a background task."""
-        if self.recorded.feed is None:
-            return False
-        try:
-            task = asyncio.current_task()
-        except RuntimeError:
-            return True
-        return task is None or task.get_name() == "holdfast runner"
+        return self.recorded.feed is not None and not _in_background()
+
+    def acting(self) -> Life:
+        """The life, whose turn or hook it must be that runs.
+
+        Raises:
+            HoldfastError: this is `__init__`, or a background task.
+        """
+        if not self.in_turn():
+            self._outside()
+        return self.recorded
 
     def _outside(self) -> None:
-        """Hooks may send (at once, unrecorded); background tasks may not."""
+        """Hooks may act (at once, unrecorded); background tasks may not, and neither may `__init__`."""
         self._alive()
-        if not self.recorded.in_hook:
+        life = self.recorded
+        if life.hook == INIT:
+            why = "__init__ runs at each life, before the state is back"
+            raise HoldfastError(f"{self.path}: {why}; act in on_start, or in on_recovered")
+        if not life.hook or _in_background():
             raise HoldfastError(
                 f"{self.path}: background tasks of a recorded actor may not send; report with ctx.pipe_to_self()"
             )
@@ -107,9 +116,13 @@ class RecordedContext(ActorContext):
             self._random = random.Random(f"{self.path}|{life.turn}|{when}")
         return self._random
 
+    def draw_anew(self) -> None:
+        """A turn is about to be run again: it draws the same numbers as the first time."""
+        self._random = None
+
     def find(self, path: str, kind: type[A]) -> ActorRef[A]:
         """A ref to the address, whoever lives there: under replay somebody else, or nobody yet (T21)."""
-        if not self.in_turn():
+        if not self.in_turn() and not self.recorded.hook:
             return super().find(path, kind)
         node = self.cell.node
         cell = node.cell_at(path)
@@ -129,8 +142,11 @@ class RecordedContext(ActorContext):
             self._outside()
             await super().send(cell, message)
             return
+        await self._accepted(self._put("send", cell, message))
+
+    async def _accepted(self, k: int) -> None:
+        """Have output `k` leave, and wait until it is accepted."""
         life = self.recorded
-        k = self._put("send", cell, message)
         accepted: asyncio.Future[None] = self.cell.node.loop.create_future()
         life.asks[life.turn, k] = accepted, None
         life.release()
@@ -139,7 +155,7 @@ class RecordedContext(ActorContext):
     def _put(self, verb: str, cell: Cell, message: Message[Any], *, seconds: float = 0.0) -> int:
         if type(message) not in cell.table:
             cell.require(message)
-        body = self.cell.node.codec.encode(message, cell.path)
+        body = self.cell.node.codec.encode_alike(message, cell.path)
         return self.recorded.put(verb, cell.path, message_name(type(message)), body, seconds=seconds)
 
     def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
@@ -169,8 +185,14 @@ class RecordedContext(ActorContext):
             self._outside()
             await super().publish(topic, message)
             return
-        body = self.cell.node.codec.encode(message, topic)
-        self.recorded.put("publish", topic, message_name(type(message)), body)
+        body = self.cell.node.codec.encode_alike(message, topic)
+        k = self.recorded.put("publish", topic, message_name(type(message)), body)
+        if self.waits_for_room(topic):
+            await self._accepted(k)
+
+    def waits_for_room(self, topic: str) -> bool:
+        """Whether to wait, in the middle of the turn, until all subscribers have accepted what is published."""
+        return True
 
     async def flush(self) -> None:
         self.recorded.release()
@@ -179,19 +201,12 @@ class RecordedContext(ActorContext):
 
     def _timer(self, message: Message[Any], delay: float, interval: float) -> Any:
         self.cell.require(message)
-        life = self.recorded
-        if not self.in_turn():
-            self._outside()
-        body = self.cell.node.codec.encode(message, self.path)
-        k = life.put(
-            "timer",
-            f"{life.turn}.{life.last_k + 1}",
-            message_name(type(message)),
-            body,
-            seconds=delay,
-            interval=interval,
-        )
-        return RecordedTimer(f"{life.turn}.{k}")
+        life = self.acting()
+        name, body = message_name(type(message)), self.cell.node.codec.encode_alike(message, self.path)
+        in_turn = life.feed is not None
+        key = f"{life.turn}.{life.last_k + 1}" if in_turn else life.timer_of_hook(name, body, interval)
+        life.put("timer", key, name, body, seconds=delay, interval=interval)
+        return RecordedTimer(key)
 
     def tell_after(self, delay: float, message: Message[Any]) -> Any:
         return self._timer(message, delay, 0.0)
@@ -205,16 +220,15 @@ class RecordedContext(ActorContext):
         then: Callable[[T], Message[Any]],
         failed: Callable[[BaseException], Message[Any]] | None = None,
     ) -> None:
-        life = self.recorded
-        if not self.in_turn():
-            self._outside()
-        feed = life.feed
-        k = life.put("pipe", "")
-        if feed is not None and k in feed.pipes:  # Its result was journaled before the crash: it will be fed.
-            if asyncio.iscoroutine(work):
-                work.close()
-            return
-        life.pipes += 1
+        life, feed = self.acting(), self.recorded.feed
+        k = 0  # What a hook begins is begun again by the next life's: no turn has to stay in the journal for it.
+        if feed is not None:
+            k = life.put("pipe", "")
+            if k in feed.pipes:  # Its result was journaled before the crash: it will be fed.
+                if asyncio.iscoroutine(work):
+                    work.close()
+                return
+            life.pipes += 1
         tasks = self.cell.extra().tasks
         task = self.cell.node.loop.create_task(
             self._piped(life.turn, k, work, then, failed), name=f"pipe of {self.path}"
@@ -225,23 +239,16 @@ class RecordedContext(ActorContext):
             task.add_done_callback(lambda _: work.close())
 
     async def _piped(self, turn: int, k: int, work: Any, then: Any, failed: Any) -> None:
+        codec = self.cell.node.codec
         try:
-            message = then(await work)
-        except asyncio.CancelledError:
-            raise
-        except BaseException as error:
-            if failed is None:  # Nobody takes the error: the actor crashes, once.
-                self._piped_back(PipeDone(turn, k, "", self.cell.node.codec.encode_error(remote_crash(error))[2]))
-                return
-            message = failed(error)
-        self._piped_back(
-            PipeDone(turn, k, message_name(type(message)), self.cell.node.codec.encode(message, self.path))
-        )
-
-    def _piped_back(self, record: PipeDone) -> None:
+            message = await self._outcome(work, then, failed)
+            record = PipeDone(turn, k, message_name(type(message)), codec.encode(message, self.path))
+        except BaseException as error:  # Nobody takes it: the actor crashes, once.
+            record = PipeDone(turn, k, "", codec.encode_error(remote_crash(self._uncaught(error)))[2])
         if not self.closed:
             self.recorded.port.to_home(record)
-            self.recorded.pipe_back()
+            if k:
+                self.recorded.pipe_back()
 
     # -- stash, links, subscriptions --------------------------------------------------------------------------------
 
@@ -255,7 +262,9 @@ class RecordedContext(ActorContext):
         life.stash.append(fed)
 
     def unstash(self) -> None:
-        life = self.recorded
+        life = self.acting()
+        if life.hook == STARTED:  # In a process, what was put aside may not be here yet.
+            life.unstashes = True
         stash, life.stash = life.stash, []
         again = [Fed(life, once_more(fed.feed), fed.message, fed.sender) for fed in stash]
         if life.is_live:
@@ -265,24 +274,24 @@ class RecordedContext(ActorContext):
             life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
 
     def monitor(self, other: ActorRef[Any]) -> Monitor:
-        self.recorded.put("monitor", other.path)
+        self.acting().put("monitor", other.path)
         return RecordedMonitor(self.cell, other._cell, for_good=False)
 
     def watch(self, other: ActorRef[Any]) -> Monitor:
-        self.recorded.put("watch", other.path)
+        self.acting().put("watch", other.path)
         return RecordedMonitor(self.cell, other._cell, for_good=True)
 
     def link(self, other: ActorRef[Any]) -> None:
-        self.recorded.put("link", other.path)
+        self.acting().put("link", other.path)
 
     def unlink(self, other: ActorRef[Any]) -> None:
-        self.recorded.put("unlink", other.path)
+        self.acting().put("unlink", other.path)
 
     def subscribe(self, topic: str) -> None:
-        self.recorded.put("subscribe", topic)
+        self.acting().put("subscribe", topic)
 
     def unsubscribe(self, topic: str) -> None:
-        self.recorded.put("unsubscribe", topic)
+        self.acting().put("unsubscribe", topic)
 
     def depart(self, owe: Callable[[Ask], int]) -> bytes:
         self.recorded.last_snapshot()
@@ -313,6 +322,15 @@ class RecordedContext(ActorContext):
         self.recorded.close()
 
 
+def _in_background() -> bool:
+    """Whether this code runs in a task of its own."""
+    try:
+        task = asyncio.current_task()
+    except RuntimeError:
+        return False
+    return task is not None and task.get_name() != "holdfast runner"
+
+
 class RecordedMonitor(Monitor):
     """A handle on a watch that the home keeps."""
 
@@ -321,7 +339,7 @@ class RecordedMonitor(Monitor):
     def cancel(self) -> None:
         """No further DOWN is admitted after the turn in hand."""
         self.active = False
-        _life_of_turn().put("unwatch" if self.for_good else "demonitor", self.target.path)
+        _own_life("stops watching").put("unwatch" if self.for_good else "demonitor", self.target.path)
 
 
 def once_more(feed: Feed) -> Feed:

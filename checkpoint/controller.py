@@ -17,17 +17,23 @@ from ..actors.errors import StartFailed, StartIgnored
 from ..actors.exits import KILLED, ExitReason
 from ..actors.mail import Item
 from ..actors.process import frames
+from ..actors.process.children import parent_of
+from ..actors.process.connection import BadFrame
 from ..actors.process.limits import Limits
 from ..actors.process.remote import ProcessHost
 from ..actors.process.workers import Worker, Workers
-from .homes import ENDED, HomeHost, Homes, parent_ended, seen
+from .homes import ENDED, HomeHost, Homes, seen
 from .life import Life
 from .method import Method
-from .records import ToHome, ToLife
+from .records import Released, Snapshot, ToHome, ToLife, TurnEnd
 from .switch import Switch
 from .turns import StopRecorded
 
 FROM_LIFE: msgspec.msgpack.Decoder[ToHome] = msgspec.msgpack.Decoder(ToHome)
+
+
+SENT = frozenset(("tell", "send", "ask", "forward", "publish"))
+"""Outputs that are messages to somebody."""
 
 
 class TaskHost(HomeHost, lives.LocalHost):
@@ -60,7 +66,8 @@ class TaskHost(HomeHost, lives.LocalHost):
         """S3, the new life with its state."""
         start = cell.extra().start
         assert start is not None
-        life = self.life = Life(cell, LocalHome(self, cell), self.method, None)
+        self.page = self.homes.page(switch)
+        life = self.life = Life(cell, LocalHome(self, cell), self.method, self.page)
         for record in switch.restore_records():
             life.from_home(record)
         life.begin(start, switch.state_turn, switch.stash)
@@ -125,7 +132,7 @@ class TaskHost(HomeHost, lives.LocalHost):
         if self._starting is not None and not self._starting.done():
             self._starting.cancel()
         start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=parent_ended(cell))
+        self.give_up(cell, start.kind._topics if start is not None else (), restarting=lives.parent_ended(cell))
 
 
 class LocalHome:
@@ -156,6 +163,8 @@ class LocalHome:
 class LocalLife:
     """From a home to its life, in one process."""
 
+    begins = True
+
     def __init__(self, life: Life) -> None:
         self._life = life
 
@@ -184,7 +193,7 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         assert clock is not None
         await self.gate("restart")
         worker, recipe = await self.take(cell)
-        worker.record_taker = functools.partial(own_records, switch)
+        worker.record_taker = functools.partial(own_records, worker, switch)
         self.subscribe(cell, start.kind._topics)
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
@@ -232,23 +241,44 @@ class RecordedProcessHost(HomeHost, ProcessHost):
     def retired(self, cell: Cell) -> None:
         ProcessHost.retired(self, cell)
         start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=parent_ended(cell))
+        self.give_up(cell, start.kind._topics if start is not None else (), restarting=lives.parent_ended(cell))
 
 
-def own_records(switch: Switch, path: str) -> frames.TakeRecord:
+def own_records(worker: Worker, switch: Switch, path: str) -> frames.TakeRecord:
     """Who takes the records of a process with one recorded actor."""
-    decode = FROM_LIFE.decode
-    return lambda frame: switch.from_life(decode(frame.body))
+    return records_of(worker, switch.from_life)
+
+
+def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRecord:
+    """Hand the records of a life in a process on, as far as it may say such a thing.
+
+    Raises (when one comes):
+        BadFrame: it sends what it may not send, or names the memory of another process.
+    """
+    decode, gate = FROM_LIFE.decode, worker.gate
+
+    def taken(frame: frames.Record) -> None:
+        record = decode(frame.body)
+        if isinstance(record, (TurnEnd, Released)):
+            for out in record.outs:
+                if out.verb in SENT:
+                    gate.output(out.to, out.name)
+        elif isinstance(record, Snapshot) and record.image is not None:
+            pid = record.image.pid
+            if pid != worker.pid and parent_of(pid) != worker.pid:
+                raise BadFrame(f"an image in the memory of process {pid}")
+        take(record)
+
+    return taken
 
 
 class RemoteLife:
     """From a home to its life, in another process."""
 
+    begins = True
+
     def __init__(self, path: str, worker: Worker) -> None:
         self._path, self._connection = path, worker.connection
-        self._name: frames.Name = path
 
     def to_life(self, record: ToLife) -> None:
-        if type(self._name) is str:  # The number is known from the second record on.
-            self._name = self._connection.name_out(self._path)
-        self._connection.send(frames.Record(self._name, record), self._path)  # type: ignore[arg-type]  # encoded in place
+        self._connection.send(frames.Record(self._connection.name_out(self._path), record), self._path)  # type: ignore[arg-type]  # encoded in place

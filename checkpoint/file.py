@@ -64,6 +64,7 @@ class RecoveryFile:
             raise SpecError(path, str(error)) from error
         self._classes: dict[str, Entry] = {}
         self._addresses: list[tuple[str, Entry]] = []
+        self._unmet: dict[str, str] = {}
         for name, table in tables.items():
             is_address = name.startswith("/")
             if not isinstance(table, dict) or not (is_address or ":" in name):
@@ -82,6 +83,9 @@ class RecoveryFile:
         Raises:
             SpecError: there is no such actor class, or the addresses are another system's.
         """
+        entries = dict(self._addresses) | self._classes
+        unmet = (name for name, one in entries.items() if one.method is None or one.method.records)
+        self._unmet = {name: self._where(name) for name in unmet}
         for name, _ in self._addresses:
             fixed = re.split(r"[*?[]", name, maxsplit=1)[0]
             if not fixed.startswith(f"/{system}/") and (fixed == name or not f"/{system}/".startswith(fixed)):
@@ -100,10 +104,7 @@ class RecoveryFile:
         Of the tables for addresses the one that names it counts, else the first that fits; then that for the class,
         which may also add the key variables to what another place says of the method.
         """
-        fitting = [entry for glob, entry in self._addresses if glob == address]
-        fitting += [entry for glob, entry in self._addresses if fnmatch.fnmatchcase(address, glob)]
-        by_class = self._classes.get(message_name(kind))
-        fitting += [by_class] if by_class is not None else []
+        fitting = self.meet(address, message_name(kind))
         method = given or next((entry.method for entry in fitting if entry.method is not None), None)
         named = next((entry for entry in fitting if entry.key_variables is not None), None)
         if named is None:
@@ -112,6 +113,21 @@ class RecoveryFile:
         if not method.records:
             return method
         return dataclasses.replace(method, key_variables=named.key_variables, origin=named.origin)
+
+    def meet(self, address: str, kind: str) -> list[Entry]:
+        """Somebody is started: the tables that are for it, the most telling first."""
+        names = [name for name, _ in self._addresses if name == address]
+        names += [name for name, _ in self._addresses if fnmatch.fnmatchcase(address, name)]
+        names += [kind] if kind in self._classes else []
+        for name in names:
+            self._unmet.pop(name, None)
+        known = dict(self._addresses) | self._classes
+        return [known[name] for name in names]
+
+    def take_unmet(self) -> list[tuple[str, str]]:
+        """The tables that nobody has been started for up to now, and where they stand; each is given out once."""
+        unmet, self._unmet = self._unmet, {}
+        return list(unmet.items())
 
     def complete(self, spec: Any, address: str) -> Any:
         """A child spec with the recovery that this file has for it. Raises SpecError: it does not go with the class."""

@@ -190,8 +190,7 @@ def _image(home: Switch) -> Image:
     outcomes = sorted(home.calls.outcomes.items())
     entries += [("got", turn, k, answer.kind, answer.name, answer.body) for (turn, k), answer in outcomes]
     for number, turn in home.turns.items():
-        more = (turn.state,) if turn.state else ()
-        entries.append(("end", number, turn.input.id, turn.status, tuple(turn.digests), *more))
+        entries.append(("end", number, turn.input.id, turn.status, tuple(turn.digests), *turn.digests_of_end()))
     if home.partial:
         entries.append(("out", home.turn + 1, home.partial_id, tuple(home.partial)))
     return Image(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in entries])

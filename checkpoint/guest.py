@@ -15,7 +15,7 @@ from ..actors.errors import StartFailed, StartIgnored
 from ..actors.exits import ExitReason, pack_exit
 from ..actors.keeper import child_key
 from ..actors.mail import Envelope, Item
-from ..actors.mailbox import Bounded
+from ..actors.mailbox import Bounded, Senders
 from ..actors.message import message_name
 from ..actors.process import frames
 from ..actors.process.relay import send_signal
@@ -220,6 +220,33 @@ class OwnHost(LifeHost):
         self._guest.report_end(cell, cell.extra().reason)
 
 
+class Homeward:
+    """The room at an actor whose home is at the root: as many messages may be on the way as its mailbox holds."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, capacity: int) -> None:
+        self._loop, self._capacity = loop, capacity
+        self._on_way = 0
+        self._senders = Senders()
+
+    def left(self, accepted: asyncio.Future[None]) -> None:
+        """A message has left, whose sender waits until it is accepted."""
+        self._on_way += 1
+        accepted.add_done_callback(self._arrived)
+
+    def _arrived(self, accepted: asyncio.Future[None]) -> None:
+        self._on_way -= 1
+        self._senders.wake(lambda: self.has_room)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether one more may leave."""
+        return self._on_way < self._capacity
+
+    def room(self) -> asyncio.Future[None] | None:
+        """None if so; else a future that ends when it is worth trying again."""
+        return None if self.has_room else self._senders.wait(self._loop)
+
+
 class InnerLifeHost(LifeHost):
     """The host of a recorded child of a supervisor in this process: everything sent to it goes home first."""
 
@@ -230,6 +257,7 @@ class InnerLifeHost(LifeHost):
         self._life = None
         self._port: Port | None = None
         self._bound: Bounded | None = None
+        self._homeward: Homeward | None = None
         self._number = 0
         self._up: asyncio.Future[None] | None = None
 
@@ -247,6 +275,8 @@ class InnerLifeHost(LifeHost):
         cell.admit = self._admit
         if more.bound is not None:  # The home counts.
             self._bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
+            if self._bound.overflow == "block":
+                more.outlet = self._homeward = Homeward(cell.node.loop, self._bound.capacity)
         self._number += 1
         self._up = cell.node.loop.create_future()
         port = self._port = self._joined(cell)
@@ -261,6 +291,12 @@ class InnerLifeHost(LifeHost):
         port.on_started = lambda record: self._started(cell, record)
         port.on_closed = lambda: self._closed(cell)
         return port
+
+    def progress(self, cell: Cell) -> object:
+        life = self._life
+        if life is None or (life.feed is None and not cell.queue):
+            return object()  # It waits for its home.
+        return life.turn
 
     def take_up(self, cell: Cell, life: Life, number: int) -> None:
         """A life that has come back here is that of the address, as if it had been wanted as `number`."""
@@ -352,7 +388,10 @@ class InnerLifeHost(LifeHost):
 
     def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
         message, sender = (item.message, item.sender) if isinstance(item, Envelope) else (item, None)
-        return self._guest.offer(cell.path, message, sender)
+        accepted = self._guest.offer(cell.path, message, sender)
+        if self._homeward is not None:
+            self._homeward.left(accepted)
+        return accepted
 
     def push(self, cell: Cell, item: Item) -> None:
         if isinstance(item, (links.Exit, links.Down)):

@@ -7,7 +7,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..actors.cell import DOWN, GONE, RUNNING, Cell
+from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import ControlFailed, HoldfastError, StartFailed, StartIgnored
 from ..actors.events import ActorStarted, Recovered, RecoveryFailed
 from ..actors.exits import ExitReason
@@ -23,6 +23,7 @@ from .inputs import HomeJournal
 from .journal import Journal, Saved
 from .method import Durability, Method
 from .quarantine import PLACE, Quarantine
+from .records import START
 from .recovery.held import hold, inlet, let_go
 from .recovery.register import Recoveries, Recovery
 from .rejoin import Rejoin
@@ -30,6 +31,7 @@ from .rollback import older_snapshot, roll_back
 from .switch import Switch
 
 if TYPE_CHECKING:
+    from ..actors.mail import Ask
     from ..actors.node import Node
 
 ENDED = "it ended before it was live"
@@ -61,15 +63,21 @@ class Homes:
         self.rejoin = Rejoin(self)
 
     def of(self, cell: Cell, method: Method) -> Switch:
-        """The home of an address; taken up from the store when it is first asked for."""
+        """The home of an address; taken up from the store when it is first asked for.
+
+        Raises:
+            StartFailed: the class that is to live there would misread what is recorded.
+        """
         switch = self._switches.get(cell.path)
         if switch is None:
-            switch = self._switches[cell.path] = Switch(
-                self.node, cell.path, method, self._journal_of(method), self.planted.pop(cell.path, None)
-            )  # fmt: skip
-            switch.recoveries, switch.quarantine, switch.rejoin = self.recoveries, self.quarantine, self.rejoin
+            switch = Switch(self.node, cell.path, method, self._journal_of(method), self.planted.get(cell.path))
             switch.cell = cell
+            self._check(switch, cell)
+            self.planted.pop(cell.path, None)
+            self._switches[cell.path] = switch
+            switch.recoveries, switch.quarantine, switch.rejoin = self.recoveries, self.quarantine, self.rejoin
             self.rejoin.loaded(switch)
+            self._count_death(switch)
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
                 begin()
@@ -87,6 +95,43 @@ class Homes:
         cell.admit = switch.admit
         more.outlet = switch
         return switch
+
+    def _check(self, switch: Switch, cell: Cell) -> None:
+        """Refuse what would misread the records of a home that was just read.
+
+        Raises:
+            StartFailed: with the difference in words; the home is forgotten, and the store as it was.
+        """
+        try:
+            switch.shapes.check(cell)
+        except StartFailed:
+            switch.timers.pause()
+            switch.images.close()
+            raise
+
+    def _count_death(self, switch: Switch) -> None:
+        """The root was killed in a turn of this actor: count that against its input, durably, before it begins again.
+
+        Raises:
+            StartFailed: the store refused.
+        """
+        hands = self.journal.in_hand
+        source = None if hands is None else switch.open.get(hands.begun(switch.path))
+        if hands is None or source is None or source.kind == START:
+            return
+        source.deliveries += 1
+        try:
+            source.positions += self.journal.append([(switch.path, ("tried", source.id, source.deliveries))])
+        except HoldfastError as error:
+            raise StartFailed(switch.path, str(error)) from error
+        hands.word(switch.path)[0] = 0
+        if source.deliveries >= switch.method.max_deliveries:
+            switch.ends.quarantine(source)
+
+    def page(self, switch: Switch) -> memoryview | None:
+        """Where a life in this process says which input it has in hand, so that it is known when that one is killed."""
+        hands = self.journal.in_hand
+        return None if hands is None or not switch.journal.durable else hands.word(switch.path)
 
     def _journal_of(self, method: Method) -> HomeJournal:
         """Where what happens at an address is kept, from its first life on."""
@@ -273,6 +318,7 @@ class HomeHost:
     """What all hosts of recorded actors have in common: the home, and the clock of the recovery at hand."""
 
     takes_parcels = True
+    page: memoryview | None = None  # of a life in this process
 
     def __init__(self, homes: Homes, method: Method) -> None:
         self.homes, self.method = homes, method
@@ -290,6 +336,9 @@ class HomeHost:
             hold(switch)
             switch.waits_for_release = recoveries.needs(self.recovery, "release")
         return switch, live, recovering
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
 
     @property
     def is_gated(self) -> bool:
@@ -351,6 +400,8 @@ class HomeHost:
         switch = self.switch
         if switch is None:
             return
+        if self.page is not None:
+            self.page[0] = 0
         self.clock = Clock()
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
@@ -374,6 +425,10 @@ class HomeHost:
         last = commits.last if commits.submitted != before else None
         return last.accepted() if isinstance(last, Admission) else None
 
+    def progress(self, cell: Cell) -> object:
+        """How far the replay has come."""
+        return None if self.switch is None else self.switch.progress
+
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
@@ -385,6 +440,10 @@ class HomeHost:
     def backlog(self, cell: Cell) -> int:
         """Messages that wait."""
         return 0 if self.switch is None else self.switch.backlog(self.running(cell))
+
+    def load(self, cell: Cell) -> int:
+        """Messages that wait and those in hand; what the actor has put aside is among them."""
+        return 0 if self.switch is None else len(self.switch.open)
 
     def running(self, cell: Cell) -> int:
         """The input in hand, -1 if none is known."""
@@ -446,11 +505,6 @@ class HomeHost:
                 raise StartFailed(switch.path, ENDED)
             switch.waits_for_release = False
             switch.let_at()
-
-
-def parent_ended(cell: Cell) -> bool:
-    """Whether it is the supervisor of a retired cell that has ended: both may be started again."""
-    return cell.parent is not None and cell.parent.state is not RUNNING
 
 
 def seen(start: asyncio.Task[None]) -> None:

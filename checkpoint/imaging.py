@@ -22,7 +22,7 @@ import msgspec
 from .image import IMAGE_BYTES, Imager, Key, estimate
 from .keys import state_of, variables
 from .records import Kept, Marked, Shared, Snapshot, Unsaved
-from .segments import Layout, Place, Segment, by_segment, can_share, new_number, places_of, write_changed
+from .segments import Layout, Place, Segment, by_segment, can_share, memory_file, new_number, places_of, write_changed
 
 if TYPE_CHECKING:
     from .life import Life
@@ -85,8 +85,8 @@ class Imaging:
         begin = time.perf_counter()
         state = state_of(actor)
         number = new_number()
-        file = os.memfd_create(f"holdfast {number:x}", os.MFD_CLOEXEC)
-        job = _Job(life.turn, [fed.feed.id for fed in life.stash], number, file)
+        file = memory_file(number)
+        job = _Job(life.turn, [fed.feed.id for fed in life.stash], number, file, life.traps)
         try:
             if self._may_fork and self._should_fork(estimate(actor, variables(actor))) and is_alone():
                 self._writer = Writer(self, job, state)
@@ -134,7 +134,8 @@ class Imaging:
         self._last_share = new / max(1, self.last_bytes)
         shared = Shared(job.number, os.getpid(), job.file, segment.inode, segment.size, places)
         life.image_taken(job.turn)
-        life.port.to_home(Snapshot(job.turn, b"", True, job.stash, job.pause, False, shared))
+        said = life.made_by()
+        life.port.to_home(Snapshot(job.turn, b"", True, job.stash, job.pause, False, shared, job.traps, *said))
 
     def kept(self, record: Kept) -> None:
         """The home has it, or has not."""
@@ -189,8 +190,8 @@ class Imaging:
 class _Job:
     """One image to be written: after which turn, into which file."""
 
-    def __init__(self, turn: int, stash: list[int], number: int, file: int) -> None:
-        self.turn, self.stash, self.number, self.file = turn, stash, number, file
+    def __init__(self, turn: int, stash: list[int], number: int, file: int, traps: bool) -> None:
+        self.turn, self.stash, self.number, self.file, self.traps = turn, stash, number, file, traps
         self.pause = 0.0
 
 

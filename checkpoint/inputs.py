@@ -45,14 +45,19 @@ class Input(msgspec.Struct, gc=False, eq=False):
     positions: list[int] = NO_POSITIONS
     held: bool = False  # not as safe yet as it has to be: it must not be fed
 
-    def feed(self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False) -> Feed:
-        """As the life gets it; what has begun is finished whatever its deadline."""
+    def feed(
+        self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False, was_asked: bool = False
+    ) -> Feed:
+        """As the life gets it; what has begun is finished whatever its deadline.
+
+        `was_asked`: it was an ask when it was handled first, and is replayed as one.
+        """
         ask = self.ask
         deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
         origin = self.origin if self.kind == TICK else ""
         return Feed(
             self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
-            ask is not None, self.chain, pipes, deadline, origin,
+            was_asked or ask is not None, self.chain, pipes, deadline, origin,
         )  # fmt: skip
 
 
@@ -63,6 +68,11 @@ class Turn(msgspec.Struct, gc=False, eq=False):
     status: str
     digests: list[int]
     state: int = 0  # digest of the state it has left, if that is checked
+    reply: int = 0  # digest of its reply, if it was asked for one
+
+    def digests_of_end(self) -> tuple[int, ...]:
+        """What its end record says of the state and the reply, as far as there is something to say."""
+        return (self.state, self.reply) if self.reply else (self.state,) if self.state else ()
 
 
 class TimerState:
@@ -78,9 +88,10 @@ class TimerState:
 class Batch:
     """What becomes one append, and what happens when it is safe."""
 
-    __slots__ = ("after", "entries", "sinks")
+    __slots__ = ("after", "asks", "entries", "sinks")
 
     def __init__(self) -> None:
+        self.asks: list[Ask] = []  # what it answers when it is safe
         self.entries: list[tuple[str, Entry]] = []
         self.sinks: list[list[int]] = []
         self.after: list[Callable[[], None]] = []
@@ -110,3 +121,8 @@ class Batch:
     def refused(self, error: HoldfastError) -> bool:
         """It has happened: it waits."""
         return False
+
+    def abandoned(self, error: HoldfastError) -> None:
+        """What it was to answer is answered with the error: whether it has happened is seen when the store is back."""
+        for ask in self.asks:
+            ask.fail(error)

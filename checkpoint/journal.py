@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 __all__ = [
     "DamagedStore",
     "Entry",
+    "ForeignStore",
     "Journal",
     "MemoryJournal",
     "Primitive",
@@ -35,6 +36,8 @@ class StoreInUse(StoreError):
         self.path, self.pid = path, pid
 
     def __str__(self) -> str:
+        if not self.pid:
+            return f"store {self.path} is open in a process that cannot be seen from here (another container?): stop it"
         return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
 
 
@@ -80,6 +83,20 @@ class StoreFailed(StoreError):
 
     def __str__(self) -> str:
         return f"store {self.path} failed: {self.reason}"
+
+
+class ForeignStore(StoreError):
+    """The store was not opened, and nothing in it was changed: a part of it is another's, or open to others."""
+
+    def __init__(self, path: str, part: str, problem: str, remedy: str) -> None:
+        super().__init__(path, part, problem, remedy)
+        self.path, self.part, self.problem, self.remedy = path, part, problem, remedy
+
+    def __str__(self) -> str:
+        return (
+            f"store {self.path} is not opened, and nothing in it was changed: "
+            f"{self.part}: {self.problem}; {self.remedy}"
+        )
 
 
 class Saved(NamedTuple):
@@ -194,6 +211,18 @@ class Journal(Protocol):
 
     def close(self) -> None:
         """Release the store; a second call does nothing. What is closed refuses to write, with a StoreError."""
+        ...
+
+
+class InHand(Protocol):
+    """Which inputs are in hand, as it outlives the process: what an engine may have as its attribute `in_hand`."""
+
+    def begun(self, address: str) -> int:
+        """The input that was in hand at an address when the last owner of the store was killed; -1: none."""
+        ...
+
+    def word(self, address: str) -> memoryview:
+        """A word of that address, in memory that outlives the process: 1 + the input in hand, or 0."""
         ...
 
 

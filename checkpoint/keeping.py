@@ -15,7 +15,7 @@ import msgspec
 from ..actors.errors import HoldfastError
 from ..actors.events import SnapshotTaken
 from .records import PIECE, Kept, Marked, Restore, Shared, Snapshot
-from .saved import IMAGES, Meta, meta_now, put
+from .saved import IMAGES, Meta, made_by, meta_now, put
 from .segments import Place, Segment, by_segment, open_segment
 
 if TYPE_CHECKING:
@@ -77,7 +77,13 @@ class Images:
             raise HoldfastError("a snapshot refers to blocks that are not here")
         self._segments[shared.number] = segment
         return msgspec.structs.replace(
-            marked, format=IMAGES, stash=record.stash, blocks=shared.places, earlier=self.earlier()
+            marked,
+            format=IMAGES,
+            stash=record.stash,
+            traps=record.traps,
+            blocks=shared.places,
+            earlier=self.earlier(),
+            **made_by(self._home, record),
         )
 
     async def _save(self, meta: Meta, record: Snapshot, shared: Shared) -> None:

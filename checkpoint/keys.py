@@ -76,13 +76,42 @@ def _parts(actor: Actor, state: State) -> list[tuple[str, object]]:
     return [(f"{where}.{name}", value) for name, value in state.value.items()]
 
 
-def restore_state(actor: Actor, data: bytes) -> None:
+def restore_state(actor: Actor, data: bytes, variables: tuple[list[str], list[str]] = ([], [])) -> None:
     """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
+
+    Args:
+        actor: constructed, and nothing more.
+        data: the state.
+        variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
 
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
-    put_back(actor, read_image(data) if is_image(data) else decode_value(data))
+    saved = read_image(data) if is_image(data) else decode_value(data)
+    refuse_renamed(actor, saved, *variables)
+    put_back(actor, saved)
+
+
+def refuse_renamed(actor: Actor, saved: Any, before: list[str], now: list[str]) -> None:
+    """Refuse a state with a variable that the class has no more: it was renamed, or what it holds would be lost.
+
+    Variables that are only made later than in `__init__` are nobody's concern here.
+
+    Raises:
+        StateMismatch: with the difference in words.
+    """
+    version, form, state = saved if isinstance(saved, tuple) and len(saved) == 3 else (None, "", None)
+    if form != "keys" or version != actor.schema_version or not isinstance(state, dict) or not now:
+        return
+    gone = [name for name in before if name in state and name not in now]
+    if gone:
+        kind = type_name(type(actor._state_root()))
+        raise StateMismatch(
+            actor.ctx.path,
+            f"it was saved with the variables ({', '.join(before)}), {kind} has ({', '.join(now)}): "
+            f"{', '.join(gone)} would be lost; raise its schema_version, and say in "
+            "migrate(state, from_version) what becomes of it",
+        )
 
 
 def put_back(actor: Actor, saved: Any) -> None:

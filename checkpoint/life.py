@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
+import zlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -21,7 +22,7 @@ from ..actors.message import Message, message_name
 from .compared import digest_of
 from .context import RecordedContext
 from .imaging import Imaging
-from .keys import check_keys, restore_state, save_state
+from .keys import check_keys, restore_state, save_state, variables
 from .method import Method
 from .readonly import check_readonly
 from .records import (
@@ -31,8 +32,10 @@ from .records import (
     START,
     STASHED,
     Answer,
+    Clock,
     Feed,
     Go,
+    Hooked,
     Ignored,
     Kept,
     Live,
@@ -49,7 +52,7 @@ from .records import (
     pieces,
 )
 from .strict import Guard
-from .turns import Fed, GoLive, Hook, TakeSnapshot
+from .turns import INIT, STOP, Fed, GoLive, Hook, TakeSnapshot
 
 
 class HomePort(Protocol):
@@ -87,18 +90,24 @@ class Life:
         self.gone: tuple[int, ...] = ()
         self.cancelled: set[str] = set()  # timers whose ticks may still be on their way
         self.stop_wanted: ExitReason | None = None
+        self.is_cut_off = False  # it ends by an EXIT that it does not trap
         self.postponed: list[Item] = []  # orders from outside that wait until it is live
         self.is_live = self.is_over = False
         self.has_replayed = False
         self.begins_suspended = False
-        self.in_hook = False
+        self.hook = ""  # the hook that runs, if it is one that is no turn
+        self.timers: dict[str, Clock] = {}  # those that run, as far as a hook has not said so
+        self.unstashes = False  # what was put aside before the snapshot is to come again
         self.guard = Guard() if method.strict else None
         self.is_checked = method.check_replay  # whether the state is compared under replay
         self.ignored_why: str | None = None
         self.saves = True  # whether its state must be one that can be saved
         self._snapshot_turn = -1
         self._state: list[bytes] = []
-        self._has_state = False
+        self._saved_variables: list[str] = []
+        self.variables: list[str] = []  # of the actor, when `__init__` had run; none if it says itself what is saved
+        self._has_state = self._traps = False
+        self._named: dict[int, int] = {}  # how many timers of hooks say this, by its checksum
         self._restore_seconds = 0.0
         self._snapshot_wanted = self._snapshot_postponed = False
         self.images = Imaging(self, may_fork=may_fork)
@@ -113,16 +122,21 @@ class Life:
         """
         cell = self.cell
         cell.life += 1
+        self.hook = INIT
         lives.build(cell, start, self._context)
+        self.hook = ""
         actor = cell.actor
         assert actor is not None
         self.turn = turn
+        if self._traps:
+            cell.extra().trap_exits = True
         try:
             check_keys(actor, self.method, first=not self._has_state)
         except HoldfastError as error:
             self._context_made.close()
             cell.actor = cell.ctx = None
             raise StartFailed(cell.path, str(error)) from error
+        self.variables = [] if hasattr(actor, "get_state") else variables(actor)
         if self.method.check_readonly:
             check_readonly(actor, self)
         if self._has_state:
@@ -130,7 +144,7 @@ class Life:
             try:
                 data = b"".join(self._state)
                 self.images.last_bytes = len(data)
-                restore_state(actor, data)
+                restore_state(actor, data, (self._saved_variables, self.variables))
             except Exception as error:
                 self._context_made.close()
                 cell.actor = cell.ctx = None
@@ -172,7 +186,10 @@ class Life:
                 self._snapshot_turn = -2  # no turn: the next one that is due is taken
             case Restore():
                 self._has_state = True
+                self._traps = self._traps or record.traps
+                self.timers.update(record.timers)
                 self._state.append(record.data)
+                self._saved_variables += record.variables
             case _:
                 pass  # for whoever begins lives
 
@@ -187,7 +204,10 @@ class Life:
         if feed.origin and feed.origin in self.cancelled and feed.turn < 0:
             return  # Its timer was cancelled while it was on its way; the home drops it too.
         if feed.id in self._stashed_ids and feed.turn < 0 and not self.is_live:
-            self.stash.append(fed)
+            if self.unstashes:
+                self.returned[feed.id] = fed
+            else:
+                self.stash.append(fed)
             return
         self._queue(fed)
 
@@ -241,7 +261,7 @@ class Life:
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
         self.feed, self.outs, self.ignored_why = None, [], why
-        self.in_hook = True  # What is left is `on_stop`.
+        self.enter(STOP)  # That is what is left.
         if self.page is not None:
             self.page[0] = 0
         self.port.to_home(Ignored(why))
@@ -252,34 +272,55 @@ class Life:
         if feed is None:
             return
         self.outs = []
-        self.in_hook = True  # What is left is `on_stop`.
-        is_heard = feed.is_ask or feed.kind == START  # The start of a protected actor tells it.
+        self.enter(STOP)  # That is what is left.
+        # The start of a protected actor tells it, and under replay it must not happen at all.
+        is_heard = feed.is_ask or feed.kind == START or feed.turn >= 0
         self.close_turn(FAILED, self.answer_error(remote_crash(error)) if is_heard else Answer())
 
     def answer_error(self, error: BaseException) -> Answer:
         """An error as the asker will get it."""
         return Answer(*self.cell.node.codec.encode_error(error))
 
-    def answer_value(self, value: object) -> Answer:
+    def answer_value(self, value: object, declared: Any) -> Answer:
         """A reply as the asker will get it; one that cannot be coded becomes the asker's error."""
         try:
-            return Answer(REPLY, "", self.cell.node.codec.encode(value, self.cell.path))
+            return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, self.cell.path, declared))
         except BadMessage as error:
             return self.answer_error(BadMessage("reply", error.message, error.problem))
 
     def put(
         self, verb: str, to: str, name: str = "", body: bytes = b"", *, seconds: float = 0.0, interval: float = 0.0
     ) -> int:
-        """One more output of the turn in hand; returns its number.
+        """One more output of the turn in hand, or of the hook that runs; returns its number.
 
-        Raises:
-            HoldfastError: no turn is in hand.
+        What a hook does takes effect at once: a hook runs at each life, and is not replayed.
         """
-        if self.feed is None:
-            raise HoldfastError(f"{self.cell.path}: only a turn can do this, not a hook or a background task")
         self.last_k = k = self.last_k + 1
-        self.outs.append(Out(k, verb, to, name, body, seconds, interval))
+        out = Out(k, verb, to, name, body, seconds, interval)
+        if self.feed is None:
+            self.port.to_home(Hooked(self.hook, out))
+        else:
+            self.outs.append(out)
         return k
+
+    def enter(self, hook: str) -> None:
+        """A hook begins that is no turn."""
+        self.hook, self.last_k = hook, 0
+
+    def timer_of_hook(self, name: str, body: bytes, interval: float) -> str:
+        """The key of a timer that a hook wants. If one that runs says the same, it is that one.
+
+        So `on_start` may set its timers at each life. Another one is named by what it says: the next life that begins
+        at the same state gives it the same name, whatever else its hook does.
+        """
+        clock = (name, body, interval)
+        known = next((key for key, other in self.timers.items() if other == clock), None)
+        if known is not None:
+            del self.timers[known]
+            return known
+        said = zlib.crc32(body, zlib.crc32(f"{name}|{interval}".encode()))
+        self._named[said] = number = self._named.get(said, 0) + 1
+        return f"{self.turn}{self.hook}{said:08x}.{number}"
 
     def cancel_timer(self, key: str) -> None:
         """Ticks that are queued here, or on their way, are dropped here and at home."""
@@ -367,6 +408,12 @@ class Life:
             self._snapshot_postponed = False
             self.want_snapshot()
 
+    @property
+    def traps(self) -> bool:
+        """Whether EXIT signals come to `on_exit`."""
+        more = self.cell.more
+        return more is not None and more.trap_exits
+
     def image_taken(self, turn: int) -> None:
         """An image of the state after this turn is on its way."""
         self._snapshot_turn = turn
@@ -417,7 +464,14 @@ class Life:
         self._snapshot_turn = self.turn  # Before it is sent: a home in this process says at once if it cannot keep it.
         self._snapshot_wanted = False
         for index, part in enumerate(parts, 1):
-            self.port.to_home(Snapshot(self.turn, part, index == len(parts), stash, pause, is_replaced))
+            is_last = index == len(parts)
+            said = self.traps, *self.made_by()
+            self.port.to_home(Snapshot(self.turn, part, is_last, stash, pause, is_replaced, None, *said))
+
+    def made_by(self) -> tuple[str, list[str]]:
+        """The class whose state is saved, and the variables that it had when `__init__` had run."""
+        actor = self.cell.actor
+        return ("", []) if actor is None else (message_name(type(actor)), self.variables)
 
     def close(self) -> None:
         """The life is over."""

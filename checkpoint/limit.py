@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from ..actors.errors import MailboxFull
 from ..actors.events import JournalFull
 from ..actors.mail import Ask
+from ..actors.mailbox import Senders
 from .records import SnapshotNow
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ class Limit:
 
     def __init__(self, home: Switch) -> None:
         self._home = home
-        self._waiters: list[asyncio.Future[None]] = []
+        self._senders = Senders()
         self._is_told = False
         self.at = home.method.trigger
         """Bytes from which on an admission has to ask here."""
@@ -67,9 +68,7 @@ class Limit:
     def wait(self) -> asyncio.Future[None]:
         """A future that ends when it is worth trying again."""
         self._want_snapshot()
-        future: asyncio.Future[None] = self._home.node.loop.create_future()
-        self._waiters.append(future)
-        return future
+        return self._senders.wait(self._home.node.loop)
 
     def _way_out(self) -> str:
         if self._home.method.snapshots:
@@ -91,7 +90,4 @@ class Limit:
 
     def wake(self) -> None:
         """Whoever waits shall look again."""
-        waiters, self._waiters = self._waiters, []
-        for waiter in waiters:
-            if not waiter.done():
-                waiter.set_result(None)
+        self._senders.release()

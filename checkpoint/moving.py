@@ -29,7 +29,7 @@ from ..actors.process.limits import Limits
 from ..actors.process.to_process import ToProcess
 from ..actors.process.to_task import FromProcess, dispose
 from ..actors.process.workers import Worker, Workers
-from .controller import FROM_LIFE, LocalHome, LocalLife, RecordedProcessHost, RemoteLife, TaskHost
+from .controller import LocalHome, LocalLife, RecordedProcessHost, RemoteLife, TaskHost, records_of
 from .life import Life
 from .records import LifePort, Live, ToHome
 from .switch import Switch
@@ -98,10 +98,10 @@ class RecordedToProcess(ToProcess):
     async def carry(self) -> None:
         cell, worker, more = self.cell, self.worker, self.cell.extra()
         assert worker is not None
-        self.remember()
         refuse_unsaved(cell, self._old.switch)
         switch, live, _ = self.host.open(cell)
-        worker.record_taker = lambda path: lambda frame: self._from_life(switch, worker, FROM_LIFE.decode(frame.body))
+        take = records_of(worker, lambda record: self._from_life(switch, worker, record))
+        worker.record_taker = lambda path: take
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
@@ -187,7 +187,8 @@ class RecordedToTask(FromProcess):
         switch, live, _ = host.open(cell)
         settled: asyncio.Future[None] = self.node.loop.create_future()
         home = ArrivingHome(host, cell, other, settled)
-        life = Life(other, home, host.method, None)
+        host.page = host.homes.page(switch)
+        life = Life(other, home, host.method, host.page)
         life.begins_suspended = self.suspended
         for record in switch.restore_records():
             life.from_home(record)
@@ -225,9 +226,8 @@ class RecordedToTask(FromProcess):
         cell, worker, transit, home = self.cell, self.worker, self.transit, self._home
         if self._twin is not None:
             dispose(self._twin)
-        worker.on_move = lambda data: None
         if self.dead is None:
-            self.say("back")
+            self.tell_old("back")
         if transit is None or home is None:
             return
         old = transit.old

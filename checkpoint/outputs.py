@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import functools
+from collections import deque
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -13,12 +16,17 @@ from ..actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ..actors.mail import Envelope
 from .asks import SwitchAsk, answer_ask, origin_of
 from .inputs import Batch
-from .records import MESSAGE, PIPE, Answer, Out, PipeDone
+from .records import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
 from .recovery.held import Inlet, inlet
-from .ties import connect
+from .ties import UNDONE_BY, connect
+from .turns import STARTED
 
 if TYPE_CHECKING:
     from .switch import Switch
+
+
+OPPOSITES = (("subscribe", "unsubscribe"), *((one, other) for other, one in UNDONE_BY.items()))
+"""What a turn can do to a topic or to another actor, and how it is undone."""
 
 
 class Outputs:
@@ -27,6 +35,7 @@ class Outputs:
     def __init__(self, home: Switch) -> None:
         self._home = home
         self.kept: list[Out] = []  # what outlives the life, and has not taken effect yet
+        self._lines: dict[Cell, deque[Callable[[], bool]]] = {}  # what waits for room at who keeps no journal
 
     def execute(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         """Let one output take effect, when the append is safe."""
@@ -37,12 +46,12 @@ class Outputs:
             case "tell":
                 self._deliver(node.cell_at(out.to), out, batch)
             case "send":
-                self._send(turn, out, batch)
+                home.calls.sends.add((turn, out.k))
+                self._send(node.cell_at(out.to), out, batch, functools.partial(home.calls.sent, turn, out.k))
             case "ask":
                 self._ask(turn, key, out, batch)
             case "publish":
-                for target in node.topics.subscribers(out.to):
-                    self._deliver(target, out, batch)
+                self._publish(turn, out, batch)
             case "reply":
                 ask = home.later.pop(int(out.to), None)
                 source = home.open.get(int(out.to))
@@ -58,6 +67,7 @@ class Outputs:
             case "forward":
                 self._forward(key, out, batch)
             case "timer" | "cancel":
+                out = home.timers.known_as(out)
                 self._keep(turn, out, batch)
                 if out.verb == "cancel":
                     home.timers.drop_ticks(out.to, key, batch)
@@ -75,9 +85,33 @@ class Outputs:
             case verb:
                 raise HoldfastError(f"{home.path}: unknown output {verb!r}")
 
+    def hooked(self, record: Hooked) -> None:
+        """What a hook does that outlives it; it is done once, though a hook runs at each life."""
+        home, out = self._home, record.out
+        if record.hook == STARTED and self._is_touched_since(out):
+            return  # The turns behind the snapshot have had the last word, and are handled again.
+        if out.verb == "timer" and not home.timers.is_new(out):
+            return
+        if out.verb in ("monitor", "watch", "link") and home.ties.has(out.verb, out.to):
+            return
+        batch = Batch()
+        self.execute(home.turn, -1, out, batch)
+        batch.commit(home.journal)
+
+    def _is_touched_since(self, out: Out) -> bool:
+        """Whether a turn behind the snapshot has tied or untied the same."""
+        verbs = next((pair for pair in OPPOSITES if out.verb in pair), ())
+        digests = {Out(0, verb, out.to).digest() for verb in verbs}
+        home = self._home
+        turns = (turn.digests for number, turn in home.turns.items() if number > home.state_turn)
+        return bool(digests) and not all(digests.isdisjoint(known) for known in (*turns, home.partial))
+
     def work_done(self, record: PipeDone) -> None:
         """Background work has an outcome: an input, once."""
         home = self._home
+        if not record.k:
+            home.forward(home.record(PIPE, record.name, record.body, home.path))
+            return
         done = home.pipes_done.setdefault(record.turn, set())
         if record.k not in done:
             done.add(record.k)
@@ -100,6 +134,8 @@ class Outputs:
         if not self._home.journal.durable:
             return
         self.kept.append(out)
+        if out.verb == "timer" and not self._home.shapes.knows(out.name):
+            self._home.note_shape(out.name, batch)
         entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, self._home.node.wall())
         batch.add(self._home.path, entry, self._home.positions_of(turn))
 
@@ -128,58 +164,101 @@ class Outputs:
 
         batch.after.append(send)
 
-    def _send(self, turn: int, out: Out, batch: Batch) -> None:
-        """A message whose sender waits until it is accepted."""
-        home = self._home
-        target = home.node.cell_at(out.to)
-        switch = switch_of(target)
+    def _publish(self, turn: int, out: Out, batch: Batch) -> None:
+        """A message to each subscriber, when it has room; the publisher waits until the last one has accepted it."""
+        home, topic = self._home, out.to
         home.calls.sends.add((turn, out.k))
+        subscribers = home.node.topics.subscribers(topic)
+        left = dict.fromkeys(subscribers)
+
+        def over(target: Cell, error: HoldfastError | None) -> None:
+            if error is not None:
+                home.node.not_taken(target, Parcel(out.name, out.body), error)
+            left.pop(target, None)
+            if not left:
+                home.calls.sent(turn, out.k, None)
+
+        for target in subscribers:
+            if isinstance(target, Inlet):
+                target.mark()
+            wanted = functools.partial(home.node.topics.has, topic, target)
+            self._send(target, out, batch, functools.partial(over, target), wanted)
+        if not subscribers:
+            batch.after.append(lambda: home.calls.sent(turn, out.k, None))
+
+    def _send(
+        self,
+        target: Cell,
+        out: Out,
+        batch: Batch,
+        over: Callable[[HoldfastError | None], None],
+        wanted: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """A message whose sender waits until it is accepted; then, or if it will not be, `over` is called."""
+        home = self._home
+        switch = switch_of(target)
         if switch is None:
-            batch.after.append(lambda: self._offer(target, turn, out))
+            batch.after.append(lambda: self._line_up(target, lambda: self._offer(target, out, over, wanted)))
             return
         bound = switch.bound
         try:
-            if bound is None or bound.overflow == "block" or bound.makes_room(None, out.name, out.body, home.path):
+            if bound is None or not target.has_room or bound.makes_room(None, out.name, out.body, home.path):
                 # Even if there is no room: what is journaled in this append cannot be lost, and the sender waits.
                 source = switch.record(MESSAGE, out.name, out.body, home.path, batch)
                 batch.after.append(lambda: switch.admitted(source))
-        except MailboxFull as error:
-            home.calls.refused(turn, out.k, error, batch)
+        except MailboxFull as full:
+            error = full
+            batch.after.append(lambda: over(error))
             return
-        batch.after.append(lambda: self._wait(switch, turn, out.k))
+        batch.after.append(lambda: self._wait(target, switch, over))
 
-    def _wait(self, switch: Switch, turn: int, k: int) -> None:
-        """Let the sender go on when its receiver has room."""
-        room = switch.room() if switch.cell is not None and switch.cell.state is not GONE else None
+    def _wait(self, target: Cell, switch: Switch, over: Callable[[HoldfastError | None], None]) -> None:
+        """Let the sender go on when its receiver, which has the message, has room; nobody waits for itself."""
+        room = None
+        if switch is not self._home and switch.cell is not None and switch.cell.state is not GONE:
+            room = target.room() if isinstance(target, Inlet) else switch.room()
         if room is None:
-            self._home.calls.accepted(turn, k)
+            over(None)
         else:
-            room.add_done_callback(lambda _: self._wait(switch, turn, k))
+            room.add_done_callback(lambda _: self._wait(target, switch, over))
 
-    def _offer(self, target: Cell, turn: int, out: Out) -> None:
-        """Hand a message over when its receiver, which keeps no journal, has room."""
+    def _line_up(self, target: Cell, offer: Callable[[], bool]) -> None:
+        """Offer a message when all that was offered to its receiver before has been taken."""
+        line = self._lines.get(target)
+        if line is not None:
+            line.append(offer)
+        elif not offer():
+            self._lines[target] = deque((offer,))
+
+    def _room_came(self, target: Cell) -> None:
+        line = self._lines[target]
+        while line and line[0]():
+            line.popleft()
+        if not line:
+            del self._lines[target]
+
+    def _offer(
+        self, target: Cell, out: Out, over: Callable[[HoldfastError | None], None], wanted: Callable[[], bool]
+    ) -> bool:
+        """Hand a message over if its receiver, which keeps no journal, has room. False: it has to wait for it."""
         home = self._home
+        taken: Awaitable[None] | None = None
         try:
-            room = target.room()
-            if room is not None:
-                room.add_done_callback(lambda _: self._offer(target, turn, out))
-                return
-            message = home.node.codec.message_in(target, out.name, out.body)
-            taken = target.host.offer(target, Envelope(message, home.cell))
+            if wanted():
+                room = target.room()
+                if room is not None:
+                    room.add_done_callback(lambda _: self._room_came(target))
+                    return False
+                message = home.node.codec.message_in(target, out.name, out.body)
+                taken = target.host.offer(target, Envelope(message, home.cell))
         except HoldfastError as error:
-            home.calls.refused(turn, out.k, error)
-            return
+            over(error)
+            return True
         if taken is None:
-            home.calls.accepted(turn, out.k)
+            over(None)
         else:  # It is in another process, which answers.
-            asyncio.ensure_future(taken).add_done_callback(lambda done: self._offered(turn, out.k, done))
-
-    def _offered(self, turn: int, k: int, done: asyncio.Future[None]) -> None:
-        error = None if done.cancelled() else done.exception()
-        if isinstance(error, HoldfastError):
-            self._home.calls.refused(turn, k, error)
-        else:
-            self._home.calls.accepted(turn, k)
+            asyncio.ensure_future(taken).add_done_callback(lambda done: over(_failure(done)))
+        return True
 
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
@@ -197,7 +276,6 @@ class Outputs:
         elif switch.bound is None or switch.bound.makes_room(ask, out.name, out.body, home.path):
             asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
             asked.ask, asked.chain = ask, chain
-            ask.started = True
             batch.after.append(lambda: switch.admitted(asked))
 
     def _send_ask(self, target: Cell, ask: SwitchAsk) -> None:
@@ -240,12 +318,18 @@ class Outputs:
             return
         if out.verb == "subscribe":
             home.topics[out.to] = None
-            if home.cell is not None:
+            if home.cell is not None and home.cell.state is not GONE:  # Else its next life will be subscribed.
                 home.node.topics.subscribe(out.to, inlet(home, out.to))
         else:
             home.topics.pop(out.to, None)
             if home.cell is not None:
                 home.node.topics.unsubscribe(out.to, inlet(home, out.to))
+
+
+def _failure(done: asyncio.Future[None]) -> HoldfastError | None:
+    """Why something was not accepted."""
+    error = None if done.cancelled() else done.exception()
+    return error if isinstance(error, HoldfastError) else None
 
 
 def switch_of(cell: Cell) -> Switch | None:

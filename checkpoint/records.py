@@ -18,6 +18,8 @@ from .method import Method
 
 # Kinds of inputs: every call into user code that may change state.
 MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
+# Outputs whose turn waits for what becomes of them.
+AWAITED = ("ask", "send", "publish")
 # How a turn can end.
 OK, FAILED, DROPPED, STASHED = "ok", "failed", "dropped", "stashed"
 # How an ask can be answered; LATER keeps it open, NOTHING means that nobody asked.
@@ -47,6 +49,17 @@ class Answer(msgspec.Struct, array_like=True, gc=False):
     kind: str = NOTHING
     name: str = ""
     body: bytes = b""
+
+
+def answer_digest(answer: Answer) -> int:
+    """A checksum by which the reply of a replayed turn is compared; 0 if there is none."""
+    if answer.kind == NOTHING:
+        return 0
+    return zlib.crc32(answer.body, zlib.crc32(f"{answer.kind}|{answer.name}".encode())) or 1
+
+
+Clock = tuple[str, bytes, float]
+"""What a timer says: type name and body of its message, and its interval (0: it comes once)."""
 
 
 # -- home to life ----------------------------------------------------------------------------------------------------
@@ -84,12 +97,13 @@ class Outcome(msgspec.Struct, array_like=True, tag=2):
 class Go(msgspec.Struct, array_like=True, tag=3):
     """Replay is over: call `on_recovered` (if anything was recovered), report, then go on after turn `turn`.
 
-    Inputs in `gone` were stashed under replay and have ended since, in turns that are not replayed.
+    Inputs in `gone` were stashed under replay and have ended since, in turns that are not replayed. `timers` run now.
     """
 
     recovered: bool
     turn: int
     gone: tuple[int, ...] = ()
+    timers: dict[str, Clock] = {}
 
 
 class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
@@ -103,9 +117,16 @@ class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
 
 
 class Restore(msgspec.Struct, array_like=True, tag=5):
-    """A piece of the state to begin with; the launch comes behind the last one."""
+    """A piece of the state to begin with; the launch comes behind the last one.
+
+    The first one also says which timers ran when that state was saved, whether the actor trapped exits, and which
+    `variables` its class had.
+    """
 
     data: bytes
+    timers: dict[str, Clock] = {}
+    traps: bool = False
+    variables: list[str] = []
 
 
 class Begin(msgspec.Struct, array_like=True, tag=6):
@@ -220,6 +241,13 @@ class TurnEnd(msgspec.Struct, array_like=True, tag=12, gc=False):
     state: int = 0  # digest of the state it has left, if that is checked
 
 
+class Hooked(msgspec.Struct, array_like=True, tag=21):
+    """What a hook does that outlives it; it takes effect at once. `hook` is "start", "recovered" or "stop"."""
+
+    hook: str
+    out: Out
+
+
 class Live(msgspec.Struct, array_like=True, tag=13):
     """`Go` was reached: the actor takes new inputs. `restore_seconds` is what putting the state back took."""
 
@@ -244,6 +272,7 @@ class Snapshot(msgspec.Struct, array_like=True, tag=14):
     """A piece of the state after `turn`; `is_last` completes it.
 
     `is_replaced`: it was put in place from outside, so no replay leads to it. `image`: where it is, if not in `data`.
+    `kind`: the actor's class, and `variables` those that it had when `__init__` had run.
     """
 
     turn: int
@@ -253,6 +282,9 @@ class Snapshot(msgspec.Struct, array_like=True, tag=14):
     pause: float
     is_replaced: bool = False
     image: Shared | None = None
+    traps: bool = False  # `ctx.trap_exits`
+    kind: str = ""
+    variables: list[str] = []
 
 
 class Marked(msgspec.Struct, array_like=True, tag=20):
@@ -262,7 +294,10 @@ class Marked(msgspec.Struct, array_like=True, tag=20):
 
 
 class PipeDone(msgspec.Struct, array_like=True, tag=15):
-    """Background work that was output (turn, k) has its result: a message to the actor itself; no name: an error."""
+    """Background work that was output (turn, k) has its result: a message to the actor itself; no name: an error.
+
+    `k` is 0 for what a hook has begun: no turn is replayed to begin it again.
+    """
 
     turn: int
     k: int
@@ -309,11 +344,18 @@ class Ignored(msgspec.Struct, array_like=True, tag=19):
     why: str
 
 
-ToHome = Ignored | Released | TurnEnd | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked | Carried
+ToHome = (
+    Ignored | Released | TurnEnd | Hooked | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked | Carried
+)
 
 
 class LifePort(Protocol):
     """The way to the present life."""
+
+    @property
+    def begins(self) -> bool:
+        """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
+        ...
 
     def to_life(self, record: ToLife) -> None:
         """Hand a record to the life; it is handled in order."""

@@ -2,12 +2,14 @@
 
 The receiver's journal says of such an input whose turn asks, (turn, k). So the receiver, whose home may be open first,
 answers to whoever that is: to the asker's home if that is open, else into the asker's journal, where it finds it.
+What the receiver never had (its mailbox was full, say) ends at its deadline: it may have been forwarded, so it is not
+asked again.
 """
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..actors.codec import Parcel
 from .asks import MARK, OVER, SwitchAsk
@@ -15,6 +17,7 @@ from .inputs import Batch, Input
 from .records import MESSAGE, Answer, Out
 
 if TYPE_CHECKING:
+    from ..actors.codec import Codec
     from .homes import Homes
     from .switch import Switch
 
@@ -22,13 +25,16 @@ if TYPE_CHECKING:
 class RejoinedAsk(SwitchAsk, eq=False):
     """An ask from before the root's restart. Its asker's home may not be open yet."""
 
-    homes: Homes | None = None
-    asker: str = ""
+    homes: Any = None
+
+    @property
+    def codec(self) -> Codec:
+        codec: Codec = self.homes.node.codec
+        return codec
 
     def give(self, answer: Answer, batch: Batch | None = None) -> None:
         """The outcome, once."""
-        homes = self.homes
-        assert homes is not None
+        homes: Homes = self.homes
         switch = homes.at(self.asker)
         homes.rejoin.forget(self)
         if switch is not None:
@@ -73,6 +79,7 @@ class Rejoin:
         if ask is None or ask.is_over:
             cell = self._homes.node.cell_at(asker)
             ask = RejoinedAsk(Parcel("", b""), cell, (), 0.0, math.inf, None)
+            ask.started = True  # It may have been: only its outcome will tell.
             ask.future, ask.homes, ask.asker, ask.turn, ask.k = ask, self._homes, asker, turn, k
             self._asks[asker, turn, k] = ask
         return ask

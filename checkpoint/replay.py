@@ -29,6 +29,7 @@ class Replay:
         self._waiting: deque[tuple[float, int, Turn]] = deque()  # due on the loop's clock, number, turn
         self._handle: asyncio.TimerHandle | None = None
         self._told_at = float("-inf")
+        self._fed = -1  # the last turn that was fed
 
     def begin(self, port: LifePort, turns: Iterable[tuple[int, Turn]], then: Callable[[], None]) -> None:
         """Feed ended turns in turn order, then call `then`.
@@ -55,7 +56,12 @@ class Replay:
 
     def _feed(self, port: LifePort, number: int, turn: Turn) -> None:
         pipes = self._home.pipes_done.get(number, ())
-        port.to_life(turn.input.feed(number, tuple(sorted(pipes))))
+        port.to_life(turn.input.feed(number, tuple(sorted(pipes)), was_asked=turn.reply != 0))
+        self._fed = number
+
+    def pauses_at(self, turn: int) -> bool:
+        """Whether all that was fed is handled, up to this turn, and it is not yet time for the next."""
+        return self._handle is not None and self._fed <= turn
 
     def _go_on(self, port: LifePort, then: Callable[[], None]) -> None:
         home, waiting = self._home, self._waiting

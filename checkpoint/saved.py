@@ -15,6 +15,7 @@ from .journal import DamagedStore, Entry
 from .journal import Saved as Journaled
 from .records import DOWN, EXIT, PIPE, STASHED, TICK, Answer, Snapshot
 from .segments import Place
+from .shapes import as_shape, kind_in
 from .ties import Tie
 from .timers import Saved
 
@@ -36,7 +37,11 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     answered later, with the address that has asked and their origin.
 
     `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
-    were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh.
+    were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh. `traps`:
+    whether it traps exits.
+
+    `kind`: the class whose state it is, `variables` those that it had when `__init__` had run, and `shapes` the fields
+    of its messages (see `shapes.py`); stores of before do not say.
     """
 
     format: int
@@ -55,6 +60,10 @@ class Meta(msgspec.Struct, array_like=True, frozen=True):
     time: float = 0.0
     owed: dict[int, tuple[str, str]] = {}
     ties: list[Tie] = []
+    traps: bool = False
+    kind: str = ""
+    variables: list[str] = []
+    shapes: dict[str, list[Any]] = {}
 
     @property
     def has_state(self) -> bool:
@@ -106,6 +115,8 @@ def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> M
         time=now,
         owed=owed(home),
         ties=home.ties.saved(),
+        kind=home.shapes.kind,
+        variables=[] if home.newest is None else home.newest.variables,
     )
 
 
@@ -116,11 +127,20 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
         HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
     """
     older = home.newest
-    meta = msgspec.structs.replace(meta_now(home, record.turn, record.stash, state), earlier=home.images.earlier())
+    meta = meta_now(home, record.turn, record.stash, state)
+    more = made_by(home, record)
+    meta = msgspec.structs.replace(meta, earlier=home.images.earlier(), traps=record.traps, **more)
     put(home, meta, home.method.keep)
     # In a store that lasts it is read back when it is wanted.
     home.older = older if home.method.keep > 1 and not home.journal.durable else None
     home.images.tidy()
+
+
+def made_by(home: Switch, record: Snapshot) -> dict[str, Any]:
+    """Whose state a snapshot is, as the life says that has made it."""
+    if record.kind:
+        home.shapes.kind = record.kind
+    return {"kind": home.shapes.kind, "variables": record.variables}
 
 
 def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:
@@ -152,10 +172,12 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
         HoldfastError: it could not be kept, and nothing has changed.
     """
     covered = [number for number in home.turns if number <= meta.turn]
+    entries = [known for number, known in home.positions.items() if number <= meta.turn]  # of hooks, too
     if home.journal.durable:
+        meta = msgspec.structs.replace(meta, shapes=home.shapes.saved())
         home.journal.barrier()  # From here on it is known where everything stands.
         drop = [*(position for known in home.dropped for position in known)]
-        drop += [*(position for number in covered for position in home.positions.get(number, ()))]
+        drop += [*(position for known in entries for position in known)]
         # An image may be behind: what was stashed when it was begun may have been handled since.
         later = {turn.input.id for number, turn in home.turns.items() if number > meta.turn}
         for number in covered:
@@ -176,7 +198,7 @@ def put(home: Switch, meta: Meta, keep: int) -> None:
 
 
 def go_back(home: Switch, meta: Meta) -> None:
-    """Between two lives: timers and subscriptions are those of the snapshot again, as the state is."""
+    """Between two lives: timers, subscriptions and ties are those of the snapshot again, as the state is."""
     home.outputs.kept.clear()  # What has not taken effect yet is undone, too.
     if home.cell is not None:
         for topic in home.topics:
@@ -184,6 +206,7 @@ def go_back(home: Switch, meta: Meta) -> None:
                 home.node.topics.unsubscribe(topic, home.cell)
     home.topics = dict.fromkeys(meta.topics)
     home.timers.replace(meta.timers)
+    home.ties.go_back(meta.ties)
 
 
 def load(home: Switch, planted: Journaled | None = None) -> None:
@@ -198,6 +221,7 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
         home.turn, home.next_id, home.stash = meta.turn, meta.next_id, meta.stash
         home.topics, home.owed = dict.fromkeys(meta.topics), dict(meta.owed)
         home.ties.replace(meta.ties)
+        home.shapes.loaded(meta.kind, {name: map(as_shape, all_) for name, all_ in meta.shapes.items()})
         timers = {
             key: (name, body, left - elapsed(home, meta.time), interval)
             for key, (name, body, left, interval) in meta.timers.items()
@@ -212,6 +236,7 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
             home.bytes += len(turn.input.body) + OVERHEAD
     for key, (name, body, left, interval) in timers.items():
         home.timers.start(key, name, body, max(0.0, left), interval)
+    home.shapes.kind = home.shapes.kind or kind_in(home)
 
 
 def elapsed(home: Switch, since: float) -> float:
@@ -262,7 +287,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
                 told = msgspec.msgpack.decode(body)
                 if not told.get("recovering"):
                     home.ties.over(told.get("verb", "link"), told["source"])
-            if kind == PIPE:
+            if kind == PIPE and origin:
                 turn, k = map(int, origin.split("."))
                 home.pipes_done.setdefault(turn, set()).add(k)
         case ("end", turn, key, status, digests, *more):
@@ -284,6 +309,13 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
         case ("drop", key):
             dropped = home.open.pop(key, None)
             home.dropped += ([] if dropped is None else dropped.positions, [position])
+        case ("tried", key, count):
+            if key in home.open:
+                home.open[key].deliveries = count
+                home.open[key].positions.append(position)
+        case ("shape", name, shape):
+            home.dropped.append([position])  # The next snapshot keeps it.
+            home.shapes.read(name, as_shape(shape))
         case ("tie", turn, verb, path):
             home.positions_of(turn).append(position)
             home.ties.turn(verb, path)
@@ -300,6 +332,7 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
             match verb:
                 case "timer":
                     timers[key] = (name, body, seconds - elapsed(home, *when or (0.0,)), interval)
+                    home.timers.made_again(key)
                 case "cancel":
                     timers.pop(key, None)
                 case "subscribe":

@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from typing import Any, Final
 
 from ..actors.errors import HoldfastError
+from ..actors.memory import keep_size, unnamed
 from .image import Key
 
 BLOCK: Final = 256 * 1024
@@ -38,9 +39,16 @@ def can_share() -> bool:
 
 
 class Segment:
-    """Some blocks, mapped; whoever holds `file` could write them, but nobody does."""
+    """Some blocks, mapped; whoever holds `file` could write them, but nobody does.
+
+    Nobody can make it shorter: whoever reads a mapping behind the end of its file dies of it (SIGBUS).
+
+    Raises:
+        OSError: the file is no memory that can be sealed.
+    """
 
     def __init__(self, number: int, file: int) -> None:
+        keep_size(file)  # Before it is measured.
         self.number, self.file = number, file
         self.size = os.fstat(file).st_size
         self.inode = os.fstat(file).st_ino
@@ -85,7 +93,7 @@ class Segment:
 
 def memory_file(number: int) -> int:
     """A new file without a name, in memory."""
-    return os.memfd_create(f"holdfast {number:x}", os.MFD_CLOEXEC)
+    return unnamed(f"holdfast {number:x}")
 
 
 def new_number() -> int:
@@ -163,7 +171,11 @@ def open_segment(number: int, pid: int, file: int, inode: int) -> Segment:
     """
     try:
         own = os.open(f"/proc/{pid}/fd/{file}", os.O_RDWR | os.O_CLOEXEC)
-        segment = Segment(number, own)
+        try:
+            segment = Segment(number, own)
+        except OSError:
+            os.close(own)
+            raise
     except OSError as error:
         raise HoldfastError(f"the blocks of a snapshot are gone: {error}") from error
     if segment.inode != inode:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 from ..actors.errors import SpecError
+from .called import Called
 from .journal import Journal, MemoryJournal
 from .method import Durability
 
@@ -20,7 +21,7 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Jour
     if store is None or store == "memory":
         return MemoryJournal()
     if not isinstance(store, str):
-        return store
+        return store if isinstance(store, MemoryJournal) else Called(store)
     kind, _, path = store.partition(":")
     if kind != "sqlite" or not path:
         raise SpecError("store", f"must be None, 'memory', 'sqlite:PATH' or an engine, not {store!r}")
@@ -28,7 +29,7 @@ def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Jour
         raise SpecError("store", f"{store!r} must name a file in a folder that is there")
     from .sqlite import SqliteJournal  # only now: sqlite3 takes a while to import, and most tests need no store
 
-    return SqliteJournal(path, takeover=takeover)
+    return Called(SqliteJournal(path, takeover=takeover))
 
 
 def check_system(journal: Journal, system: str) -> None:

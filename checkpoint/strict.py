@@ -8,7 +8,9 @@ inside the standard library or holdfast (a logged line has a time stamp) is let 
 from __future__ import annotations
 
 import asyncio
+import builtins
 import datetime
+import gc
 import importlib
 import os
 import random
@@ -18,7 +20,8 @@ import threading
 import time
 import types
 import uuid
-from collections.abc import Callable, Coroutine, Generator
+from collections.abc import Callable, Coroutine, Generator, Mapping
+from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any, TypeVar
 
@@ -27,8 +30,9 @@ from ..actors.errors import HoldfastError
 T = TypeVar("T")
 
 CLOCK, DICE, NAME, TASK = "ctx.now()", "ctx.random", "ctx.uuid()", "ctx.pipe_to_self()"
+SELF, WORLD = "ctx.path", "a message, or ctx.pipe_to_self(),"
 PACKAGE = __name__.partition(".")[0]
-TRUSTED = sys.stdlib_module_names | {PACKAGE, "anyio", "msgpack", "msgspec", "structlog", "uvloop"}
+TRUSTED = sys.stdlib_module_names | {PACKAGE, "anyio", "msgpack", "msgspec", "numpy", "structlog", "uvloop"}
 """Top packages whose own calls are their own affair."""
 
 
@@ -44,7 +48,10 @@ class NotDeterministic(HoldfastError):
 
 
 def _builtins() -> dict[int, tuple[str, str]]:
-    """Functions written in C, by identity (they live for ever): their names, and what to use instead."""
+    """Functions written in C, by identity (they live for ever): their names, and what to use instead.
+
+    uvloop's `loop.time` does not show as a call, but whoever calls it has asked for the loop.
+    """
     found: dict[int, tuple[str, str]] = {}
     for name in ("time", "time_ns", "monotonic", "monotonic_ns", "perf_counter", "perf_counter_ns", "process_time",
                  "localtime", "gmtime", "clock_gettime", "clock_gettime_ns"):  # fmt: skip
@@ -52,6 +59,15 @@ def _builtins() -> dict[int, tuple[str, str]]:
     found[id(os.urandom)] = "os.urandom", DICE
     if hasattr(os, "getrandom"):
         found[id(os.getrandom)] = "os.getrandom", DICE
+    for owner, names, instead in (
+        (os, ("getpid", "getppid"), SELF),
+        (os, ("open", "listdir", "scandir", "stat", "lstat", "getcwd"), WORLD),
+        (builtins, ("id",), SELF),
+        (builtins, ("open",), WORLD),
+        (asyncio, ("get_running_loop", "get_event_loop"), f"{CLOCK} or {TASK}"),
+    ):
+        for name in names:
+            found[id(getattr(owner, name))] = f"{owner.__name__.removeprefix('builtins')}.{name}".lstrip("."), instead
     return found
 
 
@@ -63,6 +79,16 @@ def _functions() -> dict[CodeType, tuple[str, str]]:
         (secrets, "secrets", ("token_bytes", "token_hex", "token_urlsafe", "randbelow"), DICE),
         (asyncio, "asyncio", ("create_task", "ensure_future", "to_thread"), TASK),
         (threading.Thread, "threading.Thread", ("start",), TASK),
+        (asyncio.BaseEventLoop, "loop", ("time",), CLOCK),
+        (os, "os", ("getenv",), WORLD),
+        (type(os.environ), "os.environ", ("__getitem__",), WORLD),
+        (Mapping, "os.environ", ("get",), WORLD),
+        (
+            Path,
+            "Path",
+            ("open", "read_text", "read_bytes", "write_text", "write_bytes", "stat", "exists", "iterdir"),
+            WORLD,
+        ),
     ]
     for owner, prefix, names, instead in listed:
         for name in names:
@@ -80,6 +106,7 @@ def _drawing() -> dict[CodeType, str]:
 
 
 BUILTINS, FUNCTIONS, DRAWING = _builtins(), _functions(), _drawing()
+MAPPING_GET = Mapping.get.__code__
 SHARED: random.Random = random._inst
 MADE = random.Random.__init__.__code__
 CLASS_CLOCKS = {("datetime", "now"), ("datetime", "utcnow"), ("datetime", "today"), ("date", "today")}
@@ -90,7 +117,7 @@ class Guard:
 
     def __init__(self) -> None:
         self.caught: NotDeterministic | None = None
-        self._before: Any = None
+        self._is_collecting = False
 
     def call(self, function: Callable[..., T], *args: Any) -> T:
         """Call it, watched.
@@ -98,12 +125,15 @@ class Guard:
         Raises:
             NotDeterministic: at the forbidden call; and here once more, if that was swallowed.
         """
-        outer, numbers = sys.getprofile(), numpy_state()
+        outer, numbers, collects = sys.getprofile(), numpy_state(), gc.isenabled()
+        gc.disable()  # What others have it call, and finalisers of their garbage, are none of the turn's doing.
         sys.setprofile(self._look)
         try:
             return function(*args)
         finally:
             sys.setprofile(outer)
+            if collects:
+                gc.enable()
             if numbers is not None and numpy_state() != numbers:
                 self.caught = self.caught or NotDeterministic("numpy.random's shared generator", "this turn", DICE)
             if self.caught is not None:
@@ -129,12 +159,17 @@ class Guard:
 
     def _look(self, frame: FrameType, event: str, arg: Any) -> None:
         """Called by the interpreter at each call; what is raised here is raised at the call, in place of it."""
-        if event == "c_call":
+        if arg is gc.collect:
+            self._is_collecting = event == "c_call"  # Or it has returned.
+        elif self._is_collecting:
+            return
+        elif event == "c_call":
             self._look_at_builtin(frame, arg)
         elif event == "call":
             known = FUNCTIONS.get(frame.f_code)
             if known is not None:
-                self._refuse(*known, frame.f_back)
+                if frame.f_code is not MAPPING_GET or frame.f_locals.get("self") is os.environ:
+                    self._refuse(*known, frame.f_back)
             elif frame.f_code is MADE and frame.f_locals["x"] is None:
                 self._refuse("random.Random, without a seed,", DICE, frame.f_back)
             elif frame.f_code in DRAWING:

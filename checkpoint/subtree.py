@@ -24,7 +24,7 @@ from ..actors.process.inner import know
 from ..actors.process.limits import Limits
 from ..actors.process.remote import ProcessHost
 from ..actors.process.workers import Worker, Workers
-from .controller import FROM_LIFE, RemoteLife
+from .controller import RemoteLife, records_of
 from .homes import HomeHost, Homes, seen
 from .records import Begin, Closed, Started, ToHome, Wanted
 
@@ -143,7 +143,7 @@ class SubtreeHome(HomeHost):
     def joined(self, top: Cell, worker: Worker, slot: int) -> frames.TakeRecord:
         """The process that the next lives are lived in."""
         self._top, self._worker, self._slot = top, worker, slot
-        return lambda frame: self.from_life(worker, FROM_LIFE.decode(frame.body))
+        return records_of(worker, lambda record: self.from_life(worker, record))
 
     def from_life(self, worker: Worker, record: ToHome) -> None:
         """Take what the life, or the supervisor that wants one, says."""
@@ -194,7 +194,11 @@ class SubtreeHome(HomeHost):
         if problem:
             port.to_life(Started(wanted.number, problem))
             return
-        switch, live, recovering = self.enter(cell)
+        try:
+            switch, live, recovering = self.enter(cell)
+        except StartFailed as error:  # What is recorded does not fit its class.
+            port.to_life(Started(wanted.number, error.reason))
+            return
         if self.is_gated:
             self._run(cell, self._step_by_step(cell, wanted, live, recovering))
         else:
@@ -264,6 +268,8 @@ class SubtreeHome(HomeHost):
         assert switch is not None
         cell.life += 1
         cell.state = RUNNING
+        if self.homes.file is not None:
+            self.homes.file.meet(self.path, wanted.kind)
         self.subscribe(cell, wanted.topics)
         port = RemoteLife(self.path, worker)
         for record in switch.restore_records():

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..actors.cell import Cell
 from ..actors.codec import Parcel
-from ..actors.errors import AskDeadlock, HoldfastError, ReplayDiverged, StartIgnored
+from ..actors.errors import DIVERGES, AskDeadlock, HoldfastError, ReplayDiverged, StartIgnored
 from ..actors.events import RecoveryFailed
 from ..actors.mail import Ask, Envelope, Item
 from ..actors.message import message_name
@@ -33,10 +33,13 @@ from .method import Method
 from .outputs import Outputs, went_elsewhere
 from .quarantine import Quarantine
 from .records import (
+    AWAITED,
+    DROPPED,
     FAILED,
     LATER,
     MESSAGE,
     NOTHING,
+    OK,
     START,
     STASHED,
     TICK,
@@ -44,6 +47,7 @@ from .records import (
     Carried,
     Closed,
     Go,
+    Hooked,
     Ignored,
     LifePort,
     Live,
@@ -57,11 +61,13 @@ from .records import (
     TurnEnd,
     Unsaved,
     Wanted,
+    answer_digest,
     pieces,
 )  # fmt: skip
 from .recovery.held import Holding, Inlet, let_go
 from .replay import Replay
 from .saved import Meta, load
+from .shapes import Shapes, start_name
 from .skipping import Skipping
 from .ties import Ties
 from .timers import Timers
@@ -119,6 +125,7 @@ class Switch:
         self.arrival = Arrival(self)
         self.positions: dict[int, list[int]] = {}  # in the journal, of what belongs to a turn besides its input
         self.dropped: list[list[int]] = []  # the same of inputs that ended without a turn
+        self.shapes = Shapes(self)
         self._replay_k, self._replay_turn = 0, -1
         load(self, saved)
 
@@ -140,6 +147,7 @@ class Switch:
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: number, journal, and feed unless the actor is being recovered."""
+        self.node.check_thread(self.path)
         message, sender, ask = item, None, None
         if isinstance(item, Ask):
             message, sender, ask = item.message, item.sender, item
@@ -172,16 +180,25 @@ class Switch:
             return
         if ask is not None:
             source.ask, source.chain = ask, ask.chain
-            ask.started = True
         self.forward(source)
 
     def waits(self, ask: Ask) -> bool:
         """Whether a turn of ours waits for this ask."""
         return any(path == self.path and number in self.open for path, number in ask.chain)
 
+    @property
+    def is_at_limit(self) -> bool:
+        """Whether senders wait until the next snapshot has cut the journal."""
+        return self.limit.is_reached and not self.limit.makes_room() and self.method.snapshots
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now: the journal has room, and the mailbox."""
+        return not self.is_at_limit and (self.bound is None or self.bound.has_room)
+
     def room(self) -> asyncio.Future[None] | None:
-        """For `send`: None while the journal has room."""
-        if self.limit.is_reached and not self.limit.makes_room() and self.method.snapshots:
+        """For `send`: None while there is room."""
+        if self.is_at_limit:
             return self.limit.wait()
         return None if self.bound is None else self.bound.room()
 
@@ -205,11 +222,25 @@ class Switch:
         if self.journal.durable:
             entry = ("in", key, kind, name, body, source.time, sender, origin)
             source.positions, source.held = [], True
+            if name and not self.shapes.knows(name):
+                self.note_shape(name, batch)
             if batch is not None:
                 batch.add(self.path, entry, source.positions)
             else:
                 submit(self, source, entry)
         return source
+
+    def note_shape(self, name: str, batch: Batch | None = None) -> None:
+        """Have the fields of a type of messages stand in front of the first one that is journaled."""
+        entry = self.shapes.entry(name)
+        if entry is None:
+            return
+        own = Batch() if batch is None else batch
+        position: list[int] = []
+        own.add(self.path, entry, position)
+        self.dropped.append(position)  # The next snapshot keeps it.
+        if batch is None:
+            own.commit(self.journal)
 
     def admitted(self, source: Input) -> None:
         """An input is as safe now as it has to be."""
@@ -222,6 +253,8 @@ class Switch:
         if source.held:
             return
         if self.is_released and self.port is not None and (self.bound is None or self.bound.may_feed(source)):
+            if source.ask is not None and self.port.begins:
+                source.ask.started = True
             self.port.to_life(source.feed())
 
     def push(self, item: Item) -> None:
@@ -245,6 +278,13 @@ class Switch:
         return self.is_released or (waits and caught_up)
 
     @property
+    def progress(self) -> object:
+        """How far the present life has come with what was handled before; a pause that is repeated counts as a step."""
+        if self.replay.pauses_at(self._replay_turn):
+            return object()
+        return self._replay_turn, self.port is not None
+
+    @property
     def state_turn(self) -> int:
         """The turn that the next life begins after, apart from what is replayed to it; -1: none."""
         return self.newest.turn if self.newest is not None else -1
@@ -264,6 +304,7 @@ class Switch:
         self.arrival.cancel()  # The last life may have died in the middle of a snapshot.
         self.due.restarted()
         self.timers.resume()
+        self.timers.claimed.clear()
         if self.live is not None and not self.live.done():
             self.live.cancel()
         self.live = self.node.loop.create_future()
@@ -274,9 +315,12 @@ class Switch:
         newest = self.newest
         if newest is None or not newest.has_state:
             return []
-        if newest.blocks:
-            return list(self.images.restore(newest.blocks))
-        return [Restore(part) for part in pieces(newest.state)]
+        parts = (
+            list(self.images.restore(newest.blocks)) if newest.blocks else [Restore(p) for p in pieces(newest.state)]
+        )
+        parts[0].timers, parts[0].traps = self.timers.at(newest), newest.traps
+        parts[0].variables = newest.variables
+        return parts
 
     def attach(self, port: LifePort) -> None:
         """The life is constructed and restored: feed it what it has to handle again, then `Go`."""
@@ -288,7 +332,8 @@ class Switch:
         recovered = not self.is_new
         first = next((source for source in self.open.values() if source.kind == START), None)
         if self.is_new and first is None:  # Messages may have come before it.
-            first = self.record(START, "", b"", None)
+            self.shapes.kind = start_name(self.cell)
+            first = self.record(START, "", self.shapes.kind.encode(), None)
             first.held = False  # Nobody waits for it, and what it leads to is safe only behind it.
         again = self.skipping.left()
         self.replayed = len(again)
@@ -299,7 +344,8 @@ class Switch:
         if first is not None:
             port.to_life(first.feed())
         stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)
-        port.to_life(Go(recovered, self.turn, tuple(key for key in stashed if key not in self.open)))
+        gone = tuple(key for key in stashed if key not in self.open)
+        port.to_life(Go(recovered, self.turn, gone, self.timers.running()))
 
     def let_at(self) -> None:
         """Release the actor, unless somebody else has a say in it, or those that it may send to are not there yet."""
@@ -321,6 +367,8 @@ class Switch:
         for index, source in enumerate(waiting):
             begun = source.id == self.partial_id
             if self.bound is None or self.bound.may_feed(source):
+                if source.ask is not None and port.begins:
+                    source.ask.started = True
                 port.to_life(source.feed(-1, pipes if index == 0 else (), has_begun=begun))
         if self.bound is not None:
             self.bound.refill()
@@ -347,9 +395,9 @@ class Switch:
         if source.deliveries >= self.method.max_deliveries:
             self.ends.quarantine(source)
 
-    def end_turn(self, source: Input, number: int, status: str, batch: Batch, state: int = 0) -> None:
+    def end_turn(self, source: Input, number: int, status: str, batch: Batch, state: int = 0, reply: int = 0) -> None:
         """A turn is over: its end record."""
-        turn = self.turns[number] = Turn(source, status, self.partial, state)
+        turn = self.turns[number] = Turn(source, status, self.partial, state, reply)
         self.partial, self.partial_id = [], -1
         self.turn = source.turn = number
         source.deliveries = 0
@@ -358,8 +406,8 @@ class Switch:
         if self.bound is not None:
             batch.after.append(functools.partial(self.bound.ended, source))
         if self.journal.durable:
-            entry = ("end", number, source.id, status, tuple(turn.digests), *((state,) if state else ()))
-            batch.add(self.path, entry, self.positions_of(number))
+            end = "end", number, source.id, status, tuple(turn.digests)
+            batch.add(self.path, (*end, *turn.digests_of_end()), self.positions_of(number))
 
     def positions_of(self, turn: int) -> list[int]:
         """Where in the journal a turn's own entries stand."""
@@ -383,6 +431,8 @@ class Switch:
                     self._live(record)
                 case PipeDone():
                     self.outputs.work_done(record)
+                case Hooked():
+                    self.outputs.hooked(record)
                 case Unsaved():
                     self.due.failed(record.problem)
                 case Marked():
@@ -434,7 +484,7 @@ class Switch:
                 if known[out.k - 1] != out.digest() and not went_elsewhere(self, out, known[out.k - 1]):
                     raise ReplayDiverged(self.path, turn, out.k)
                 self._replay_k = out.k
-                if out.verb in ("ask", "send"):
+                if out.verb in AWAITED:
                     self.calls.join(turn, key, out)
             elif ended:
                 raise ReplayDiverged(self.path, turn, out.k)
@@ -458,16 +508,20 @@ class Switch:
             self.partial_id, source.deliveries = -1, 0
             if end.status != STASHED:
                 del self.open[end.id]
+                if end.status != OK:
+                    self._lose(source, end)
             return
         batch = Batch()
         self._take(end.turn, end.id, end.outs, batch)
-        self.end_turn(source, end.turn, end.status, batch, end.state)
+        was_asked = source.ask is not None and end.status == OK
+        self.end_turn(source, end.turn, end.status, batch, end.state, answer_digest(end.answer) if was_asked else 0)
         if end.answer.kind == LATER:
             if source.ask is not None:
                 self.later[end.id] = source.ask
                 if self.journal.durable and isinstance(source.ask, SwitchAsk):
                     batch.add(self.path, ("later", end.turn, end.id), self.positions_of(end.turn))
         elif end.status != STASHED:
+            self._lose(source, end)
             self.give(source, end.answer, batch)
         batch.commit(self.journal)
 
@@ -478,10 +532,27 @@ class Switch:
         if end.status == FAILED and past is not None and past.input.kind == START and past.status != FAILED:
             return  # It has not become anything else: its start failed, and will be tried again.
         seen = self._replay_k if self._replay_turn == end.turn else 0
+        if past is not None and end.status in (FAILED, DROPPED) and end.status != past.status:
+            error = self._error(end.answer)
+            what = "handling it again raised" if end.status == FAILED else "it cannot be handled any more:"
+            hint = DIVERGES if end.status == FAILED else "the class has been changed since; what is recorded stays"
+            cause = f"{past.input.name or past.input.kind} was handled well before the crash; {what} {error} ({hint})"
+            raise ReplayDiverged(self.path, end.turn, seen + 1, cause)
         if past is None or seen != len(past.digests) or end.status != past.status:
             raise ReplayDiverged(self.path, end.turn, seen + 1)
         if end.state != past.state and end.state and past.state:
             raise StateDiverged(self.path, end.turn, past.input.name or past.input.kind)
+        if past.reply and past.reply != answer_digest(end.answer):
+            cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
+            raise ReplayDiverged(self.path, end.turn, seen + 1, cause)
+
+    def _lose(self, source: Input, end: TurnEnd) -> None:
+        """What the life could make nothing of is a dead letter, if nobody waits who could hear of it."""
+        if end.status == DROPPED and source.ask is None and end.answer.kind != NOTHING:
+            self.ends.lost(source.name, source.body, self._error(end.answer))
+
+    def _error(self, answer: Answer) -> str:
+        return str(self.node.codec.decode_error(answer.kind, answer.name, answer.body))
 
     def give(self, source: Input, answer: Answer, batch: Batch) -> None:
         """Answer the ask of an input, behind the append."""
@@ -491,4 +562,5 @@ class Switch:
         if isinstance(ask, SwitchAsk):
             ask.give(answer, batch)
         else:
+            batch.asks.append(ask)
             batch.after.append(lambda: answer_ask(self, ask, answer))

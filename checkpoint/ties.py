@@ -39,6 +39,20 @@ class Ties:
         """The actor is told of the other one's end, and that was the last of it."""
         self._kept.pop((verb, path), None)
 
+    def has(self, verb: str, path: str) -> bool:
+        """Whether there is such a tie, or will be when the other one is there."""
+        return (verb, path) in self._kept
+
+    def go_back(self, ties: list[Tie]) -> None:
+        """These again, as a snapshot has them: what was tied since is undone, and what was untied comes back."""
+        cell, node = self._home.cell, self._home.node
+        undo = {verb: name for name, verb in UNDONE_BY.items()}
+        for verb, path in self._kept:
+            if cell is not None and (verb, path) not in ties and (verb, path) not in self._untied:
+                connect(cell, node.cell_at(path), undo[verb])
+        self._untied = [one for one in ties if one in self._untied or one not in self._kept]
+        self._kept = dict.fromkeys(ties)
+
     def saved(self) -> list[Tie]:
         """All of them, as a snapshot has them."""
         return list(self._kept)

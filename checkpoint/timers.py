@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from .inputs import Batch, TimerState
-from .records import TICK, Answer, Out
+from .records import TICK, Answer, Clock, Out
 
 if TYPE_CHECKING:
+    from .saved import Meta
     from .switch import Switch
 
 Saved = tuple[str, bytes, float, float]
@@ -20,6 +23,9 @@ class Timers:
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._states: dict[str, TimerState] = {}
+        self._made: set[str] = set()  # by hooks, since the last snapshot
+        self._same: dict[str, str] = {}  # timers that a hook wanted, and which they are
+        self.claimed: set[str] = set()  # timers that the present life's hooks have wanted
 
     def operate(self, out: Out) -> None:
         """Start or cancel one, as an ended turn wants it."""
@@ -29,6 +35,52 @@ class Timers:
             timer = self._states.pop(out.to, None)
             if timer is not None and timer.handle is not None:
                 timer.handle.cancel()
+
+    # -- of hooks, which run at each life ---------------------------------------------------------------------------
+
+    def is_new(self, out: Out) -> bool:
+        """Whether a timer that a hook wants is really one more: not one that runs, has come, or says the same."""
+        if out.to in self._states or out.to in self._made:
+            self.claimed.add(out.to)
+            return False
+        clock = (out.name, out.body, out.interval)
+        for key, other in self.running().items():
+            if other == clock and key not in self.claimed:
+                self.claimed.add(key)
+                self._same[out.to] = key
+                return False
+        self._made.add(out.to)
+        self.claimed.add(out.to)
+        return True
+
+    def known_as(self, out: Out) -> Out:
+        """The same order, for the timer that it means."""
+        key = self._same.get(out.to)
+        return out if key is None else msgspec.structs.replace(out, to=key)
+
+    def made_again(self, key: str) -> None:
+        """The journal has this one."""
+        if not key.partition(".")[0].isdigit():  # Else a turn has made it.
+            self._made.add(key)
+
+    def running(self) -> dict[str, Clock]:
+        """All of them, and those that have come and wait to be handled."""
+        clocks = {key: (one.name, one.body, one.interval) for key, one in self._states.items()}
+        for source in self._home.open.values():
+            if source.kind == TICK:
+                clocks.setdefault(source.origin, (source.name, source.body, 0.0))
+        return clocks
+
+    def at(self, meta: Meta) -> dict[str, Clock]:
+        """Those that ran when a snapshot was taken, or had come and waited."""
+        clocks = {key: (name, body, interval) for key, (name, body, _, interval) in meta.timers.items()}
+        home = self._home
+        for source in (*(turn.input for turn in home.turns.values()), *home.open.values()):
+            if source.kind == TICK and source.id < meta.next_id:
+                clocks.setdefault(source.origin, (source.name, source.body, 0.0))
+        return clocks
+
+    # -- over lives -------------------------------------------------------------------------------------------------
 
     def start(self, key: str, name: str, body: bytes, left: float, interval: float) -> None:
         """A tick comes in `left` seconds."""
@@ -78,6 +130,7 @@ class Timers:
         for timer in self._states.values():
             if timer.handle is not None:
                 timer.handle.cancel()
+        self._made.clear()
         waiting = {source.origin for source in self._home.open.values() if source.kind == TICK}
         self._states = {
             key: TimerState(name, body, max(0.0, left), interval)

@@ -11,7 +11,7 @@ from ..actors.cell import Cell
 from ..actors.errors import HoldfastError, RemoteCrash, StartFailed
 from ..actors.exits import NORMAL, ExitReason, unpack_exit
 from ..actors.mail import LEAVE, Item, ReplyHandle
-from ..actors.message import Refusal
+from ..actors.message import Message, Refusal, reply_type
 from .keys import check_saved
 from .records import CRASH, DROPPED, LATER, OK, START, STASHED, Answer, Feed, Go
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from .life import Life
 
 Coroutine_ = types.CoroutineType
+INIT, STARTED, RECOVERED, STOP = "init", "start", "recovered", "stop"
+"""The hooks that are no turns: `__init__`, `on_start(True)`, `on_recovered`, `on_stop`."""
 
 
 class Fed(Item):
@@ -48,7 +50,7 @@ class Fed(Item):
             try:
                 item.message = life.cell.node.codec.message_in(life.cell, feed.name, feed.body)
             except HoldfastError as error:  # It came encoded, and is none of ours.
-                life.close_turn(DROPPED, life.answer_error(error) if feed.is_ask else Answer())
+                life.close_turn(DROPPED, life.answer_error(error))
                 return None
         try:
             result = item.call(actor) if life.guard is None else life.guard.call(item.call, actor)
@@ -59,6 +61,9 @@ class Fed(Item):
             return item.finish(result if life.guard is None else life.guard.drive(result))
         item.end_with(result)
         return None
+
+    def hook(self) -> str:
+        return f"on_{self.feed.kind}" if self.feed.kind in ("start", "exit", "down") else self.feed.kind
 
     def call(self, actor: Any) -> Any:
         """Call the handler or hook that this input is for."""
@@ -73,6 +78,7 @@ class Fed(Item):
                 if more is not None and more.trap_exits:
                     return actor.on_exit(node.cell_at(data["source"]).ref, reason)
                 if reason != NORMAL:
+                    self.life.is_cut_off = True
                     actor.ctx.stop(reason)
                 return None
             case "down":
@@ -109,7 +115,8 @@ class Fed(Item):
         elif isinstance(result, ReplyHandle):
             self.end(Answer(LATER))
         else:
-            self.end(self.life.answer_value(result))
+            kind: type[Message[Any]] = type(self.message)
+            self.end(self.life.answer_value(result, reply_type(kind)))
 
     def end(self, answer: Answer) -> None:
         """The turn is over; a stashed message stays open."""
@@ -120,6 +127,9 @@ class Fed(Item):
             life.close_turn(STASHED, Answer())
         else:
             life.close_turn(OK, answer if self.feed.is_ask else Answer())
+
+    def is_start(self) -> bool:
+        return self.feed.kind == START
 
     def ignored(self, cell: Cell, why: str) -> bool:
         """Called when the turn raised `Ignore`: only `on_start` may mean it."""
@@ -133,17 +143,20 @@ class Fed(Item):
 
 
 class Hook(Item):
-    """A hook that is no turn: called at each life, what it sends goes out at once and is not journaled."""
+    """A hook that is no turn: called at each life, what it does takes effect at once and is not replayed."""
 
     __slots__ = ("life", "name")
 
     def __init__(self, life: Life, name: str) -> None:
         self.life, self.name = life, name
 
+    def hook(self) -> str:
+        return self.name
+
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         life: Life = item.life
-        life.in_hook = True
+        life.enter(STARTED if item.name == "on_start" else RECOVERED)
         try:
             result = actor.on_start(True) if item.name == "on_start" else actor.on_recovered()
         except Refusal as no:  # Nobody asked: an actor that refuses to start has failed to.
@@ -160,6 +173,9 @@ class Hook(Item):
             raise StartFailed(self.life.cell.path, str(no)) from no
         self.over()
 
+    def is_start(self) -> bool:
+        return True
+
     def ignored(self, cell: Cell, why: str) -> bool:
         """Called when the hook raised `Ignore`."""
         if self.name == "on_start":
@@ -168,7 +184,7 @@ class Hook(Item):
 
     def over(self) -> None:
         """The hook has returned."""
-        self.life.in_hook = False
+        self.life.hook = ""
 
 
 class GoLive(Hook):
@@ -184,7 +200,7 @@ class GoLive(Hook):
     def run(actor: Any, item: Any) -> object:
         # Turns that failed are not replayed, but their numbers are used.
         item.life.turn = max(item.life.turn, item.go.turn)
-        item.life.gone = item.go.gone
+        item.life.gone, item.life.timers = item.go.gone, dict(item.go.timers)
         if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
             return Hook.run(actor, item)
         item.over()
@@ -221,6 +237,9 @@ class StopRecorded(Item):
     def run(actor: Any, item: Any) -> object:
         life: Life = item.life
         life.take_snapshot(is_last=True)
-        life.in_hook = True
-        lives.finish(life.cell, item.reason)
+        life.enter(STOP)
+        if life.is_cut_off:
+            lives.finish(life.cell, item.reason, is_orderly=False)
+        else:
+            lives.stop(life.cell, item.reason, item)
         return LEAVE

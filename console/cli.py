@@ -1,14 +1,15 @@
-"""The `holdfast` command. What it needs beside the library comes with the extra `demo`."""
+"""The `holdfast` command. What it needs beside the library comes with the extra `cli`, its demo with `demo`."""
 
 from __future__ import annotations
 
 import sys
 
-EXTRA = frozenset({"PIL", "numpy", "rich", "typer"})
+EXTRAS = {"rich": "cli", "typer": "cli", "PIL": "demo", "numpy": "demo"}
+"""The packages of other people that the command imports, and the extra that each comes with."""
 
 
 def app() -> None:
-    """Run the command line; without the extra, say what to install instead of showing a traceback."""
+    """Run the command line; without its extra, say what to install instead of showing a traceback."""
     try:
         from .commands import commands
 
@@ -18,15 +19,16 @@ def app() -> None:
 
 
 def missing_extra(missing: ModuleNotFoundError) -> str:
-    """What to tell a user who lacks a package of the extra.
+    """What to tell a user who lacks a package of an extra.
 
     Raises:
-        ModuleNotFoundError: the package is none of the extra's; that is a fault of the installation, not a choice.
+        ModuleNotFoundError: the package is of no extra; that is a fault of the installation, not a choice.
     """
     package = (missing.name or "").partition(".")[0]
-    if package not in EXTRA:
+    if package not in EXTRAS:
         raise missing
-    return f"holdfast: this command needs the package {package!r}, which is not installed: pip install holdfast[demo]"
+    install = f"pip install 'holdfast[{EXTRAS[package]}]'"  # in quotes, for shells to which brackets mean something
+    return f"holdfast: this command needs the package {package!r}, which is not installed: {install}"
 
 
 if __name__ == "__main__":

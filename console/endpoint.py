@@ -5,10 +5,11 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import fcntl
 import os
 import socket
 import stat
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Generator
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ LONGEST = 3600.0
 _TREE = {"add", "remove", "move", "reorder", "strategy", "intensity", "isolation", "stop", "start"}
 _LIVING = {"bind", "unbind", "register", "unregister", "suspend", "resume", "replace_state", "replace_code"}
 OPERATIONS = frozenset(_TREE | _LIVING | {"attach", "detach", "compose", "transition", "update"})
-NAMED = {"compose": ("outside",), "update": ("mechanism", "role")}
+NAMED = {"compose": ("outside",), "transition": ("whole",), "update": ("mechanism", "role")}
 """What comes last is named."""
 
 
@@ -77,16 +78,62 @@ async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) ->
         EndpointInUse: a live process has it, or there is something else. UntrustedFile: others may write the folder.
     """
     where = absolute(path)
-    sock, inode = listen(where)
-    endpoint = Endpoint(system, os.geteuid())
-    server = await asyncio.start_unix_server(endpoint.serve, sock=sock, limit=64 * 1024)
+    with claimed(where):
+        sock, inode = listen(where)
+        endpoint = Endpoint(system, os.geteuid())
+        server = await asyncio.start_unix_server(endpoint.serve, sock=sock, limit=64 * 1024)
+        try:
+            yield where
+        finally:
+            server.close()
+            await endpoint.close()
+            await server.wait_closed()
+            remove(where, inode)
+
+
+@contextlib.contextmanager
+def claimed(path: Path) -> Generator[None, None, None]:
+    """Have the path for oneself: of several processes that find the socket of a dead one, one replaces it.
+
+    The claim is a lock on a file beside the socket, which the kernel takes back when its holder dies, however.
+
+    Raises:
+        EndpointInUse: a live process has it. UntrustedFile: others may write the folder.
+    """
+    beside = path.with_name(f"{path.name}.lock")
     try:
-        yield where
+        check_folders(path.parent, {os.geteuid()}, may_share=True)
+        file = _locked(beside, str(path))
+    except OSError as error:
+        raise EndpointInUse(str(path), error.strerror or str(error)) from error
+    try:
+        yield
     finally:
-        server.close()
-        await endpoint.close()
-        await server.wait_closed()
-        remove(where, inode)
+        os.unlink(beside)  # Ours, as long as we hold it.
+        os.close(file)
+
+
+def _locked(beside: Path, path: str) -> int:
+    while True:
+        file = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            ours, there = os.fstat(file), os.stat(beside, follow_symlinks=False)
+        except BlockingIOError:
+            os.close(file)
+            raise EndpointInUse(path, "a live process listens there") from None
+        except FileNotFoundError:  # Its last holder has just ended in good order.
+            os.close(file)
+            continue
+        except BaseException:
+            os.close(file)
+            raise
+        if (ours.st_dev, ours.st_ino) == (there.st_dev, there.st_ino):
+            if ours.st_uid != os.geteuid():
+                os.close(file)
+                raise EndpointInUse(path, "somebody else's lock lies beside it")
+            return file
+        os.close(file)
 
 
 def absolute(path: str | os.PathLike[str]) -> Path:
@@ -105,10 +152,6 @@ def remove(path: Path, inode: int) -> None:
 
 def listen(path: Path) -> tuple[socket.socket, int]:
     """A listening socket at `path` that never had wider rights than 0600, and its inode."""
-    try:
-        check_folders(path.parent, {os.geteuid()}, may_share=True)
-    except OSError as error:
-        raise EndpointInUse(str(path), error.strerror or str(error)) from error
     clear(path)
     sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_CLOEXEC | socket.SOCK_NONBLOCK)
     try:
@@ -148,6 +191,7 @@ class Endpoint:
     def __init__(self, system: ActorSystem, uid: int) -> None:
         self._system, self._uid = system, uid
         self._clients: set[asyncio.Task[Any]] = set()
+        self._idle: dict[asyncio.Task[Any], None] = {}  # those that have asked for nothing, the longest first
 
     async def close(self) -> None:
         """End all connections; what they have asked for and is not done is undone."""
@@ -162,12 +206,11 @@ class Endpoint:
         assert task is not None
         self._clients.add(task)
         try:
-            if len(self._clients) > MOST_CLIENTS:
-                raise BadRequest(f"there are {MOST_CLIENTS} connections already")
             check_user(peer_uid(writer.get_extra_info("socket")), self._uid)
-            while (body := await read(reader)) is not None and await self._answer(body, reader, writer):
+            self._make_place()
+            while (body := await self._next(task, reader)) is not None and await self._answer(body, reader, writer):
                 pass
-        except (HoldfastError, msgspec.DecodeError) as error:
+        except (HoldfastError, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
             no = error if isinstance(error, HoldfastError) else BadRequest(str(error))
             with contextlib.suppress(OSError, TimeoutError):
                 await part(reader, writer, no)
@@ -178,6 +221,28 @@ class Endpoint:
         finally:
             self._clients.discard(task)
             writer.close()
+
+    def _make_place(self) -> None:
+        """One more client: if there are too many, whoever has asked for nothing for the longest time has to go.
+
+        Raises:
+            BadRequest: all of them are at work.
+        """
+        if len(self._clients) <= MOST_CLIENTS:
+            return
+        if not self._idle:
+            raise BadRequest(f"there are {MOST_CLIENTS} connections already")
+        task = next(iter(self._idle))
+        del self._idle[task]
+        task.cancel()
+
+    async def _next(self, task: asyncio.Task[Any], reader: asyncio.StreamReader) -> bytes | None:
+        """The next request of a client, which may be told to go while it says nothing."""
+        self._idle[task] = None
+        try:
+            return await read(reader)
+        finally:
+            self._idle.pop(task, None)
 
     async def _answer(self, body: bytes, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> bool:
         """Carry out one request. If the client goes meanwhile it is cancelled, and with it undone: False."""

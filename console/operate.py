@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import time
 import traceback
 from pathlib import Path
 from typing import Annotated
@@ -11,6 +12,7 @@ from typing import Annotated
 import typer
 
 from ..actors.errors import HoldfastError, SpecError
+from ..ftm.protected import ProtectionStatus
 from ..system.script import UntrustedFile, load_script
 from .remote import NotReached, RemoteChange, RemoteSystem
 from .wire import WrongUser
@@ -84,12 +86,25 @@ def status(
     try:
         with RemoteSystem(socket) as system:
             found = asyncio.run(system.get_status(path))
+            protection = asyncio.run(system.protection(path))
     except (NotReached, WrongUser) as error:
         raise _failed("status", error, UNUSABLE) from error
     except HoldfastError as error:
         raise _failed("status", error, FAILED) from error
     for name, value in dataclasses.asdict(found).items():
         typer.echo(f"{name}: {'-' if value is None else value}")
+    typer.echo(f"protection: {protection_text(protection)}")
+
+
+def protection_text(found: ProtectionStatus) -> str:
+    """How an actor is protected, in a line."""
+    if not found.is_protected:
+        return "none"
+    replicas = ", ".join(f"{name} {state}" for name, state in found.replicas.items())
+    since = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(found.since))
+    whole = "whole" if found.is_whole else "not whole"
+    more = (", changing" if found.is_changing else "") + (", on probation" if found.is_on_probation else "")
+    return f"{' + '.join(found.stack)}, {whole} since {since}, epoch {found.epoch} ({replicas or 'starting'}){more}"
 
 
 def _failed(command: str, error: Exception, code: int) -> typer.Exit:

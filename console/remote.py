@@ -19,6 +19,7 @@ from ..actors.control.orders import Change as StateChange
 from ..actors.control.orders import Migrate, Status
 from ..actors.control.tap import Statistics
 from ..actors.errors import HoldfastError, SpecError
+from ..ftm.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.transaction.operation import Step
 from .wire import (
@@ -185,6 +186,11 @@ class RemoteSystem:
         """How an actor is."""
         status: Status = await self._control("get_status", ref, timeout)
         return status
+
+    async def protection(self, ref: RemoteTarget, *, timeout: float = 5.0) -> ProtectionStatus:
+        """Whether an actor is protected by mechanisms, by which, who leads, and whether a replica may die."""
+        found: ProtectionStatus = await self._control("protection", ref, timeout)
+        return found
 
     async def get_state(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Any:
         """A copy of an actor's state."""
@@ -366,7 +372,7 @@ class RemoteChange:
 
     def attach(self, target: RemoteTarget, mechanism: Any) -> None:
         """Protect an actor by a mechanism, or by several, outermost first; a file is one of the running system's."""
-        self._put("attach", target, whole(mechanism))
+        self._put("attach", target, in_full(mechanism))
 
     def detach(self, target: RemoteTarget, mechanism: str = "") -> None:
         """Have it live without a mechanism."""
@@ -374,15 +380,15 @@ class RemoteChange:
 
     def compose(self, target: RemoteTarget, mechanism: Any, *, outside: bool = False) -> None:
         """Nest one more mechanism inside of those that it has, or outside."""
-        self._put("compose", target, whole(mechanism), outside)
+        self._put("compose", target, in_full(mechanism), outside)
 
-    def transition(self, target: RemoteTarget, mechanism: Any) -> None:
-        """Put a mechanism in the place of the one of its sort, or several in the place of all."""
-        self._put("transition", target, whole(mechanism))
+    def transition(self, target: RemoteTarget, mechanism: Any, *, whole: bool = False) -> None:
+        """Put a mechanism in the place of the one of its sort, or several (or all, `whole`) in the place of all."""
+        self._put("transition", target, in_full(mechanism), whole)
 
     def update(self, target: RemoteTarget, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
         """Give one brick new code."""
-        self._put("update", target, brick, whole(new), mechanism, role)
+        self._put("update", target, brick, in_full(new), mechanism, role)
 
     def _put(self, verb: str, target: RemoteTarget, *args: Any) -> None:
         packed = [pack_arg(arg, f"{verb} {text_of(target)}") for arg in (text_of(target), *args)]
@@ -416,10 +422,10 @@ def text_of(target: RemoteTarget) -> str:
     return target.path if isinstance(target, RemoteRef) else target
 
 
-def whole(code: Any) -> Any:
+def in_full(code: Any) -> Any:
     """Files by their whole path: the running system has another working directory."""
     if isinstance(code, (tuple, list)):
-        return tuple(map(whole, code))
+        return tuple(map(in_full, code))
     text = os.fspath(code) if isinstance(code, os.PathLike) else code
     if not isinstance(text, str):
         return text

@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import hashlib
-import os
 import sys
-from collections.abc import Generator, Sequence
-from importlib.machinery import ModuleSpec
-from pathlib import Path
-from types import ModuleType
+from collections.abc import Generator
 
 from ..actors.errors import SpecError
 from ..actors.node import Node
-from ..system.script import UntrustedFile, check_folders, check_owner, load_source, read_source, tell_loaded
+from ..system.script import find_beside, guarded_imports, load_source, read_source, tell_loaded
 from .wire import AnyArg, Packed
 
 
@@ -45,40 +40,9 @@ def trusted_imports(node: Node, needed: Needed) -> Generator[None, None, None]:
         source = read_source(path)
         if source.sha256 != sha256:
             raise SpecError(path, "it has changed since the command has read it: start it again")
+        find_beside(source)
         if needed.is_used(source.module) and source.module not in sys.modules:
             load_source(source)
         tell_loaded(node, source.path, sha256)
-    guard = _Guard(node)
-    sys.meta_path.insert(0, guard)
-    try:
+    with guarded_imports(lambda path, sha256: tell_loaded(node, path, sha256)):
         yield
-    finally:
-        sys.meta_path.remove(guard)
-
-
-class _Guard:
-    """Stands before all other finders, and looks at what they find."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-
-    def find_spec(
-        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
-        """The module's spec as the others find it. Raises UntrustedFile."""
-        for finder in sys.meta_path:
-            found = None if finder is self else finder.find_spec(name, path, target)
-            if found is not None:
-                if found.has_location and found.origin is not None:
-                    self._look(found.origin)
-                return found
-        return None
-
-    def _look(self, origin: str) -> None:
-        full, owner = Path(os.path.realpath(origin)), os.geteuid()
-        try:
-            check_owner(str(full), os.stat(full), {owner, 0})
-            check_folders(full.parent, {owner, 0})
-            tell_loaded(self._node, str(full), hashlib.sha256(full.read_bytes()).hexdigest())
-        except OSError as error:
-            raise UntrustedFile(origin, error.strerror or str(error)) from error

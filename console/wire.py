@@ -163,7 +163,15 @@ class Control(Request, tag="control", frozen=True):
     """An operator's order to one actor."""
 
     verb: Literal[
-        "suspend", "resume", "get_state", "get_status", "statistics", "terminate", "replace_state", "replace_code"
+        "suspend",
+        "resume",
+        "get_state",
+        "get_status",
+        "protection",
+        "statistics",
+        "terminate",
+        "replace_state",
+        "replace_code",
     ]
     path: str
     args: list[AnyArg]

@@ -19,6 +19,7 @@ from .messages import (
     OBSERVATIONS,
     REPAIR,
     ROS_DIAGNOSTICS,
+    STARTS,
     Explained,
     GetDiagnosis,
     GetExplanation,
@@ -27,6 +28,7 @@ from .messages import (
     ModelChanged,
     NextBest,
     RosDiagnostics,
+    Started,
     Touched,
 )
 from .model import Declaration, Model
@@ -147,6 +149,14 @@ class DiagnoserActor(Actor):
         if message.grace > 0:
             names = _names_below(self._engine.model, message.components)
             await self.ctx.publish(GRACE, Grace(names, message.grace))
+        self._due()
+
+    @subscribe(STARTS)
+    @on(Started)
+    async def _started(self, message: Started) -> None:
+        """Who was started by others is given as much time as who was started by repair."""
+        names = _names_below(self._engine.model, message.components)
+        await self.ctx.publish(GRACE, Grace(names, message.seconds, is_counted=True))
         self._due()
 
     @on(GetDiagnosis)

@@ -24,6 +24,8 @@ MODEL: Final = "/model"
 """`ModelChanged`."""
 GRACE: Final = "/grace"
 """`Grace`, from whoever acts upon the system."""
+STARTS: Final = "/starts"
+"""`Started`, from whoever sees that a component has begun a new life."""
 REPAIR: Final = "/repair"
 """`Touched`, and whatever else repair tells."""
 
@@ -37,6 +39,8 @@ class Grace(Message):
 
     names: tuple[str, ...]
     seconds: float
+    is_counted: bool = False
+    """It was started by others: how often that happens is still counted."""
 
 
 class Touched(Message):
@@ -50,6 +54,16 @@ class Touched(Message):
     action: str
     time: float
     grace: float = 0.0
+
+
+class Started(Message):
+    """These components have begun a new life: their supervisor, or a person, has started them again.
+
+    `seconds`: how long what is seen of them, and of what depends on them, says nothing yet.
+    """
+
+    components: tuple[str, ...]
+    seconds: float
 
 
 class ModelChanged(Message):
@@ -105,6 +119,7 @@ __all__ = [
     "OBSERVATIONS",
     "REPAIR",
     "ROS_DIAGNOSTICS",
+    "STARTS",
     "Explained",
     "GetDiagnosis",
     "GetExplanation",
@@ -113,5 +128,6 @@ __all__ = [
     "ModelChanged",
     "NextBest",
     "RosDiagnostics",
+    "Started",
     "Touched",
 ]

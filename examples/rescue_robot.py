@@ -373,7 +373,7 @@ async def play(scenario: str, board: str | None) -> Told:
             if is_off:
                 for name in NODES:
                     if name != "rviz":  # It runs on the operator's computer.
-                        await supervisor.ask(TerminateChild(name), LONG)
+                        await supervisor.ask(TerminateChild(name, parks=False), LONG)
             await system.start(care(board))
             mending = system.ref("/robot/diagnosis/repairer", repair.Repairer)
             first = Until(ALL_DOWN, State.FAULTY) if is_off else Until(ALL_WELL, State.HEALTHY)

@@ -1,6 +1,7 @@
 """The adaptation engine: another stack of mechanisms for a protected actor, while requests flow (A5, A76 to A82).
 
-The bricks that are new are started in all replicas beside the old ones (prepare). Then nothing new goes in, what is
+The new stack is tried in a replica of its own, which is no part of the group (`trial.py`). Then the bricks that are new
+are started in all replicas beside the old ones, in the one that leads last (prepare). Then nothing new goes in, what is
 inside comes to its end, and each replica has all that the other has sent to it (rest). Only then the replicas bind
 their bricks anew (commit); the old ones end behind that. Requests that come meanwhile wait at the home.
 
@@ -14,11 +15,11 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ..actors.actor import Actor, on
 from ..actors.cell import Cell
-from ..actors.errors import HoldfastError
+from ..actors.errors import AskTimeout, HoldfastError
 from ..actors.message import Message
 from ..supervision.admin import AlreadyPresent, DeleteChild, StartChild, TerminateChild
 from ..supervision.spec import ChildSpec
@@ -26,13 +27,20 @@ from .failover import bury
 from .group import Look
 from .messages import ConfigMismatch, StaleEpoch
 from .orders import Abort, Commit, Prepare, Quiesce, Stand
+from .trial import TRIAL, TrialFailed, tried, until_given_up
+from .trial import ended as ended_trial
 
 if TYPE_CHECKING:
     from .group import Group
     from .mechanism import Mechanism
+    from .sealed import SecuredLink
 
 PREPARED_WITHIN = 30.0
-"""Seconds that a replica may take to start its new bricks; requests flow meanwhile."""
+"""Seconds that a replica may take to start its new bricks, before it is ended; requests flow meanwhile."""
+ABORTED_WITHIN = 5.0
+"""Seconds that it may take to end them again, before it is ended."""
+SECURED_WITHIN = 15.0
+"""Seconds within which the authority has to have certified everybody."""
 REST_WITHIN = 5.0
 """Seconds within which what is inside has to come to its end; requests wait meanwhile."""
 COMMITTED_WITHIN = 5.0
@@ -50,7 +58,7 @@ PREPARING, RESTING, COMMITTING, TIDYING, UNDOING, OVER = (
     "undoing",
     "over",
 )
-STEPS = ("start", "prepare", "rest", "quiesce", "commit", "switch", "tidy")
+STEPS = ("try", "start", "prepare", "rest", "quiesce", "commit", "switch", "tidy")
 """Where the engine may be struck by a test; undoing has `abort` instead of the last three."""
 
 
@@ -73,6 +81,11 @@ class Reconfiguration:
         self.descriptions = [layer.describe() for layer in layers]
         self.names = names_for(group, layers)
         self.stage = PREPARING
+        self.is_back = False  # to what has worked before
+        self.is_preparing = False  # replicas start its bricks
+        self.is_tried = False
+        self.link: SecuredLink | None = None  # that of the new stack, if it is another one
+        self.given_up: asyncio.Future[str] = group.node.loop.create_future()
         self.prepared: dict[str, int] = {}  # name to life, of those that have the new bricks
         self.epoch = -1  # in which they were prepared
         self.turn = -1  # the last one of the primary when it had come to rest
@@ -93,6 +106,8 @@ class Reconfiguration:
         """It is not wanted any more, unless it has gone too far."""
         if self.stage in (PREPARING, RESTING):
             self.why = self.why or why
+            if not self.given_up.done():
+                self.given_up.set_result(self.why)
             self._group.stir()
             self._group.tell("adapt", Look())
 
@@ -128,6 +143,8 @@ def names_for(group: Group, layers: tuple[Mechanism, ...]) -> tuple[str, ...]:
 class AdaptationEngine(Actor):
     """Carries out what `group.change` says. `spec` makes the spec of a replica; `switched` makes a change last."""
 
+    _is_part: ClassVar[bool] = True
+
     deterministic = False
 
     def __init__(
@@ -147,7 +164,13 @@ class AdaptationEngine(Actor):
     async def look(self, message: Look) -> None:
         """Go on with the change, until it is made or undone."""
         group = self._group
-        while (change := group.change) is not None and not group.is_over and change.stage is not OVER:
+        while not group.is_over:
+            change = group.change
+            if change is None or change.stage is OVER:
+                change = group.change = group.gone_back  # Those that only the stack before needs, or does not need.
+                group.gone_back = None
+            if change is None:
+                return
             if change.why and change.stage in (PREPARING, RESTING):
                 change.stage = UNDOING
             match change.stage:
@@ -170,23 +193,73 @@ class AdaptationEngine(Actor):
         if not group.is_steady():
             await self._wait_for_change(LOOK_AGAIN)
             return
+        try:
+            await until_given_up(self._try(change), change.given_up)
+        except HoldfastError as error:
+            change.give_up(str(error))
+            return
+        if not group.is_steady():
+            return
         self._step("start")
         try:
-            await self._start_replicas(change)
+            await until_given_up(self._start_replicas(change), change.given_up)
         except HoldfastError as error:
             change.give_up(f"one more replica could not be started: {error}")
             return
         members = {name: life for name, life in group.members.items() if group.is_well(name)}
-        epoch = group.epoch
+        epoch, order = group.epoch, Prepare(change.config, change.descriptions)
         self._step("prepare")
-        _, errors = await self._ask_all(members, Prepare(change.config, change.descriptions), PREPARED_WITHIN)
-        if errors:
-            await self._wait_for_change(LOOK_AGAIN)  # If it has died, that is known soon.
-            for name, why in errors.items():
-                if group.members.get(name) == members[name] and group.is_well(name):
-                    change.give_up(f"{name} could not prepare it: {why}")
+        change.is_preparing = True
+        # The one that leads comes last: what goes wrong in another one keeps nobody waiting.
+        for names in ([name for name in members if name != group.primary], [group.primary]):
+            _, errors = await self._ask_all(
+                [name for name in names if name in members], order, PREPARED_WITHIN, given_up=change.given_up
+            )
+            if errors:
+                await self._wait_for_change(LOOK_AGAIN)  # If it has died, that is known soon.
+                for name, why in errors.items():
+                    # A failover has it given up: it is prepared again.
+                    if group.epoch == epoch and group.members.get(name) == members[name] and group.is_well(name):
+                        change.give_up(f"{name} could not prepare it: {why}")
+                        self._replace_late(name, members[name], why)
+                change.is_preparing = False
+                return
+        change.is_preparing = False
+        if change.stage is PREPARING:  # Else a failover has brought the stack before back meanwhile.
+            change.prepared, change.epoch, change.stage = members, epoch, RESTING
+
+    async def _try(self, change: Reconfiguration) -> None:
+        """See, where it hurts nobody, whether the bricks start and pass a batch on, and whether links can be secured.
+
+        Raises:
+            HoldfastError: why it cannot be.
+        """
+        group, outermost = self._group, change.layers[0]
+        if not (change.is_tried or change.is_back):
+            self._step("try")
+            await tried(group, self._supervisor(), self._spec(TRIAL, change.config, change.layers))
+            change.is_tried = True
+        if change.link is not None or (group.link is not None and group.link.mechanism == outermost):
             return
-        change.prepared, change.epoch, change.stage = members, epoch, RESTING
+        link = group.linked(outermost, lambda: dict.fromkeys((*group.names, *change.names)))
+        if link is None:
+            return
+        try:
+            async with asyncio.timeout(SECURED_WITHIN):
+                await link.ready()
+        except TimeoutError:
+            link.close()
+            raise TrialFailed(group.path, f"the authority has not answered within {SECURED_WITHIN:g} s") from None
+        except BaseException:
+            link.close()
+            raise
+        change.link = link
+
+    def _replace_late(self, name: str, life: int, why: BaseException) -> None:
+        """A replica that does not answer in time is ended, and started again, unless it is all there is."""
+        group = self._group
+        if isinstance(why, AskTimeout) and any(one != name and group.is_well(one) for one in group.members):
+            group.suspect(name, life, "it has not answered in time when the mechanism was to be changed")
 
     async def _start_replicas(self, change: Reconfiguration) -> None:
         """Those that only the new stack needs come up beside the others."""
@@ -196,6 +269,8 @@ class AdaptationEngine(Actor):
                 continue
             if name not in change.started:
                 change.started.append(name)
+            if self._group.cell_of(name) is None:
+                self._group.expect(name)
             try:
                 await above.ask(StartChild(self._spec(name, change.config, change.layers)), STARTED_WITHIN)
             except AlreadyPresent:
@@ -217,7 +292,7 @@ class AdaptationEngine(Actor):
         self._step("rest")
         group.is_resting = True
         change.rest_at = time.monotonic()
-        if await self._is_at_rest(change):
+        if await self._is_at_rest(change) and change.stage is RESTING:
             change.stage, group.is_changing = COMMITTING, True
             return
         self._go_on()
@@ -309,6 +384,10 @@ class AdaptationEngine(Actor):
         self._go_on()
         for name, life in change.failed.items():
             await bury(group, name, life)
+        try:
+            await self._start_replicas(change)
+        except HoldfastError:  # The supervisor of the replicas tries again.
+            await self._wait_for_change(LOOK_AGAIN)
         left = [name for name in group.names if name not in change.names]
         if group.primary is None and left:
             await self._wait_for_change(LOOK_AGAIN)
@@ -346,8 +425,13 @@ class AdaptationEngine(Actor):
         group = self._group
         self._step("abort")
         self._go_on()
+        if change.link is not None:
+            change.link.close()
         members = {name: life for name, life in group.members.items() if group.is_well(name)}
-        await self._ask_all(members, Abort(change.config), PREPARED_WITHIN)
+        _, errors = await self._ask_all(members, Abort(change.config), ABORTED_WITHIN)
+        for name, why in errors.items():
+            self._replace_late(name, members[name], why)
+        await ended_trial(group, self._supervisor())
         await self._end_replicas(change.started)
         self._over(change)
         change.fail(change.why)
@@ -379,9 +463,17 @@ class AdaptationEngine(Actor):
         return not change.why
 
     async def _ask_all(
-        self, names: Iterable[str], message: Message[Any], seconds: float, reach: Callable[[str], Any] | None = None
+        self,
+        names: Iterable[str],
+        message: Message[Any],
+        seconds: float,
+        reach: Callable[[str], Any] | None = None,
+        given_up: asyncio.Future[str] | None = None,
     ) -> tuple[dict[str, Any], dict[str, BaseException]]:
-        """Order all of these replicas at once: replies, and the errors of those that have not done so."""
+        """Order all of these replicas at once: replies, and the errors of those that have not done so.
+
+        Those that have not answered when it is given up are left out.
+        """
         group, asked = self._group, dict[str, asyncio.Future[Any]]()
         replies: dict[str, Any] = {}
         errors: dict[str, BaseException] = {}
@@ -391,10 +483,15 @@ class AdaptationEngine(Actor):
                 asked[name].add_done_callback(_heard)  # If this actor is killed, nobody looks at it.
             except HoldfastError as error:
                 errors[name] = error
+        if given_up is None:
+            given_up = self._group.node.loop.create_future()
         if asked:
-            await asyncio.wait(asked.values())
+            all_of_them = asyncio.gather(*asked.values(), return_exceptions=True)
+            await asyncio.wait((all_of_them, given_up), return_when=asyncio.FIRST_COMPLETED)
         for name, future in asked.items():
-            if (failed := future.exception()) is not None:
+            if not future.done():
+                errors[name] = TrialFailed(self._group.path, "it was given up")
+            elif (failed := future.exception()) is not None:
                 errors[name] = failed
             else:
                 replies[name] = future.result()

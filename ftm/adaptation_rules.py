@@ -141,21 +141,24 @@ def composed(layers: Any, new: Any, *, outside: bool) -> tuple[Mechanism, ...]:
     return (*more, *there) if outside else (*there, *more)
 
 
-def replaced(layers: Any, new: Any) -> tuple[Mechanism, ...]:
-    """A mechanism in the place of the one of the same layer; several in the place of all.
+def replaced(layers: Any, new: Any, *, whole: bool = False) -> tuple[Mechanism, ...]:
+    """One mechanism in the place of the one of the same layer, alone or in a tuple; several in the place of all.
+
+    Args:
+        layers: the stack.
+        new: the mechanism, or several.
+        whole: whether what is new is the whole stack, also if it is only one.
 
     Raises:
         MechanismRefused: it has no place.
     """
-    there = compose(layers)
-    if isinstance(new, (tuple, list)):
-        return layers_of(new)
-    (one,) = layers_of(new)
-    if len(there) == 1:
-        return (one,)
+    there, wanted = compose(layers), layers_of(new)
+    if whole or len(wanted) != 1 or len(there) == 1:
+        return wanted
+    (one,) = wanted
     alike = [index for index, layer in enumerate(there) if layer.layer == one.layer]
     if len(alike) != 1:
-        why = f"{names_of(there)} has {len(alike)} layers of its sort ({one.layer}): name the whole stack, as a tuple"
+        why = f"{names_of(there)} has {len(alike)} layers of its sort ({one.layer}): name the whole stack (whole=True)"
         raise MechanismRefused(one.name, why)
     return (*there[: alike[0]], one, *there[alike[0] + 1 :])
 

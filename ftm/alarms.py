@@ -13,9 +13,11 @@ class ProtectionLost(Event, frozen=True, eq=False):
 
 
 class Diverged(Event, frozen=True, eq=False):
-    """Two replicas have come to different outcomes of the same request: the actor is not deterministic (T8).
+    """Two replicas have come to different outcomes of the same request (T8).
 
-    `request` is its number and `name` what it was; from there on the follower's state is not the leader's.
+    `request` is its number and `name` what it was; from there on the follower's state is not the leader's. Whose fault
+    it is, a comparison of two does not say: the follower computes the request again, and `NondeterminismFound` follows
+    if that comes out differently each time.
     """
 
     replica: str
@@ -23,6 +25,45 @@ class Diverged(Event, frozen=True, eq=False):
     request: int
     name: str
     turn: int
+
+
+class StatesDiffer(Event, frozen=True, eq=False):
+    """After turn `turn` the follower's state was not the leader's, though no outcome has shown it."""
+
+    replica: str
+    epoch: int
+    turn: int
+
+
+class NondeterminismFound(Event, frozen=True, eq=False):
+    """A replica has run requests up to `request` (`name`) again from the same state, and it came out differently.
+
+    The actor is not deterministic; no single wrong value explains that.
+    """
+
+    replica: str
+    epoch: int
+    request: int
+    name: str
+    turn: int
+
+
+class ProtectionCostly(Event, frozen=True, eq=False):
+    """To compare runs, a replica had to go through the whole state of `size` bytes, and took `seconds` for it.
+
+    It does so for each batch. Told once per life of a replica, from 10 ms on.
+    """
+
+    replica: str
+    seconds: float
+    size: int
+
+
+class RequestsDropped(Event, frozen=True, eq=False):
+    """A brick has neither passed these requests on nor ended them: they fail with `RequestDropped`."""
+
+    replica: str
+    numbers: str
 
 
 class Masked(Event, frozen=True, eq=False):

@@ -11,6 +11,8 @@ import itertools
 from collections import deque
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import msgspec
+
 from ..actors import lives
 from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
@@ -18,9 +20,9 @@ from ..actors.errors import HoldfastError
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message
 from ..actors.ref import current
-from ..checkpoint.records import Live, Outcome, Released, Snapshot, TurnEnd
+from ..checkpoint.records import DROPPED, MESSAGE, REPLY, Answer, Live, Outcome, Released, Snapshot, TurnEnd
 from .letters import FOREVER as FOREVER
-from .messages import FORWARDED, Done, Ended, Inward, Outward, StaleEpoch, Taken, Work
+from .messages import FORWARDED, Done, Ended, Inward, Outward, Request, StaleEpoch, Taken, Work
 from .post import Inbox, Posting
 from .sealing import sealed
 
@@ -113,16 +115,43 @@ class Before(Brick):
     """What is done with a batch before it is computed; without `before` it passes through."""
 
     async def before(self, work: Work) -> Work | None:
-        """Prepare a batch. None: it goes no further from here."""
+        """Prepare a batch. None: none of its requests goes further from here.
+
+        A request that is neither passed on nor ended by `answer` or `refuse` fails, and that is told
+        (`RequestsDropped`).
+        """
         return work
+
+    def message_of(self, request: Request) -> Any:
+        """The message that a request brings to the protected actor; None if it is something else, such as a timer."""
+        feed, cell = request.feed, self._standing.server.cell
+        if feed.kind != MESSAGE or cell is None:
+            return None
+        return cell.node.codec.message_in(cell, feed.name, feed.body)
+
+    def answer(self, work: Work, request: Request, reply: object) -> Work:
+        """End one request here with this reply; it is computed nowhere. Returns the batch without it."""
+        node = self._standing.node
+        return self._end(work, request, Answer(REPLY, "", node.codec.encode(reply, self._standing.address)))
+
+    def refuse(self, work: Work, request: Request, error: HoldfastError) -> Work:
+        """End one request here: whoever has asked gets the error. Returns the batch without it."""
+        return self._end(work, request, Answer(*self._standing.node.codec.encode_error(error)))
+
+    def _end(self, work: Work, request: Request, answer: Answer) -> Work:
+        standing = self._standing
+        if self.leads:  # Elsewhere, nobody hears of outcomes.
+            end = TurnEnd(-1, request.feed.id, DROPPED, [], answer if request.feed.is_ask else Answer())
+            done = Done(standing.epoch, standing.config, -1, [end], False)
+            standing.node.cell_at(standing.paths["protocol"]).ref.tell(done)
+        return msgspec.structs.replace(work, requests=[one for one in work.requests if one is not request])
 
     @on(Work)
     async def _work(self, work: Work) -> None:
         if self._refuses():
             return
         out = await self.before(work)
-        if out is not None:
-            self.next.tell(out)
+        self.next.tell(msgspec.structs.replace(work, requests=[]) if out is None else out)
 
 
 class After(Brick):
@@ -169,6 +198,11 @@ class Proceed(Brick):
         self._at_home: asyncio.Future[None] | None = None
         self._flushes: list[ReplyHandle[None]] = []
         self._work_now: Work | None = None
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether a batch is being computed, or handed over."""
+        return self._task is not None
 
     def take_over(self) -> None:
         """The server reports here from now on. (Not from the start: a brick that is only prepared must not hear it.)"""

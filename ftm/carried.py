@@ -63,7 +63,7 @@ class Carrier:
     def __init__(self, guest: Guest, path: str) -> None:
         self._guest, self._path = guest, path
         self._port = guest.recovery.port_of(path)
-        self._attempt, self._incoming = -1, Incoming()
+        self._attempt, self._incoming = -1, Incoming(imports=True)
         self._take: Take | None = None
         self._cell: Cell | None = None  # where a life is at rest, or comes back to
         self._other: Cell | None = None  # beside it: the life that comes back
@@ -71,7 +71,7 @@ class Carrier:
 
     def hear(self, record: Carried) -> None:
         if record.attempt != self._attempt:
-            self._attempt, self._incoming = record.attempt, Incoming()
+            self._attempt, self._incoming = record.attempt, Incoming(imports=True)
         told = self._incoming.take(record)
         if told is None:
             return
@@ -177,6 +177,7 @@ class Carrier:
         other.extra().bindings = cell.extra().bindings
         try:
             lives.build(other, start, ActorContext)
+            other.extra().trap_exits = told["traps"]
             assert other.actor is not None
             restore_state(other.actor, told["state"])
         except StartFailed as error:

@@ -12,7 +12,7 @@ from collections import deque
 from typing import TYPE_CHECKING, Any, cast
 
 from ..actors.cell import GONE, RUNNING, Cell, Host
-from ..actors.control.moving import ATTEMPTS, now
+from ..actors.control.moving import now
 from ..actors.errors import CannotMove, HoldfastError, StartFailed, error_text
 from ..actors.exits import ExitReason, unpack_exit
 from ..actors.mail import Item
@@ -22,6 +22,7 @@ from ..actors.process import frames
 from ..actors.process.recipe import pack_recipe
 from ..actors.process.relay import OutsideHost
 from ..actors.process.workers import Worker
+from ..checkpoint.bound import HomeBound
 from ..checkpoint.controller import RemoteLife
 from ..checkpoint.records import DOWN, EXIT, Carried, Closed, Live, Protected, ToHome, Wanted
 from ..checkpoint.recovery.held import inlet
@@ -71,7 +72,7 @@ class OutOfProcess(ToGroup):
         super().__init__(cell, host, timeout)
         self._new_host, self._place, self._spec, self._worker = host, place, spec, worker_of(place, cell)
         self._port = RemoteLife(cell.path, self._worker)
-        self._attempt, self._incoming = next(ATTEMPTS), Incoming()
+        self._incoming = Incoming(imports=False)
         self._admit: Admit = cell.admit
         self._held: list[Any] = []  # what has been sent to it here meanwhile
         self._left: asyncio.Future[None] = self.node.loop.create_future()
@@ -92,11 +93,11 @@ class OutOfProcess(ToGroup):
         )
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_life, self.cell.path, self._attempt, step, **told)
+        carry(self._port.to_life, self.cell.path, self.attempt, step, **told)
         self._worker.connection.flush()
 
     def _said(self, record: ToHome) -> None:
-        if not isinstance(record, Carried) or record.attempt != self._attempt:
+        if not isinstance(record, Carried) or record.attempt != self.attempt:
             return
         told = self._incoming.take(record)
         if told is None:
@@ -231,22 +232,22 @@ class IntoProcess(ToPlainTask):
         super().__init__(cell, old.place, timeout)
         self._group_host, self._place, self._worker = old, old.place, worker_of(old.place, cell)
         self._port = RemoteLife(cell.path, self._worker)
-        self._attempt, self._incoming = next(ATTEMPTS), Incoming()
+        self._incoming = Incoming(imports=False)
         self._up: asyncio.Future[None] = self.node.loop.create_future()
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_life, self.cell.path, self._attempt, step, **told)
+        carry(self._port.to_life, self.cell.path, self.attempt, step, **told)
         self._worker.connection.flush()
 
     async def carry(self) -> None:
         self._place.arriving = self._said
-        self._say("come", state=self._data)
+        self._say("come", state=self._data, traps=self._traps)
         await self.within(self._up, self.timeout, lambda: "its new life was not up")
 
     def _said(self, record: ToHome) -> None:
         if isinstance(record, Closed):
             self._fail(str(unpack_exit(record.reason)))
-        if not isinstance(record, Carried) or record.attempt != self._attempt:
+        if not isinstance(record, Carried) or record.attempt != self.attempt:
             return
         told = self._incoming.take(record)
         if told is None or self._up.done() or self.given_up.done():
@@ -297,9 +298,8 @@ class IntoProcess(ToPlainTask):
         for port, target in more.bindings.items():
             data = {"port": port, "target": target.path}
             worker.connection.send(frames.Command(worker.connection.name_out(cell.path), "bind", data))
-        for sender in getattr(homed, "senders", ()):
-            if not sender.done():
-                sender.set_result(None)
+        if isinstance(homed, HomeBound):
+            homed.senders.release()
         self.dismantled()
         self.gone_on_at = now()
         self.moved()

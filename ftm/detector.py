@@ -11,10 +11,11 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections import deque
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ..actors.actor import Actor, on
 from ..actors.errors import SpecError
+from ..actors.own_clock import OwnClock
 from .orders import Beat, Broken
 
 if TYPE_CHECKING:
@@ -65,26 +66,6 @@ def _number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-class OwnClock:
-    """Time as the observer has lived it: if it comes later than it meant to, the rest does not count."""
-
-    def __init__(self, now: float, period: float) -> None:
-        self._real, self._own, self._period = now, 0.0, period
-        self.lag = 0.0  # all that was taken out so far
-
-    def tick(self, now: float) -> float:
-        """The observer looks; it meant to look again after one period. Returns the time on this clock."""
-        late = max(0.0, now - self._real - self._period)
-        self.lag += late
-        self._own += max(0.0, now - self._real) - late
-        self._real = now
-        return self._own
-
-    def at(self, now: float) -> float:
-        """The time on this clock between two looks."""
-        return self._own + min(max(0.0, now - self._real), self._period)
-
-
 class Accrual:
     """What is known of one replica's heartbeats, and how much its silence means."""
 
@@ -127,6 +108,8 @@ class Accrual:
 class Detector(Actor):
     """The root's side: hears the heartbeats of a group's replicas, and tells the failover manager whom it suspects."""
 
+    _is_part: ClassVar[bool] = True
+
     deterministic = False
 
     def __init__(self, group: Group) -> None:
@@ -153,7 +136,7 @@ class Detector(Actor):
             return  # It has died since it said so.
         accrual = self._known.get((beat.name, life))
         now = self._clock.at(self.ctx.cell.node.loop.time())
-        if accrual is None:
+        if accrual is None or group.up.get(beat.name) != life:  # Or it is another replica of that name.
             for old in [one for one in self._known if one[0] == beat.name]:
                 del self._known[old]
             self._known[beat.name, life] = Accrual(group.detection, now)
@@ -177,5 +160,5 @@ class Detector(Actor):
             if accrual is None:  # Not heard yet by this life of ours.
                 self._known[name, life] = Accrual(self._group.detection, now)
             elif accrual.is_suspect(now):
-                self._group.suspect(name, life, f"no heartbeat for {now - accrual.last:.3f} s")
+                self._group.silent(name, life, f"no heartbeat for {now - accrual.last:.3f} s")
         self._timer = loop.call_later(self._period, self._look)

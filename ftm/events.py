@@ -28,6 +28,16 @@ class MechanismChanged(Event, frozen=True, eq=False):
     seconds: float
 
 
+class MechanismSettled(Event, frozen=True, eq=False):
+    """The probation of a change of layers is over: they stay (`is_kept`), or those before are there again, and why."""
+
+    before: tuple[str, ...]
+    layers: tuple[str, ...]
+    is_kept: bool
+    why: str
+    seconds: float
+
+
 class FailedOver(Event, frozen=True, eq=False):
     """Another replica leads; `seconds` from when the end of the old one was noticed."""
 

@@ -9,33 +9,39 @@ from __future__ import annotations
 
 import asyncio
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ..actors.actor import Actor, on
 from ..actors.cell import RUNNING
-from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
+from ..actors.errors import ActorStopped, AskFailed, AskTimeout, HoldfastError
 from ..actors.exits import KILLED
 from ..actors.process.remote import ProcessHost
 from .events import FailedOver
 from .group import Look
 from .messages import Lead
-from .orders import Peer
+from .orders import Commit, Peer, Prepare
+from .sealed import Refused
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from .adaptation import Reconfiguration
     from .group import Group
 
 ANSWERED_WITHIN = 1.0
 """Seconds after which a replica is looked at again that was told something: it may have been suspected meanwhile."""
 TOLD_WITHIN = 1.0
 """Seconds until the end of a replica that has said so is known with its reason."""
+BACK_WITHIN = 30.0
+"""Seconds after which a replica is given up that is brought back to an earlier stack of mechanisms."""
 AGAIN_AFTER = 0.05
 """Seconds until something is tried again that a replica has refused."""
 
 
 class FailoverManager(Actor):
     """Sees to it that one replica leads, and that it waits for no dead ones."""
+
+    _is_part: ClassVar[bool] = True
 
     deterministic = False
 
@@ -59,7 +65,9 @@ class FailoverManager(Actor):
         while not group.is_over and group.is_begun:
             if group.is_changing:
                 return  # It is short, and whoever does it wakes us.
-            if group.primary is not None and not group.is_well(group.primary):
+            if group.primary is not None and group.primary == group.renewing and group.is_well(group.primary):
+                self._renew(group.primary)
+            elif group.primary is not None and not group.is_well(group.primary):
                 if group.is_awaited(group.primary):  # To end it would lose what only it has.
                     self._later()
                     return
@@ -84,6 +92,14 @@ class FailoverManager(Actor):
             group.why = "its process has ended" if cell is None else f"its process has ended ({cell.extra().reason})"
         group.primary, group.condemned[name] = None, life
         group.lost(name, group.why)
+
+    def _renew(self, name: str) -> None:
+        """The only replica that is left leads anew, in another epoch, when it has other bricks."""
+        group = self._group
+        self._step("epoch")
+        group.epoch += 1
+        group.forget_answers()
+        group.primary, group.leading, group.renewing = None, name, None
 
     async def _replaced(self) -> bool:
         """One step towards another primary; False: none is left."""
@@ -110,18 +126,39 @@ class FailoverManager(Actor):
             self._step("kill")
             await bury(group, name, life)
             group.condemned.pop(name, None)
+        back = group.back_to()
+        if back is not None and not await self._brought_back(leading, back):
+            return True
         self._step("lead")
         try:
-            await group.protocol(leading).ask(Lead(group.epoch, group.config, group.least_turn()), ANSWERED_WITHIN)
+            order = Lead(group.epoch, group.config, group.least_turn(), group.peer_of(leading))
+            await group.protocol(leading).ask(order, ANSWERED_WITHIN)
         except AskTimeout:
             return True
         except HoldfastError as error:
-            if group.is_well(leading):
+            if group.is_well(leading) and not (back is not None and isinstance(error, Refused)):
                 group.suspect(leading, group.members[leading], f"it refused to lead: {error}")
+                group.at_fault(leading, f"it refused to lead: {error}")
             return True
         self._step("bind")
         if group.is_well(leading):
             self._bind(leading)
+        return True
+
+    async def _brought_back(self, name: str, back: Reconfiguration) -> bool:
+        """Whether a replica that is to lead has the stack again that was there before one which has failed."""
+        group, life = self._group, self._group.members.get(name, 0)
+        self._step("back")
+        try:
+            await group.protocol(name).ask(Prepare(back.config, back.descriptions), BACK_WITHIN)
+            await group.protocol(name).ask(Commit(back.config, insists=True), BACK_WITHIN)
+        except HoldfastError as error:
+            if group.is_well(name):
+                group.suspect(name, life, f"it could not go back to the mechanism before: {error}")
+            return False
+        group.went_back(back)
+        for other in [one for one in group.members if one != name]:
+            group.lost(other, "it has the stack that has failed, and begins again")
         return True
 
     def _bind(self, name: str) -> None:
@@ -129,7 +166,7 @@ class FailoverManager(Actor):
         group = self._group
         group.primary, group.leading = name, None
         group.bind_proxy()
-        for other in [one for one in group.members if one != name]:
+        for other in [one for one in group.members if one != name and not group.keeps_members]:
             group.lost(other, "it has to catch up with the new primary")
         group.failovers += 1
         group.hold.give_back()
@@ -197,12 +234,13 @@ async def bury(group: Group, name: str, life: int) -> None:
     while not group.is_over:
         with group.hold.of(group.place(name), "it does not count any more") as is_ours:
             if is_ours:
-                await _killed(group, name, life)
+                await killed(group, name, life)
                 return
         await asyncio.sleep(AGAIN_AFTER)
 
 
-async def _killed(group: Group, name: str, life: int) -> None:
+async def killed(group: Group, name: str, life: int) -> None:
+    """Kill a replica's process, if it is that life, and wait until it has been reaped; by nobody's leave."""
     cell = group.cell_of(name)
     if cell is None or cell.life != life or cell.state is not RUNNING:
         return
@@ -222,7 +260,7 @@ def nothing(step: str) -> None:
 async def why_ended(group: Group, name: str, life: int, error: HoldfastError) -> str:
     """Why a replica has not done as it was told: if it has ended, it says soon of what."""
     cell = group.cell_of(name)
-    if not isinstance(error, ActorStopped) or cell is None:
+    if not isinstance(error, (ActorStopped, AskFailed)) or cell is None:
         return str(error)
     if group.life_of(name) == life:
         await asyncio.wait((cell.ended(),), timeout=TOLD_WITHIN)

@@ -10,9 +10,11 @@ from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ..actors.cell import Cell
 from ..actors.message import Message
-from ..checkpoint.inputs import Batch
+from ..checkpoint.inputs import EXPIRED, Batch
 from ..checkpoint.records import (
     DROPPED,
     FAILED,
@@ -56,6 +58,8 @@ class Flush(Message):
 class Group(Members):
     """A protected address: its replicas, who of them leads, and what is on its way to it."""
 
+    begins = False  # What the proxy has not sent to any replica is not begun.
+
     def __init__(
         self, cell: Cell, switch: Switch, names: tuple[str, ...], *, epoch: int, config: int, detection: Detection
     ) -> None:
@@ -80,6 +84,7 @@ class Group(Members):
         self.is_held = False  # nothing new goes in: nobody could take over yet
         self.is_suspended = self.is_stopping = False
         self.change: Reconfiguration | None = None  # that is being made
+        self.gone_back: Reconfiguration | None = None  # done by a failover: what is left is to tidy up
         self.is_resting = False  # nothing new goes in: the mechanism is about to be changed
         self.is_changing = False  # the replicas change it: nobody else may tell them anything
         self.is_joining = False  # a replica is catching up
@@ -93,6 +98,9 @@ class Group(Members):
         self.on_start_failed: Callable[[TurnEnd], None] = lambda end: None
         self.on_ended: Callable[[dict[str, Any]], None] = lambda reason: None
         self.on_joined: Callable[[], None] = lambda: None
+        self.back_to: Callable[[], Reconfiguration | None] = lambda: None  # the stack that has to come back
+        self.refuses_all: Callable[[], bool] = lambda: False  # a new stack has not let pass a single request
+        self.went_back: Callable[[Reconfiguration], None] = lambda change: None
         self.on_joining: Callable[[str], None] = lambda name: None
 
     # -- replicas ---------------------------------------------------------------------------------------------------
@@ -191,6 +199,13 @@ class Group(Members):
         if client not in lives:
             cell = self.node.find(client) if client else None
             lives[client] = 0 if cell is None else cell.life
+        source = self.switch.open.get(feed.id)
+        ask = None if source is None else source.ask
+        if ask is not None:
+            if not ask.started and not ask.deadline:
+                # Its client was told that it has not run: no replica may find, on its own clock, that there is time.
+                feed = msgspec.structs.replace(feed, deadline=EXPIRED)
+            ask.started = True
         return Request(client, lives[client], feed)
 
     def send_again(self, *, careful: bool = False) -> None:
@@ -225,6 +240,7 @@ class Group(Members):
         """Another one is to lead: what it asks again is answered again."""
         self.inward.clear()
         self.finished.clear()
+        self.switch.timers.claimed.clear()  # Its hooks want theirs again.
         self.switch.arrival.cancel()  # The last one may have died in the middle of a snapshot,
         self.switch.due.restarted()  # or before it began with it.
         if self.switch.due.wishes:
@@ -334,6 +350,8 @@ class Group(Members):
 
     def _end(self, end: TurnEnd) -> None:
         switch = self.switch
+        if end.turn < 0 and end.status == DROPPED and self.refuses_all():
+            return  # It is asked of the stack before.
         if end.turn < 0 and end.status == DROPPED:  # It was handled, and nobody knows any more what came of it.
             self.ledger.pop(end.id, None)
             if end.id in switch.open:

@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..actors.cell import RUNNING, Cell
-from ..actors.control.moving import ATTEMPTS, Transit, now
+from ..actors.control.moving import Transit, now
 from ..actors.errors import CannotMove, StartFailed
 from ..actors.exits import unpack_exit
-from ..actors.process import frames
 from ..actors.process.recipe import pack_recipe
 from ..checkpoint.controller import RemoteLife
 from ..checkpoint.moving import Detached, refuse_unsaved
@@ -51,7 +50,7 @@ class OutOfSubtree(ToGroup):
         super().__init__(cell, host, timeout)
         self._new_host = host
         self._place, self._spec, self._worker = place, spec, worker_of(place, cell)
-        self._switch, self._attempt = place.switch, next(ATTEMPTS)
+        self._switch = place.switch
 
     @property
     def is_recorded(self) -> bool:
@@ -63,21 +62,17 @@ class OutOfSubtree(ToGroup):
         await super().prepare()
 
     async def take(self) -> None:
-        self._worker.on_move = self._said
+        self.hear(self._worker)
         self._say("take")
         await self.within(
             self._taken, self.timeout, lambda: "it did not come to rest: a turn or background work goes on"
         )
 
     def _say(self, step: str) -> None:
-        connection = self._worker.connection
-        data = {"step": step, "attempt": self._attempt}
-        connection.send(frames.Command(connection.name_out(self.cell.path), "move", data))
-        connection.flush()
+        self.say(self._worker, step)
+        self._worker.connection.flush()
 
-    def _said(self, data: dict[str, Any]) -> None:
-        if data.get("attempt") != self._attempt:
-            return
+    def heard(self, data: dict[str, Any]) -> None:
         if data.get("step") == "refused":
             self.give_up(str(data["why"]))
         elif data.get("step") == "taken" and not self.given_up.done():
@@ -99,7 +94,6 @@ class OutOfSubtree(ToGroup):
             self.is_late = True
             raise CannotMove(cell.path, "its life has ended")
         self.is_done = True
-        self._worker.on_move = lambda data: None
         wanted = self._place.hand_over(host)
         protected = Protected(b"", [], {})  # What it is made of is known.
         host.take_up(cell, msgspec.structs.replace(wanted, protected=protected), RemoteLife(cell.path, self._worker))
@@ -115,7 +109,6 @@ class OutOfSubtree(ToGroup):
 
     def undo(self) -> None:
         cell = self.cell
-        self._worker.on_move = lambda data: None
         cell.extra().trap_exits = False
         if self.is_late:
             self.ending = asyncio.ensure_future(self.host.dismantle(cell))

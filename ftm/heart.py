@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
@@ -28,6 +28,8 @@ Turn = tuple[int, ServerLife, int]
 
 class Heart(Actor):
     """Tells the failure detector that the bricks of this replica run, and that a turn does not end."""
+
+    _is_part: ClassVar[bool] = True
 
     detector: Binding[Actor]
     proxy: Binding[Actor]

@@ -9,7 +9,7 @@ import msgspec
 from ..actors.message import Message
 from ..checkpoint.records import Outcome, TurnEnd
 from .messages import Logged, Request, State
-from .runs import Missing, Remembering, Run, Shadow, digest_of_state
+from .runs import Digests, Missing, Remembering, Run, Shadow
 
 
 class Computed(msgspec.Struct, array_like=True):
@@ -58,6 +58,7 @@ class Helping(Remembering):
         super().__init__(*args)
         self._shadow: Shadow | None = None
         self._digest = b""
+        self._digests = Digests()
         self._kept: State | None = None
 
     async def on_stop(self, reason: object) -> None:
@@ -85,15 +86,17 @@ class Helping(Remembering):
                 return Computed([], [], None, b"", [], NEEDS_STATE)
         if before.live != order.live:
             before = msgspec.structs.replace(before, live=order.live)
-        if self._shadow is None:
-            self._shadow = Shadow(self._standing, None)
         epoch = self._standing.epoch
-        run = await self._shadow.run(before, order.requests, order.heard)
+        run: Run | Missing = Run([], [], before)
+        if order.requests:
+            if self._shadow is None:
+                self._shadow = Shadow(self._standing, None)
+            run = await self._shadow.run(before, order.requests, order.heard)
         if isinstance(run, Missing) or run.state is None:
             return Computed([], [], None, b"", [], run.why if isinstance(run, Missing) else "no state")
         digest = b""
         if order.keep:
-            digest = digest_of_state(run.state)
+            digest = self._digests.of(run.state)
             self._keep(order, run, digest, epoch)
         return Computed(run.ends, run.released, None if order.keep else run.state, digest, run.objections)
 
@@ -104,7 +107,7 @@ class Helping(Remembering):
         if standing.server.life is not None or point is None or point.turn != order.turn:
             return None
         if point is not self._kept:
-            self._digest, self._kept = digest_of_state(point), point
+            self._digest, self._kept = self._digests.of(point), point
         return point if self._digest == order.base else None
 
     def _keep(self, order: Compute, run: Run, digest: bytes, epoch: int) -> None:

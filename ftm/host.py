@@ -7,6 +7,7 @@ it is protected: nothing is kept of what it has handled, and when no replica is 
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import time
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
@@ -17,22 +18,33 @@ from ..actors.cell import DOWN, GONE, RUNNING, Cell
 from ..actors.errors import HoldfastError, StartFailed
 from ..actors.exits import KILLED, ExitReason, pack_exit, unpack_exit
 from ..actors.mail import Item
-from ..checkpoint.homes import Homes, parent_ended, seen
+from ..checkpoint.homes import Homes, seen
 from ..checkpoint.method import Method
 from ..checkpoint.records import Restore
 from ..supervision.backoff import Backoff
-from ..supervision.respec import respec
+from ..supervision.respec import replace_mechanism, respec
 from ..supervision.spec import ChildSpec, Flags, child
 from ..supervision.supervisor import Supervisor
-from .adaptation import REST_WITHIN, AdaptationEngine, CannotAdapt, Reconfiguration
+from .adaptation import (
+    OVER,
+    PREPARING,
+    REST_WITHIN,
+    TIDYING,
+    AdaptationEngine,
+    CannotAdapt,
+    Reconfiguration,
+    names_for,
+)
 from .detector import Detection, Detector
 from .events import ReplicaLost
 from .failover import FailoverManager, why_ended
 from .group import Group, Look
 from .join import Joiner
 from .mechanism import compose
+from .members import fault_of
 from .messages import Lead
 from .orders import Finish, Install, Setting
+from .probation import Probation
 from .proxy import Proxy, Settle
 from .steering import Steered
 from .unkept import UNKEPT, begin_afresh, forget_later, is_unkept
@@ -48,6 +60,10 @@ JOINED_WITHIN = 10.0
 """Seconds that a start waits for another replica to catch up; after that the first one goes on alone."""
 FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
+REPLICA_SHUTDOWN = 20.0
+"""Seconds that a replica may take to end its bricks, before its process is killed."""
+BUILT_WITHIN = 60.0
+"""Seconds that the processes of a group may take to come up."""
 BRICKS_INTENSITY = 100
 """Ends of parts and replicas within `BRICKS_PERIOD` seconds after which the whole group is given up."""
 BRICKS_PERIOD = 5.0
@@ -66,6 +82,8 @@ class GroupHost(Steered):
         self.last_config = 1  # that was ever given to a stack of mechanisms
         self.on_step: Callable[[str], None] | None = None  # for tests: called before each step of a failover
         self.on_switched: Callable[[], None] = lambda: None
+        self.ended_at = time.time()  # when the last group ended, by the system's clock
+        self.probation: Probation | None = None  # of the stack that there is, if it is not trusted yet
         self._starting: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
@@ -149,6 +167,7 @@ class GroupHost(Steered):
         group.careful = {key for key in self._careful if key in switch.open}
         self.take_over(cell, group)
         group.is_held = len(names) > 1
+        group.keeps_members = any(layer.keeps_members for layer in self.layers)
         group.secure(self.layers[0])
         if group.link is not None:
             await group.link.ready()
@@ -164,7 +183,10 @@ class GroupHost(Steered):
             raise
         ftm.ended().add_done_callback(lambda done: self._parts_ended(cell, group))
         if up is not None:
-            await up
+            done, _ = await asyncio.wait((up,), timeout=BUILT_WITHIN)
+            if not done:
+                raise StartFailed(cell.path, f"its replicas were not up within {BUILT_WITHIN:g} s")
+            up.result()
         return group
 
     def take_over(self, cell: Cell, group: Group) -> None:
@@ -174,6 +196,12 @@ class GroupHost(Steered):
         group.on_start_failed = lambda end: self._start_failed(cell, end)
         group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
         group.on_joined = self._has_joined
+        group.on_fault = lambda name, why, has_ended: self._at_fault(group, name, why, has_ended=has_ended)
+        group.refuses_all = lambda: self.probation is not None and self.probation.refuses_all()
+        group.back_to = lambda: self._back_to(group)
+        group.went_back = lambda back: self._went_back(cell, group, back)
+        if self.probation is not None:
+            self.probation.moved(group)
         group.on_joining = lambda name: self._bind_all(cell, group, name)
 
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
@@ -191,6 +219,7 @@ class GroupHost(Steered):
             name,
             self._replica_start(cell, name, config, layers),
             isolation="process",
+            shutdown=REPLICA_SHUTDOWN,
             backoff=Backoff(initial=0.01, maximum=2.0, reset_after=5.0),
         )
 
@@ -225,6 +254,10 @@ class GroupHost(Steered):
         group = self.group
         if group is None or group.is_over or self._ending is not None:
             raise CannotAdapt(cell.path, "it is being recovered; try again")
+        for back in (group.change, group.gone_back):
+            if back is not None and back.is_back and not back.outcome.done():  # It is told as settled, and ends soon.
+                await asyncio.wait((back.outcome,))
+                return await self.adapt(cell, mechanism, switched, rest_within)
         if group.change is not None:
             raise CannotAdapt(cell.path, "it is being changed already")
         self.last_config += 1
@@ -234,6 +267,67 @@ class GroupHost(Steered):
         await asyncio.shield(change.outcome)
         return change
 
+    # -- probation --------------------------------------------------------------------------------------------------
+
+    def _put_on_probation(
+        self, cell: Cell, group: Group, before: tuple[Mechanism, ...], change: Reconfiguration
+    ) -> None:
+        earlier = self.probation
+        if earlier is not None and earlier.is_over:
+            earlier = None
+        self.probation = Probation(
+            group, before, change, earlier, lambda: self._begin_going_back(cell), self._probation_over
+        )  # fmt: skip
+
+    def _probation_over(self, probation: Probation) -> None:
+        if self.probation is probation:
+            earlier = probation.earlier
+            is_wanted = not probation.settled.result().is_kept and earlier is not None and not earlier.is_over
+            self.probation = earlier if is_wanted else None
+
+    def _at_fault(self, group: Group, name: str, why: str, *, has_ended: bool) -> None:
+        """A replica ends by its own doing: what it prepares is given up; a stack that is new gives way."""
+        if has_ended and group.change is not None and group.change.is_preparing and not group.change.is_back:
+            group.change.give_up(f"{name} has ended when it prepared it: {why}")
+        if self.probation is not None and group is self.group:
+            self.probation.failed(f"{name}: {why}")
+
+    def _back_to(self, group: Group) -> Reconfiguration | None:
+        """What whoever leads next has to be brought to first."""
+        probation = self.probation
+        if probation is None or probation.is_over or not probation.why or group is not self.group:
+            return None
+        if probation.back is None or probation.back.outcome.done():
+            self.last_config += 1
+            probation.back = Reconfiguration(group, self.last_config, probation.before, REST_WITHIN)
+            probation.back.is_back = True
+        return probation.back
+
+    def _begin_going_back(self, cell: Cell) -> None:
+        """Go back while the group is led; if nobody leads now, whoever leads next is brought back."""
+        group = self.group
+        if group is None or group.is_over or self._ending is not None:
+            return
+        other = group.change
+        if other is not None:
+            other.give_up("the mechanism before comes back")  # Tried again soon.
+            return
+        back = self._back_to(group)
+        if back is not None and back.stage == PREPARING:
+            group.change = back
+            group.tell("adapt", Look())
+
+    def _went_back(self, cell: Cell, group: Group, back: Reconfiguration) -> None:
+        """Whoever is to lead has the stack before, and so have all that are started from now on."""
+        if back.stage == OVER or back is not self._back_to(group):
+            return
+        back.stage = TIDYING
+        back.names = names_for(group, back.layers)
+        self._switch_to(cell, group, back)
+        if group.change is not back:
+            group.gone_back = back
+        group.tell("adapt", Look())
+
     def _adapting(self, cell: Cell, group: Group) -> tuple[Any, Any]:
         """What the engine needs of us: the spec of a replica, and how a change is made to last."""
 
@@ -241,16 +335,27 @@ class GroupHost(Steered):
             return self._replica_spec(cell, name, config, layers)
 
         def switched(change: Reconfiguration) -> None:
-            self.layers, self.config = change.layers, change.config
-            group.config, group.detection = change.config, self.detection
-            group.secure(change.layers[0])
-            for name in group.names:
-                one = group.cell_of(name)
-                if one is not None:
-                    respec(one, self._replica_start(cell, name, change.config, change.layers))
-            self.on_switched()
+            self._switch_to(cell, group, change)
 
         return spec, switched
+
+    def _switch_to(self, cell: Cell, group: Group, change: Reconfiguration) -> None:
+        """This stack is the one from now on."""
+        before, probation = self.layers, self.probation
+        self.layers, self.config = change.layers, change.config
+        group.config, group.detection = change.config, self.detection
+        group.keeps_members = any(layer.keeps_members for layer in change.layers)
+        group.secure(change.layers[0], change.link)
+        for name in group.names:
+            one = group.cell_of(name)
+            if one is not None:
+                respec(one, self._replica_start(cell, name, change.config, change.layers))
+        if not change.is_back:
+            self._put_on_probation(cell, group, before, change)
+            self.on_switched()
+        elif probation is not None:
+            replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=as_spec(change.layers)))
+            probation.end(is_kept=False)
 
     def _step(self, name: str) -> None:
         if self.on_step is not None:
@@ -271,6 +376,7 @@ class GroupHost(Steered):
             pieces = switch.restore_records()
             if not pieces and switch.state_turn >= 0:
                 pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
+            traps = traps or any(piece.traps for piece in pieces)
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 await protocol.ask(
@@ -428,6 +534,14 @@ class GroupHost(Steered):
         self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int, noticed: float, *, ordered: bool
     ) -> None:
         """All replicas have ended: the life at the address is over."""
+        probation = self.probation
+        if probation is not None and not ordered and not probation.is_over and (probation.why or fault_of(reason)):
+            probation.why = probation.why or f"no replica is left: {failed or reason}"
+            # Nobody is left who could be brought back: the next life begins with the stack before.
+            self.last_config += 1
+            self.layers, self.config = probation.before, self.last_config
+            replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=as_spec(probation.before)))
+            probation.end(is_kept=False)
         self.over(
             cell, running, str(failed or reason), ordered=ordered or running < 0, noticed=noticed, reason=reason
         )  # fmt: skip
@@ -438,6 +552,7 @@ class GroupHost(Steered):
     async def dismantle(self, cell: Cell) -> None:
         """End the mechanism; returns when all of its processes have been reaped."""
         group, self.group = self.group, None
+        self.ended_at = time.time()
         if group is not None:
             group.is_over = True
             group.hold.give_back()
@@ -465,11 +580,13 @@ class GroupHost(Steered):
                 if self.group.change is not None:
                     self.group.change.close("it has stopped")
             ftm.kill()
+        if self.probation is not None:
+            self.probation.end(is_kept=True)
         self.give_up(cell, self.topics(cell), restarting=self.is_restarting(cell))
 
     def is_restarting(self, cell: Cell) -> bool:
         """Whether a retired address may have its supervisor, and so itself, started again."""
-        return parent_ended(cell)
+        return lives.parent_ended(cell)
 
     # -- what else a host does --------------------------------------------------------------------------------------
 
@@ -482,6 +599,11 @@ class GroupHost(Steered):
 
     def running(self, cell: Cell) -> int:
         return -1 if self.group is None else self.group.only_suspect_input()
+
+
+def as_spec(layers: tuple[Mechanism, ...]) -> Any:
+    """Layers as a spec has them: one alone stands there as it is."""
+    return layers[0] if len(layers) == 1 else layers
 
 
 def replica(setting: Setting, start: Start[Any] | bytes, layers: tuple[Any, ...]) -> Start[Any]:

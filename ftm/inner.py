@@ -20,7 +20,7 @@ from ..actors.control.calls import Call
 from ..actors.control.moving import farewell, obey_commands, part, settle, sorted_out, twin
 from ..actors.errors import ControlFailed, StartFailed, StartIgnored
 from ..actors.exits import ExitReason, pack_exit, unpack_exit
-from ..actors.mail import Envelope, Item
+from ..actors.mail import Ask, Envelope, Item
 from ..actors.mailbox import Bounded
 from ..actors.message import message_name
 from ..actors.process.recipe import pack_recipe
@@ -65,6 +65,9 @@ class InnerGroupHost:
         self.bound: Bounded | None = None
         self._number = 0
         self._up: asyncio.Future[None] | None = None
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the root for replicas."""
@@ -148,6 +151,9 @@ class InnerGroupHost:
             cell.queue.clear()  # Its home has these.
         self._guest.tell_gone(cell)
 
+    def progress(self, cell: Cell) -> object:
+        return object()  # It waits for the root.
+
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
@@ -174,6 +180,9 @@ class InnerGroupHost:
 
     def backlog(self, cell: Cell) -> int:
         return 0  # The home has it.
+
+    def load(self, cell: Cell) -> int:
+        return 0
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         if verb in ("link", "unlink"):  # Its links are kept at home; what watches it from here is told here.

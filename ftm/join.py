@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ..actors.actor import Actor, on
 from ..actors.errors import AskTimeout, HoldfastError
@@ -31,6 +31,8 @@ FIRST_RETRY, LONGEST_RETRY = 0.02, 2.0
 
 class Joiner(Actor):
     """Has replicas that are up, and do not count, catch up with the primary."""
+
+    _is_part: ClassVar[bool] = True
 
     deterministic = False
 

@@ -78,7 +78,9 @@ class Settings(msgspec.Struct, frozen=True):
         confirm: seconds a wish must hold before it is followed.
         dwell: seconds after a change in which nothing changes that need not.
         urgent_dwell: seconds after a change in which nothing changes at all; after it, what is not valid may go.
-        transition_cost: how much cheaper (in `price`) another choice must be, if the present one is valid.
+        transition_cost: how much cheaper (in `price`) another choice must be, if the present one is valid. By default
+            less than one computation more or less per request, so that what was left for want of a resource comes
+            back with it.
         notice: seconds between telling a decision and carrying it out, for a person to object.
     """
 
@@ -90,7 +92,7 @@ class Settings(msgspec.Struct, frozen=True):
     confirm: float = 5.0
     dwell: float = 300.0
     urgent_dwell: float = 10.0
-    transition_cost: float = 1.0
+    transition_cost: float = 0.3
     notice: float = 0.0
 
     def __post_init__(self) -> None:
@@ -274,15 +276,19 @@ class Judge:
                 return NONE, Verdict(NONE, reason, degraded=selection.degraded, **about)
             # That it must go is what has to be confirmed, not where to: the second best is no worse for it.
             return "away", Verdict(ADAPT, f"{reason}; {best} is the cheapest that is", best.layers, **about)
-        here = choice_of(self.layers(), faults, self.application, price=self.price)
+        energy = self._narrow().energy  # As in what it is compared with.
+        here = choice_of(self.layers(), faults, self.application, price=self.price, energy=energy)
         if best is None or best.layers == self.current or best.price > here.price - self.settings.transition_cost:
             return None, Verdict(STAY, f"{label(self.current)} is valid, and nothing is enough cheaper", **about)
         reason = f"{best} is cheaper than {here}: {best.price:.3g} against {here.price:.3g}"
         return best.layers, Verdict(ADAPT, reason, best.layers, **about)
 
+    def _narrow(self) -> Resources:
+        """What there is for a choice that is to come."""
+        return self.resources.scaled(1 - self.settings.margin)
+
     def _select(self, faults: Faults, now: float) -> Selection:
-        narrow = self.resources.scaled(1 - self.settings.margin)
-        selection = select(faults, self.application, narrow, list(self._entries.values()), price=self.price)
+        selection = select(faults, self.application, self._narrow(), list(self._entries.values()), price=self.price)
         for layers, (until, _) in list(self.forbidden.items()):
             if now >= until:
                 del self.forbidden[layers]

@@ -31,6 +31,7 @@ from ..actors.process.mover import Move
 from ..actors.process.moves import await_up
 from ..actors.process.to_task import dispose
 from ..actors.timers import Timer
+from ..checkpoint.bound import HomeBound
 from ..checkpoint.controller import LocalLife, TaskHost
 from ..checkpoint.keys import restore_state
 from ..checkpoint.life import Life
@@ -158,7 +159,8 @@ class ToRecordedTask(FromGroup):
         switch, live, _ = host.open(cell)
         settled: asyncio.Future[None] = self.node.loop.create_future()
         home = ArrivingHome(host, cell, other, settled)
-        life = Life(other, home, host.method, None)
+        host.page = host.homes.page(switch)
+        life = Life(other, home, host.method, host.page)
         life.begins_suspended = self._group.is_suspended
         for record in switch.restore_records():
             life.from_home(record)
@@ -200,6 +202,7 @@ class ToPlainTask(FromGroup):
         super().__init__(cell, host, timeout)
         self._data = b""
         self._stash: list[int] = []
+        self._traps = False  # `ctx.trap_exits`
 
     async def take(self) -> None:
         switch = self._switch
@@ -216,7 +219,7 @@ class ToPlainTask(FromGroup):
         if primary is not None:
             ask = group.protocol(primary).ask(Export(epoch), EXPORTED_WITHIN)
             exported = await self.within(ask, end - now(), lambda: "its state did not come")
-            self._data, self._stash = exported.data, list(exported.stash)
+            self._data, self._stash, self._traps = exported.data, list(exported.stash), exported.traps
 
     async def carry(self) -> None:
         cell, start = self.cell, self.cell.extra().start
@@ -225,6 +228,7 @@ class ToPlainTask(FromGroup):
         other.table = start.kind._table
         other.extra().bindings = cell.extra().bindings
         lives.build(other, start, ActorContext)
+        other.extra().trap_exits = self._traps
         actor = other.actor
         assert actor is not None
         try:
@@ -269,9 +273,8 @@ class ToPlainTask(FromGroup):
         for ask, name, body, sender in getattr(homed, "waiting", ()):
             del name, body, sender
             cell.admit(cell, ask)
-        for sender in getattr(homed, "senders", ()):
-            if not sender.done():
-                sender.set_result(None)
+        if isinstance(homed, HomeBound):
+            homed.senders.release()
         if self._group.is_suspended:
             more.suspended = True
             mailbox.hold(cell)

@@ -52,6 +52,8 @@ class Sheet(Message):
 class Letters(Actor):
     """Opens sealed letters, and seals what is answered."""
 
+    _is_part: ClassVar[bool] = True
+
     peer_messages: ClassVar[tuple[type[Message[Any]], ...]] = ()
     """What `from_peer` understands."""
     answers_later: ClassVar[bool] = False

@@ -18,7 +18,7 @@ from ..checkpoint.records import (
     ToHome,
     TurnEnd,
 )
-from ..checkpoint.turns import Hook
+from ..checkpoint.turns import STARTED, Fed, Hook
 
 if TYPE_CHECKING:
     from .server import Server
@@ -45,6 +45,10 @@ class ServerContext(RecordedContext):
     def ref(self) -> ActorRef[Any]:
         return self.cell.node.cell_at(self._address).ref
 
+    def waits_for_room(self, topic: str) -> bool:
+        """What is published leaves when the turn's result has been compared, voted on or copied, and not before."""
+        return False
+
 
 class ServerLife(Life):
     """A life of the protected actor. What it wants released in the middle of a turn is the server's to decide."""
@@ -59,6 +63,11 @@ class ServerLife(Life):
         made = self._context_made = ServerContext(cell, self.server.address)
         made.recorded = self
         return made
+
+    def rewind(self, turn: int, stash: list[Fed]) -> None:
+        """Go on from after an earlier turn: what was run since is run again, or something else is."""
+        self.turn, self.stash = turn, stash
+        self._context_made.draw_anew()
 
     def close_turn(self, status: str, answer: Answer) -> None:
         self.ended = self.feed
@@ -109,14 +118,14 @@ NOWHERE: Final = Nowhere()
 class PartOver(Item):
     """Stands behind what the server was given: it has come to rest, between two turns."""
 
-    __slots__ = ("server",)
+    __slots__ = ("number", "server")
 
-    def __init__(self, server: Server) -> None:
-        self.server = server
+    def __init__(self, server: Server, number: int) -> None:
+        self.server, self.number = server, number
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        item.server.at_rest(OVER)
+        item.server.part_over(item.number)
         return None
 
 
@@ -144,7 +153,7 @@ class BeginAgain(Hook):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        item.life.in_hook = True
+        item.life.enter(STARTED)
         result = actor.on_start(False)
         if inspect.iscoroutine(result):
             return item.finish(result)

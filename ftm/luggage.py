@@ -35,10 +35,10 @@ def carry(say: Callable[[Carried], None], path: str, attempt: int, step: str, **
 
 
 class Incoming:
-    """What comes in pieces."""
+    """What comes in pieces; `imports`: from the root, which may have modules imported."""
 
-    def __init__(self) -> None:
-        self._luggage = Luggage()
+    def __init__(self, *, imports: bool) -> None:
+        self._luggage = Luggage(imports=imports)
 
     def take(self, record: Carried) -> dict[str, Any] | None:
         """One more piece; all that was told if it was the last."""

@@ -96,6 +96,11 @@ class Mechanism:
     """Of: crash, transient_value, permanent_value, development, eavesdropping, forgery, replay."""
     needs: ClassVar[frozenset[str]] = frozenset()
     """Of: state_access, determinism, assertions, versions, certificates."""
+    keeps_members: ClassVar[bool] = False
+    """Whether the next leader itself brings the others to its state, before anything leaves: they count all the while.
+
+    Without it, all others have to join again after a failover, and until one has, nobody could take over.
+    """
     bandwidth: ClassVar[str] = "low"
     cpu: ClassVar[str] = "low"
     units: ClassVar[int] = 1
@@ -218,13 +223,14 @@ def revive(description: Description) -> Mechanism:
     """
     name = description.kind
     try:
-        made = find_class(Code(name, description.file, description.sha256))(**description.settings)
+        kind = find_class(Code(name, description.file, description.sha256))
+        if not (isinstance(kind, type) and issubclass(kind, Mechanism)):  # Whatever it is, it is not called.
+            raise MechanismRefused(name, "it is no Mechanism")
+        made: Mechanism = kind(**description.settings)
     except MechanismRefused:
         raise
     except Exception as error:  # Importing runs the file: anything may be raised.
         raise MechanismRefused(name, f"it cannot be loaded: {type_name(type(error))}: {error}") from error
-    if not isinstance(made, Mechanism):
-        raise MechanismRefused(name, "it is no Mechanism")
     for role, part, code in description.bricks:
         try:
             made = made.with_brick(role, part, find_class(code))

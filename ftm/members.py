@@ -4,19 +4,57 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import os
 import time
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 from ..actors.cell import RUNNING, Cell
 from ..actors.errors import HoldfastError
+from ..actors.exits import Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal
 from ..actors.message import Message
+from ..actors.process.remote import ProcessHost
 from .events import ReplicaLost, WrongSuspicion
 from .securing import Securing
 
 if TYPE_CHECKING:
     from .detector import Detection
     from .stuck import Stuck
+
+
+FROM_OUTSIDE: Final = frozenset({1, 2, 3, 9, 15, 19, 20})
+"""Signals (HUP, INT, QUIT, KILL, TERM, STOP, TSTP) by which others end a process, or stop it."""
+OUTVOTED: Final = "OutvotedHere"
+"""The error of a replica that was outvoted, which is no fault of its bricks."""
+
+
+def fault_of(reason: ExitReason) -> str:
+    """Why the end of a replica may be the fault of its own code; "" if somebody else has ended it."""
+    match reason:
+        case Crash() | Hung() | OutOfMemory() | Exited():
+            why = str(reason)
+        case Signal() if reason.number not in FROM_OUTSIDE:
+            why = str(reason)
+        case Shutdown() if reason.detail:  # A replica ends so when a brick of it has crashed.
+            why = reason.detail
+        case _:
+            why = ""
+    return "" if OUTVOTED in why else why
+
+
+def is_blocked(pid: int) -> bool:
+    """Whether the silence of a process can be the doing of its own code.
+
+    One that sleeps though it has something to do is blocked, by a call that does not return. One that computes may be
+    in a loop without end, or may have got no processor: where more want one than there are, that cannot be told apart.
+    One that was stopped by a signal, or waits for a disk, is silent for another reason.
+    """
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state == "S" or (state == "R" and os.getloadavg()[0] <= (os.cpu_count() or 1))
 
 
 class Look(Message):
@@ -36,6 +74,9 @@ class Members(Securing):
         self.leading: str | None = None  # who is to lead in this epoch: `Lead` may or may not have reached it
         self.why = ""  # why the last one does not any more
         self.noticed = 0.0  # and since when that is known, on the monotonic clock
+        self.keeps_members = (
+            False  # through a failover: the next leader brings them to its state before anything leaves
+        )
         self.members: dict[str, int] = {}  # name to life, of those that hold all state: the primary and its backups
         self.condemned: dict[str, int] = {}  # name to life, of those that must be dead before the next one leads
         self.dropped: set[str] = set()  # backups that the primary still has to forget
@@ -43,10 +84,13 @@ class Members(Securing):
         self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}  # name to life
         self.ending: dict[str, int] = {}  # lives that end by themselves: nobody waits for them
+        self.renewing: str | None = None  # the primary, if it is to lead anew, with other bricks
         self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
         self.is_over = False
         self._stirred: list[asyncio.Future[None]] = []
+        self._was_whole, self._whole_since = False, time.time()
+        self.on_fault: Callable[[str, str, bool], None] = lambda name, why, has_ended: None
 
     def cell_of(self, name: str) -> Cell | None:
         """The cell of an actor of the mechanism, if there is one now."""
@@ -79,6 +123,11 @@ class Members(Securing):
         """Those that could lead instead of the primary, in order."""
         return [name for name in self.names if name not in (self.primary, self.leading) and self.is_well(name)]
 
+    def peer_of(self, leading: str) -> str | None:
+        """The path of a member that goes on under the next leader, if its mechanism keeps its members."""
+        left = [name for name in self.names if name != leading and self.is_well(name)] if self.keeps_members else []
+        return self.place(left[0]) if left else None
+
     def watched(self) -> Iterator[tuple[str, int]]:
         """Who is expected to be heard of, and is not suspected already: name and life."""
         for name, life in list(self.up.items()):
@@ -102,12 +151,22 @@ class Members(Securing):
         """Hear of the end of a replica's present life."""
         cell = self.cell_of(name)
         if cell is not None and cell.state is RUNNING:
-            cell.ended().add_done_callback(lambda done: self._died(name))
+            cell.ended().add_done_callback(lambda done: self._died(name, done))
 
-    def _died(self, name: str) -> None:
+    def _died(self, name: str, done: asyncio.Future[ExitReason]) -> None:
         if not self.noticed:
             self.noticed = time.monotonic()
+        if not done.cancelled() and (why := fault_of(done.result())):
+            self.at_fault(name, f"its process has ended: {why}")
         self.wake()
+
+    def expect(self, name: str) -> None:
+        """A replica is about to be started, and none of its name is there: what is known is of an earlier one.
+
+        The lives of each are counted from one.
+        """
+        for known in (self.up, self.suspects, self.ending, self.joining):
+            known.pop(name, None)
 
     def suspect(self, name: str, life: int, why: str) -> None:
         """A replica is silent for too long."""
@@ -117,16 +176,38 @@ class Members(Securing):
             self.why, self.noticed = why, time.monotonic()
         self.wake()
 
+    def at_fault(self, name: str, why: str, *, has_ended: bool = True) -> None:
+        """A replica has ended by what its own code has done, or only looks as if it had."""
+        if name in self.names and not self.is_over:
+            self.on_fault(name, why, has_ended)
+
+    def silent(self, name: str, life: int, why: str) -> None:
+        """No sign of life has come from a replica for too long."""
+        self.suspect(name, life, why)
+        cell = self.cell_of(name)
+        worker = cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None
+        if worker is not None and is_blocked(worker.pid):
+            self.at_fault(name, why, has_ended=False)
+
     def broken(self, name: str, life: int, why: str) -> None:
         """A replica ends by itself, and nobody needs to wait for that: no sign of life counts any more."""
         self.ending[name] = life
         self.suspect(name, life, why)
+        if OUTVOTED not in why:
+            self.at_fault(name, why)
 
     def lost(self, name: str, why: str) -> None:
         """A replica does not count any more."""
         self.stir()
         if self.members.pop(name, None) is not None:
             self.node.emit(ReplicaLost(self.path, name, self.epoch, why))
+
+    def whole_since(self) -> tuple[bool, float]:
+        """Whether one replica leads and all others could, and since when that is so (by the system's clock)."""
+        is_whole = self.primary is not None and all(map(self.is_well, self.names))
+        if is_whole != self._was_whole:
+            self._was_whole, self._whole_since = is_whole, time.time()
+        return is_whole, self._whole_since
 
     def stirred(self) -> asyncio.Future[None]:
         """A future that ends when a replica begins or ceases to count."""
@@ -136,6 +217,7 @@ class Members(Securing):
 
     def stir(self) -> None:
         """One has, or whoever waits for that should look again."""
+        self.whole_since()
         waiting, self._stirred = self._stirred, []
         for future in waiting:
             if not future.done():

@@ -9,6 +9,7 @@ from ..checkpoint.records import (
     Closed,
     Feed,
     Go,
+    Hooked,
     Ignored,
     Live,
     Outcome,
@@ -53,6 +54,13 @@ class CannotJoin(Refusal):
     why: str
 
 
+class RequestDropped(Refusal):
+    """A brick of the mechanism has neither passed this request on nor ended it."""
+
+    path: str
+    number: int
+
+
 class ReplyEvicted(Refusal):
     """The request was handled, but its reply is not kept any more: the reply log is bounded."""
 
@@ -65,6 +73,19 @@ FORWARDED = -(1 << 40)
 
 Each state that a follower takes lowers the number: what was on its way to the one before is known by that.
 """
+
+
+def marker_of(epoch: int) -> int:
+    """The number of the batch that a new leader sends through its own bricks before any request.
+
+    When it comes out, all that the last leader gave this replica to compute has ended.
+    """
+    return -2 - epoch
+
+
+def is_marker(number: int) -> bool:
+    """Whether a batch is the first one of a new leader."""
+    return FORWARDED < number < -1
 
 
 class CannotLead(Refusal):
@@ -117,7 +138,7 @@ class WorkLost(msgspec.Struct, array_like=True, tag=42):
     turn: int
 
 
-Beside = PipeDone | Snapshot | Unsaved | Closed | Ignored | Strayed | WorkLost
+Beside = PipeDone | Snapshot | Unsaved | Closed | Ignored | Hooked | Strayed | WorkLost
 """What goes home besides the ends of turns, behind them."""
 
 
@@ -150,7 +171,7 @@ class Outward(Message):
     """From the life to the home, past the bricks: what is released in the middle of a turn that is at the front."""
 
     epoch: int
-    records: list[Released | PipeDone | Snapshot | Unsaved | Ignored]
+    records: list[Released | PipeDone | Snapshot | Unsaved | Ignored | Hooked]
 
 
 class Ended(Message):
@@ -200,12 +221,13 @@ class Lead(Message[int]):
     """Be primary (leader) from now on; the reply is the turn of the state it goes on from.
 
     `turn`: the last one that home knows of. Those that are lost (which only a mechanism that does not wait for its
-    backup admits) are not numbered anew.
+    backup admits) are not numbered anew. `peer`: a replica that stays a member under this leader.
     """
 
     epoch: int
     config: int
     turn: int = -1
+    peer: str | None = None
 
 
 class Follow(Message[int]):

@@ -151,6 +151,21 @@ def recovery_price(cost: Cost, units: int, bytes_per_second: float, load: float)
     return 1e6 * cost.recovery + resource_price(cost, units, bytes_per_second, load)
 
 
+SCARCE = 0.5
+"""Below this part of the battery, computations are dear."""
+PER_COMPUTATION = 100.0
+"""What one computation per request costs more in any price, at half of `SCARCE`."""
+
+
+def energy_price(cost: Cost, energy: float) -> float:
+    """What is added to any price when the battery runs low: what computes least lasts longest.
+
+    >>> energy_price(Cost(total=2), 1.0), energy_price(Cost(total=2), 0.25)
+    (0.0, 200.0)
+    """
+    return PER_COMPUTATION * cost.total * max(0.0, SCARCE / max(energy, 0.001) - 1.0)
+
+
 # -- nesting ---------------------------------------------------------------------------------------------------------
 
 
@@ -216,7 +231,8 @@ def select(
         application: A.
         resources: R.
         mechanisms: declarations of those there are; the built-in ones if not given.
-        price: what is cheap: `resource_price`, `response_price`, `recovery_price`, or a user's own.
+        price: what is cheap: `resource_price`, `response_price`, `recovery_price`, or a user's own. When less than half
+            of the battery is left, `energy_price` comes on top of it.
     """
     compositions = _compositions([Entry.of(one) for one in (built_in() if mechanisms is None else mechanisms)])
     valid: list[Choice] = []
@@ -226,11 +242,11 @@ def select(
         refusal = _refusal(entries, faults, application, resources)
         if refusal is None:
             if not _has_needless(entries, faults):
-                valid.append(_choice(entries, faults, application, price))
+                valid.append(_choice(entries, faults, application, price, resources.energy))
             continue
         refused.append(refusal)
         if refusal.stage == "F" and _refusal(entries, Faults(), application, resources) is None:
-            choice = _choice(entries, faults, application, price)
+            choice = _choice(entries, faults, application, price, resources.energy)
             if not _has_needless(entries, Faults(faults.classes - choice.uncovered)):
                 partial.append(choice)
     valid.sort(key=lambda choice: (choice.price, choice.layers))
@@ -253,10 +269,15 @@ def check(layers: Mechanisms, faults: Faults, application: Application, resource
 
 
 def choice_of(
-    layers: Mechanisms, faults: Faults, application: Application, *, price: Pricing = resource_price
+    layers: Mechanisms,
+    faults: Faults,
+    application: Application,
+    *,
+    price: Pricing = resource_price,
+    energy: float = 1.0,
 ) -> Choice:
-    """What one composition costs, valid or not."""
-    return _choice(tuple(Entry.of(layer) for layer in layers), faults, application, price)
+    """What one composition costs, valid or not, with this part of the battery left."""
+    return _choice(tuple(Entry.of(layer) for layer in layers), faults, application, price, energy)
 
 
 def built_in() -> Mechanisms:
@@ -364,13 +385,15 @@ def _load(cost: Cost, application: Application) -> float:
     return cost.runs * application.rate * application.turn_seconds
 
 
-def _choice(entries: tuple[Entry, ...], faults: Faults, application: Application, price: Pricing) -> Choice:
+def _choice(
+    entries: tuple[Entry, ...], faults: Faults, application: Application, price: Pricing, energy: float
+) -> Choice:
     cost, units = _combined(entries), _units(entries)
     sent, load = _bytes_per_second(cost, application), _load(cost, application)
     words = [entry.bandwidth for entry in entries]
     return Choice(
         layers=tuple(entry.name for entry in entries),
-        price=price(cost, units, sent, load),
+        price=price(cost, units, sent, load) + energy_price(cost, energy),
         units=units,
         bandwidth=max(words, key=LEVELS.index, default="nil"),
         cost=cost,

@@ -21,7 +21,7 @@ import psutil
 
 from ..actors.actor import Actor, on
 from ..actors.events import Event, EventHub, EventStream
-from ..actors.message import Message
+from ..actors.message import Message, Order
 from ..actors.node import cell_kind
 from ..actors.ref import ActorRef
 from ..supervision.arbiter import Hand, arbiter_of
@@ -46,7 +46,9 @@ SIGNS: Final[Mapping[str, str]] = {
     "ReplicaLost": CRASH,
     "Masked": MISMATCH,
     "Objected": MISMATCH,
-    "Diverged": DIVERGED,
+    "Diverged": MISMATCH,  # Whoever has seen it computes again, before anybody blames the application.
+    "StatesDiffer": MISMATCH,
+    "NondeterminismFound": DIVERGED,
     "ReplicaFaulty": FAULTY,
     "FrameRefused": REJECTED,
 }
@@ -62,7 +64,7 @@ SIZES: Final = ("assertions", "versions", "state_bytes", "delta_bytes", "request
 # -- what it is told -------------------------------------------------------------------------------------------------
 
 
-class Adapt(Message[None]):
+class Adapt(Order[None]):
     """The order to change the mechanism of `address` to `target`, outermost layer first."""
 
     number: int
@@ -102,7 +104,7 @@ class MechanismIs(Message):
     layers: tuple[str, ...]
 
 
-class Forbid(Message):
+class Forbid(Order[None]):
     """A person does not want this mechanism or composition for so many seconds."""
 
     layers: tuple[str, ...]
@@ -110,7 +112,7 @@ class Forbid(Message):
     why: str = "forbidden"
 
 
-class Allow(Message):
+class Allow(Order[None]):
     """A person has nothing against it any more."""
 
     layers: tuple[str, ...]

@@ -42,6 +42,7 @@ from ..checkpoint.switch import Switch
 from ..checkpoint.turns import StopRecorded
 from .group import Group, Look
 from .host import GroupHost
+from .trial import rehearsed
 
 if TYPE_CHECKING:
     from ..actors.actor import Actor
@@ -87,6 +88,10 @@ class ToGroup(Move):
         )
         group.on_live, group.on_joined = self._is_live, self._has_joined
         group.on_over = self.give_up
+        # Its replicas have no part yet: one of them tries what all of them are to do.
+        await self.within(
+            rehearsed(group, group.names[-1]), MADE_WITHIN, lambda: "its replicas could not try their parts"
+        )
 
     def _is_live(self, live: Live) -> None:
         if not self._live.done():

@@ -88,16 +88,36 @@ class Prepare(Message[None]):
 class Commit(Message[int]):
     """Bind everything as that stack wants it, and end the bricks that are not needed. Nothing may be inside.
 
-    The reply is the last turn whose state is here.
+    The reply is the last turn whose state is here. `insists`: bricks that do not come to an end are not waited for.
     """
 
     config: int
+    insists: bool = False
 
 
 class Abort(Message[None]):
     """End the bricks that were prepared; everything stays as it was."""
 
     config: int
+
+
+class Doing(msgspec.Struct, array_like=True):
+    """What a replica does with what is inside."""
+
+    computes: bool
+    """The protected actor, or another life of it here, is at work; else what is inside is in the bricks."""
+    keeps: bool
+    """Nothing that was computed has been lost in the bricks: what is inside can be asked for again."""
+
+
+class Computes(Message[Doing]):
+    """What do you do with what is inside? `turn` is the last one that home knows of."""
+
+    turn: int
+
+
+class Rehearse(Message[None]):
+    """To a replica that is no part of a group yet: play each role, and let a batch without requests pass its bricks."""
 
 
 class Finish(Message[None]):
@@ -144,6 +164,7 @@ class Exported(msgspec.Struct, array_like=True):
     turn: int
     data: bytes
     stash: list[int]
+    traps: bool  # `ctx.trap_exits`
 
 
 class Export(Message[Exported]):

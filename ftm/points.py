@@ -6,6 +6,7 @@ Between two parts of a batch the state is captured; from there a life can be beg
 from __future__ import annotations
 
 import asyncio
+import time
 import zlib
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable
@@ -19,8 +20,8 @@ from ..actors.actor import Actor
 from ..actors.cell import DOWN, Cell
 from ..actors.errors import DamagedValue, StartFailed
 from ..actors.mail import Item
-from ..actors.values import decode_value, encode_value
-from ..checkpoint.keys import key_names, put_back, variables
+from ..actors.values import decode_value, encode_value, state_digest
+from ..checkpoint.keys import key_names, put_back, state_of, variables
 from ..checkpoint.method import Method
 from ..checkpoint.records import (
     FAILED,
@@ -47,6 +48,8 @@ COMPACT_BYTES: Final = 64 * 1024
 """Deltas that are larger than the state they belong to, and than this, are replaced by a whole state."""
 MOST_DELTAS: Final = 4096
 """So are more than these: whoever leads next has to apply them."""
+BEGUN_WITHIN: Final = 60.0
+"""Seconds that `on_start` of a life that begins at a point may take; then the replica cannot have one."""
 UNKNOWN: Final = -3
 """In place of the turn that a delta begins after."""
 
@@ -65,6 +68,11 @@ def checksum(parts: Iterable[bytes]) -> int:
 
 def _begins_with(parts: list[bytes], first: list[bytes]) -> bool:
     return len(first) <= len(parts) and all(map(is_, first, parts))
+
+
+def is_dropped(life: ServerLife | None) -> bool:
+    """Whether a life was ended by whoever put something else in its place: that is no failure of whoever began it."""
+    return life is not None and life.port is NOWHERE
 
 
 def is_blank(point: State) -> bool:
@@ -111,6 +119,8 @@ class Points(lives.LocalHost):
         self._withheld: list[Out] = []  # of the turn in hand, on a follower
         self._pending: deque[Request] = deque()
         self._resting: asyncio.Future[str] | None = None
+        self._part = 0  # the number of what was given to the server last
+        self._beginning = asyncio.Lock()
         self._chunk = 8
         self._work_waited_for: list[asyncio.Future[None]] = []
         self._singles = 0  # requests that are run one at a time: one of them has left what cannot be saved
@@ -142,26 +152,34 @@ class Points(lives.LocalHost):
         return -1 if self.point is None else self.point.turn
 
     async def ensure(self) -> None:
-        """See to it that there is a life.
+        """See to it that there is a life, and that it has begun.
+
+        The replica, its protocol and Proceed all come here, each in its own time: one of them begins the life, and the
+        others wait until it has. Otherwise whoever comes second is given a life that is still replaying, and what it
+        gives to that takes the place of what the first one waits for.
 
         Raises:
             StartFailed: it cannot begin.
         """
-        if self.life is None and not self.is_over:
-            await self._begin()
+        if self.life is not None and not self._beginning.locked():
+            return
+        async with self._beginning:
+            if self.life is None and not self.is_over:
+                await self._begin()
 
     async def _begin(self) -> None:
         """Begin a life where the point is, and handle again what was handed over since."""
         await self._begin_at_point()
-        if not self.tail or not self.has_access:
+        if not self.tail or not self.has_access or self.life is None:
             return
         self._is_quiet = True
         try:
             items = [(one.feed, end) for one, end in self.tail]
+            life = self.life
             why = await self._go(items)
         finally:
             self._is_quiet = False
-        if why is not OVER:
+        if why is not OVER and not is_dropped(life):
             raise StartFailed(self.address, "what it has handled before cannot be handled again")
 
     async def _begin_at_point(self) -> None:
@@ -212,7 +230,13 @@ class Points(lives.LocalHost):
             self._put(())  # `on_start(restored=True)` must have returned before anybody counts on this life.
         else:
             return
-        if await self._rest() is not OVER:
+        try:
+            async with asyncio.timeout(BEGUN_WITHIN):
+                why = await self._rest()
+        except TimeoutError:
+            await self.drop_life()
+            raise StartFailed(self.address, f"its on_start did not return within {BEGUN_WITHIN:g} s") from None
+        if why is not OVER and not is_dropped(life):
             raise StartFailed(self.address, str(cell.extra().reason))
 
     def abandon(self) -> None:
@@ -221,14 +245,17 @@ class Points(lives.LocalHost):
         self.at_rest(ENDED)
 
     async def drop_life(self) -> None:
-        """End the life without a word: its state is kept as bytes."""
+        """End the life without a word: its state is kept as bytes. Whoever waits for it to come to rest is told."""
         cell = self.cell
         life, self.life = self.life, None
         self.note_work(life)
         self.work_back()
+        if life is not None:
+            life.port = NOWHERE
+        if self._resting is not None:
+            self.abandon()
         if life is None or cell is None or cell.state is DOWN:
             return
-        life.port = NOWHERE
         gone = cell.ended()
         self.kill(cell)
         await gone
@@ -259,7 +286,8 @@ class Points(lives.LocalHost):
         assert cell is not None
         queue = mailbox.queue_of(cell)
         queue.extend(items)
-        queue.append(PartOver(cast("Server", self)))
+        self._part += 1
+        queue.append(PartOver(cast("Server", self), self._part))
         cell.schedule()
 
     def _rest(self) -> asyncio.Future[str]:
@@ -277,6 +305,11 @@ class Points(lives.LocalHost):
         else:
             self._resting = resting
         return resting
+
+    def part_over(self, number: int) -> None:
+        """All of what was given to the server with this number is done; of an earlier life's nobody wants to know."""
+        if number == self._part:
+            self.at_rest(OVER)
 
     def at_rest(self, why: str) -> None:
         """What was given to the server is done, or cannot go on."""
@@ -371,6 +404,33 @@ class Points(lives.LocalHost):
         self.tail = []
         return self.point
 
+    def state_digest(self) -> bytes:
+        """A digest of the state after the last turn, the same on each replica. Only between two turns.
+
+        Raises:
+            UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
+        """
+        life = self.life
+        assert life is not None
+        assert life.feed is None
+        actor: Any = life.cell.actor
+        state = state_of(actor)
+        value: Any = state.value
+        if type(value) is dict and all(type(name) is str for name in value):
+            value = sorted(value.items())
+        return state_digest([life.turn, [fed.feed.id for fed in life.stash], [state.version, state.form, value]])
+
+    def since_before(self, number: int, turn: int) -> tuple[State, list[Request]] | None:
+        """A state before this turn, and the requests from there up to this one; None if that is not known any more."""
+        kept = [(self.point, [one for one, _ in self.tail])]
+        if self.previous is not None:
+            kept.append(self.previous)
+        for before, requests in kept:
+            numbers = [one.feed.id for one in requests]
+            if before is not None and before.turn < turn and number in numbers and not is_blank(before):
+                return before, requests[: numbers.index(number) + 1]
+        return None
+
     def _takes_delta(self, point: State) -> bool:
         """Whether what has changed is kept on top of this point."""
         if self._chain[0] is not point:
@@ -451,7 +511,7 @@ class Points(lives.LocalHost):
         assert life is not None
         assert life.feed is None
         actor: Any = life.cell.actor
-        names = self._point_names
+        names, begin = self._point_names, time.perf_counter()
         saved = point.data.value()
         put_back(actor, saved)
         for delta in point.deltas:
@@ -463,10 +523,11 @@ class Points(lives.LocalHost):
                 delattr(actor._state_root(), name)
         senders = life.cell.node
         life.cell.extra().trap_exits = point.traps
-        life.turn = point.turn
-        life.stash = [
+        stash = [
             Fed(life, feed, None, None if feed.sender is None else senders.cell_at(feed.sender)) for feed in point.stash
         ]
+        life.rewind(point.turn, stash)
+        self.standing.took(time.perf_counter() - begin, point.data.size)
         self.point, self.tail = point, []
         self.marks = [UNKNOWN] * len(point.deltas)
 

@@ -21,7 +21,8 @@ from ..actors.mail import ReplyHandle
 from ..actors.message import Message, message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
-from .bricks import FOREVER, Brick, Flush
+from .alarms import RequestsDropped
+from .bricks import FOREVER, Brick, Flush, Proceed
 from .images import image_from
 from .messages import (
     CannotLead,
@@ -33,19 +34,41 @@ from .messages import (
     Lead,
     ReplyEvicted,
     Request,
+    RequestDropped,
     State,
     Taken,
     Work,
+    marker_of,
 )
-from .orders import Abort, Commit, EndTurn, Export, Exported, Finish, Install, Join, Peer, Prepare, Quiesce, Stand
+from .orders import (
+    Abort,
+    Commit,
+    Computes,
+    Doing,
+    EndTurn,
+    Export,
+    Exported,
+    Finish,
+    Install,
+    Join,
+    Peer,
+    Prepare,
+    Quiesce,
+    Rehearse,
+    Stand,
+)
 from .post import Where
 from .sealed import Opened, Refused
-from .transfer import Assume, Transfer
+from .transfer import Assume, Play, Transfer
 
 if TYPE_CHECKING:
     from ..actors.actor import Actor
     from .mechanism import Mechanism
     from .standing import Standing
+
+
+CANARY = -1
+"""The number of a batch without requests that only shows whether all bricks let it pass."""
 
 
 class InnerProtocol(Brick):
@@ -152,9 +175,23 @@ class RequestProtocol(Transfer):
             self.next.tell(done)
         if done.is_last and done.number == self._current:
             self._current = None
+            if standing.leads and done.number >= 0 and not standing.server.is_over:
+                dropped = [number for number, one in standing.inside.items() if not standing.server.has_taken(one)]
+                if dropped:
+                    self._end_dropped(done, dropped)
             standing.inside.clear()
             self._go_on()
         return Taken()
+
+    def _end_dropped(self, done: Done, numbers: list[int]) -> None:
+        """The batch is over, and these requests have no end: a brick has let them fall."""
+        standing = self._standing
+        standing.node.emit(RequestsDropped(standing.address, standing.path, ", ".join(map(str, numbers))))
+        ends = list[TurnEnd]()
+        for number in numbers:
+            error = RequestDropped(path=standing.path, number=number)
+            ends.append(TurnEnd(-1, number, DROPPED, [], Answer(*standing.node.codec.encode_error(error))))
+        self.next.tell(Done(standing.epoch, done.config, -1, ends, False))
 
     def _drained(self, done: Done) -> None:
         """An outcome of what the last leader gave us: home gets it, in its order, when it asks for it again."""
@@ -243,22 +280,25 @@ class RequestProtocol(Transfer):
     @on(Lead)
     def _lead(self, message: Lead) -> Any:
         self._check(message.epoch, message.config)
-        return self._answer(self._begin_to_lead(message.epoch, message.turn))
+        if self._standing.leads and self._standing.leading != message.epoch and self._marker is None:
+            self._current = None  # The bricks have kept what was inside, and are others now: it is asked for again.
+            self._go_on()
+        return self._answer(self._begin_to_lead(message))
 
-    async def _begin_to_lead(self, epoch: int, least: int) -> int:
-        standing, server = self._standing, self._standing.server
+    async def _begin_to_lead(self, order: Lead) -> int:
+        standing, server, epoch = self._standing, self._standing.server, order.epoch
         if standing.leads and standing.leading == epoch:
             return server.turn
         if standing.follows and not standing.is_ready:  # It has diverged, or was never brought to the leader's state.
             raise CannotLead(path=standing.path)
-        standing.set_peer(None, "none")
+        standing.set_peer(order.peer, "live")
         standing.is_fenced = standing.follows = False
         standing.ready()
+        # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
+        self._current = self._marker = marker = marker_of(epoch)
+        self._least = order.turn
         await self._order(Assume(True))
         standing.leading = epoch
-        # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
-        self._current = self._marker = marker = -2 - epoch
-        self._least = least
         self.before.tell(Work(epoch, standing.config, marker, []))
         server.lead()
         return server.turn
@@ -338,7 +378,7 @@ class RequestProtocol(Transfer):
             assert life is not None
             assert life.cell.actor is not None
             stash = [fed.feed.id for fed in life.stash]
-            return Exported(life.turn, save_state(life.cell.actor), stash)
+            return Exported(life.turn, save_state(life.cell.actor), stash, life.cell.extra().trap_exits)
         finally:
             self._holds -= 1
             self._go_on()
@@ -363,6 +403,30 @@ class RequestProtocol(Transfer):
         finally:
             self._holds -= 1
             self._go_on()
+
+    @on(Computes)
+    def _computes(self, message: Computes) -> Doing:
+        standing = self._standing
+        servers = (standing.server, *standing.shadows)
+        computes = any(one.life is not None and one.life.feed is not None for one in servers)
+        proceed = self.proceed._cell.actor
+        hands_over = isinstance(proceed, Proceed) and proceed.is_at_work  # It hands it to whoever comes after.
+        return Doing(computes, hands_over or standing.server.turn <= message.turn)
+
+    @on(Rehearse)
+    def _rehearse(self, message: Rehearse) -> Any:
+        if self._standing.epoch >= 0:  # It has a part: whoever says this, plain, must not take it from there.
+            raise Refused(path=self._standing.path, reason="plain")
+        return self._answer(self._rehearsed())
+
+    async def _rehearsed(self) -> None:
+        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody."""
+        standing = self._standing
+        for leads in (True, False):
+            await self._order(Play(leads))
+            self._current = self._marker = CANARY
+            self.before.tell(Work(standing.epoch, standing.config, CANARY, []))
+            await self._quiet()
 
     @on(Finish)
     def _finish(self, message: Finish) -> Any:
@@ -394,6 +458,8 @@ RequestProtocol.handlers = {
     Join: "_join",
     Export: "_export",
     Quiesce: "_quiesce",
+    Computes: "_computes",
+    Rehearse: "_rehearse",
     Finish: "_finish",
 }
 OPENED = {message_name(kind): kind for kind in RequestProtocol.handlers}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from ..actors.actor import Actor, on
 from ..actors.bindings import Binding
@@ -28,6 +28,8 @@ class Settle(Message[None]):
 
 class Proxy(Actor):
     """Between the home of a protected actor and the replica that leads. All it knows is in the group."""
+
+    _is_part: ClassVar[bool] = True
 
     deterministic = False
 

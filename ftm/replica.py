@@ -2,6 +2,9 @@
 
 It weaves the layers of a composition into bricks and bindings. When the layers or the role change, new bricks are
 started beside the old ones, everything is bound anew, and the old ones end: only those that differ are touched.
+
+Orders are carried out in tasks, one after the other, and never in the replica's turn: whatever a brick or the protected
+actor waits for, the replica can be stopped, and an order to lead ends the preparation of another stack.
 """
 
 from __future__ import annotations
@@ -9,17 +12,18 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from ..actors.actor import Start, on, start
 from ..actors.cell import Cell
-from ..actors.errors import HoldfastError, type_name
+from ..actors.errors import HoldfastError, StartFailed, StartIgnored, remote_crash, type_name
 from ..actors.events import ActorStarted
 from ..actors.exits import SHUTDOWN, ExitReason, Shutdown
+from ..actors.mail import ReplyHandle
 from ..actors.message import Message
 from ..actors.process.recipe import unpack_recipe
 from ..checkpoint.method import Method
-from ..supervision.children import Child, new_cell
+from ..supervision.children import STOPPED, UP, Child, new_cell
 from ..supervision.spec import Flags, Plan, child
 from ..supervision.supervisor import Supervisor
 from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
@@ -31,7 +35,7 @@ from .sealed import Opened, Refused
 from .server import Server
 from .standing import Standing
 from .state import StateManager
-from .transfer import Assume
+from .transfer import Assume, Play
 
 SERVER, STATE, BEAT, PROTOCOL = "server", "state", "beat", "protocol"
 
@@ -42,8 +46,16 @@ class EndBricks(Message):
     names: list[str]
 
 
-ORDERS = (Assume, Prepare, Commit, Abort, EndBricks)
+Order = Assume | Prepare | Commit | Abort | EndBricks | Play
+ORDERS = (Assume, Prepare, Commit, Abort, Play)
 """What a replica obeys."""
+
+STARTED_WITHIN = 10.0
+"""Seconds that `__init__` and `on_start` of a brick may take."""
+CAUGHT_UP_WITHIN = 4.0
+"""Seconds that a follower may take to come to the end of what it was sent, when the mechanism is changed."""
+SETTLED_WITHIN = 6.0
+"""Seconds after which a brick that is not needed any more is ended, whatever is still in its mailbox."""
 
 
 class Place(NamedTuple):
@@ -131,6 +143,8 @@ class Woven:
 class Replica(Supervisor):
     """One of the lives of a protected actor, with the bricks around it. The crash of any brick is its end."""
 
+    _is_part: ClassVar[bool] = True
+
     def __init__(
         self, setting: Setting, start: Start[Any] | bytes, layers: tuple[Mechanism | Description, ...]
     ) -> None:
@@ -142,6 +156,19 @@ class Replica(Supervisor):
         for one in made:
             one.check(start.kind, setting.address)
         self._made = nested(made)
+        self._one_order = asyncio.Lock()
+        self._orders: set[asyncio.Task[None]] = set()
+        self._preparing: asyncio.Task[None] | None = None
+
+    @classmethod
+    def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
+        setting: Setting = start.args[0]
+        return f"{setting.address}/ftm", *setting.bindings.values()
+
+    @classmethod
+    def _speaks_for(cls, start: Start[Any]) -> tuple[str, ...]:
+        setting: Setting = start.args[0]
+        return (setting.address,)
 
     def init(self) -> Plan:
         """The protected actor and its state manager; the bricks follow."""
@@ -221,7 +248,7 @@ class Replica(Supervisor):
                     self._enlist(one)
                     woven.new.append(name)
                     woven.names[slot] = name
-                    await self._start(one)
+                    await self._start_brick(one)
                 woven.names[slot] = name
         except BaseException:
             await self._end_bricks(woven.new)
@@ -241,34 +268,70 @@ class Replica(Supervisor):
                     return name
         return None
 
-    async def _end_bricks(self, names: list[str]) -> None:
-        for name in names:
-            one = self._children.get(name)
-            if one is not None:
-                await self._stop(one)
-                self._give_up_address(one, SHUTDOWN)
-                self._forget(one)
-
-    async def _settled(self, name: str) -> None:
-        """Wait until a brick has handled what has come so far.
+    async def _start_brick(self, one: Child) -> None:
+        """Start a brick, and wait until it is up, but not for ever.
 
         Raises:
-            HoldfastError: it has crashed; we hear of that only behind this turn, and then all of us ends.
+            StartFailed: it has not come up, or not in time.
         """
-        cell = self._cell(name)
-        asked, ended = cell.ref.ask(Settle(), timeout=FOREVER), cell.ended()
-        await asyncio.wait((asked, ended), return_when=asyncio.FIRST_COMPLETED)
-        if not asked.done():
-            raise HoldfastError(f"{cell.path} has crashed")
-        await asked
+        where = self._path_of(one)
+        try:
+            up = self._launch(one)
+            if up is not None:
+                done, _ = await asyncio.wait((up,), timeout=STARTED_WITHIN)
+                if not done:
+                    raise StartFailed(where, f"its on_start did not return within {STARTED_WITHIN:g} s")
+                up.result()
+        except StartIgnored as error:
+            raise StartFailed(where, str(error)) from error
+        except HoldfastError as error:
+            self._start_failed(one, error)
+            raise
+        self._is_up(one)
+
+    async def _end_bricks(self, names: list[str]) -> None:
+        """End these; one that has not come up is not waited for."""
+        for name in names:
+            one = self._children.get(name)
+            if one is None:
+                continue
+            if one.state != UP and one.cell is not None:
+                one.ignored_life = one.cell.life
+                one.cell.kill()
+            await self._stop(one)
+            self._give_up_address(one, SHUTDOWN)
+            self._forget(one)
+
+    async def _settled(self, names: list[str]) -> None:
+        """Wait until bricks that are to end have handled what has come so far; one that does not is killed.
+
+        What it still had is not lost: home sends again what it has no outcome of.
+
+        Raises:
+            HoldfastError: one has crashed, which is the end of all of us.
+        """
+        asked = {name: self._cell(name).ref.ask(Settle(), timeout=FOREVER) for name in names}
+        ended = {name: self._cell(name).ended() for name in names}
+        end = self.ctx.cell.node.loop.time() + SETTLED_WITHIN
+        for name in names:
+            left = max(0.0, end - self.ctx.cell.node.loop.time())
+            await asyncio.wait((asked[name], ended[name]), timeout=left, return_when=asyncio.FIRST_COMPLETED)
+            if asked[name].done():
+                await asked[name]
+            elif ended[name].done():
+                raise HoldfastError(f"{self._cell(name).path} has crashed")
+            else:
+                asked[name].cancel()
+                one = self._children[name]
+                one.state = STOPPED  # Its end is no failure of ours.
+                self._cell(name).kill()
 
     async def _take_up(self, woven: Woven, *, leads: bool | None = None, behind: bool = False) -> None:
         """Have this stack be the one: bind everything, end what is not needed (`behind`: when we have answered)."""
         old, self._woven, standing = self._woven, woven, self._standing
         kept = set(woven.names.values())
         left = [name for name in old.names.values() if name not in kept and name in self._children]
-        for name in left:  # What is in their mailboxes belongs to the time before.
-            await self._settled(name)
+        await self._settled(left)  # What is in their mailboxes belongs to the time before.
         standing.config, standing.layers = woven.config, woven.layers
         if leads is not None:
             standing.leads = leads
@@ -282,7 +345,7 @@ class Replica(Supervisor):
         standing.forget_bricks()
         self._bind_all(woven)
         if behind:
-            self.ctx.ref.tell(Opened(standing.put_opened(EndBricks(left))))
+            self._obey(EndBricks(left), None)
         else:
             self._secure()
             await self._end_bricks(left)
@@ -389,31 +452,83 @@ class Replica(Supervisor):
     # -- orders -----------------------------------------------------------------------------------------------------
 
     @on(Opened)
-    async def _ordered(self, message: Opened) -> Any:
-        """From its own RequestProtocol, which has seen how it came, or from itself; nobody else gives it orders."""
-        match self._standing.take_opened(message.key, ORDERS):
-            case Assume() as order:
+    def _ordered(self, message: Opened) -> Any:
+        """From its own RequestProtocol, which has seen how it came; nobody else gives it orders."""
+        order = self._standing.take_opened(message.key, ORDERS)
+        if order is None:
+            return self._fail(Refused(path=self.ctx.path, reason="forged"))
+        handle: ReplyHandle[Any] = self.ctx.reply_handle()
+        if isinstance(order, (Assume, Abort)) and self._preparing is not None:
+            self._preparing.cancel()  # Nobody who has to lead waits for a change.
+        task = self._obey(order, handle)  # type: ignore[arg-type]  # one of `ORDERS`
+        if isinstance(order, Prepare):
+            self._preparing = task
+        return handle
+
+    def _obey(self, order: Order, handle: ReplyHandle[Any] | None) -> asyncio.Task[None]:
+        task = self.ctx.create_task(self._obeyed(order, handle))
+        self._orders.add(task)
+        task.add_done_callback(self._orders.discard)
+        return task
+
+    async def _obeyed(self, order: Order, handle: ReplyHandle[Any] | None) -> None:
+        """Carry out an order behind those that came before it; one that fails is the end of the replica."""
+        try:
+            async with self._one_order:
+                reply = await self._carry_out(order)
+        except asyncio.CancelledError:
+            if handle is not None:
+                handle.fail(MechanismRefused(self.ctx.path, "it was given up"))
+            raise
+        except BaseException as error:
+            if handle is not None:
+                handle.fail(remote_crash(error))
+            raise
+        if handle is not None:
+            if isinstance(reply, HoldfastError):
+                handle.fail(reply)
+            else:
+                handle.reply(reply)
+
+    async def _carry_out(self, order: Order) -> Any:
+        match order:
+            case Assume():
                 return await self._assume(order)
-            case Prepare() as order:
+            case Prepare():
                 return await self._prepare(order)
-            case Commit() as order:
+            case Commit():
                 return await self._commit(order)
-            case Abort() as order:
+            case Abort():
                 return await self._abort(order)
-            case EndBricks() as order:
+            case Play():
+                return await self._play(order)
+            case EndBricks():
                 return await self._end(order)
-            case _:  # None.
-                return self._fail(Refused(path=self.ctx.path, reason="forged"))
+
+    async def _stop_children(self) -> None:
+        """We end: whatever we were about to do is not waited for."""
+        for task in list(self._orders):
+            task.cancel()
+        await super()._stop_children()
 
     async def _assume(self, message: Assume) -> None:
         old = self._woven
         places = weave(old.layers, leads=message.leads)
         left = [name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]]
-        for name in left:  # What is in their mailboxes belongs to the time before.
-            await self._settled(name)
+        await self._settled(left)  # What is in their mailboxes belongs to the time before.
         await self._end_bricks(left)  # First: the new ones have their names.
         woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         await self._take_up(woven, leads=message.leads)
+
+    async def _play(self, message: Play) -> None:
+        """Have the bricks of this role, without the protected actor: it is only to be seen how they do."""
+        old, standing = self._woven, self._standing
+        standing.leads = message.leads
+        places = weave(old.layers, leads=message.leads)
+        await self._end_bricks([name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]])
+        woven = self._woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
+        standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
+        self._bind_all(woven)
 
     async def _prepare(self, message: Prepare) -> Any:
         try:
@@ -427,7 +542,10 @@ class Replica(Supervisor):
             self._check_wiring(self._prepared)
         except HoldfastError as error:
             await self._drop_prepared()
-            return self._fail(error)
+            return error
+        except Exception as error:  # Importing a module, and making a mechanism of its settings, raise anything.
+            await self._drop_prepared()
+            return MechanismRefused(self.ctx.path, f"{type_name(type(error))}: {error}")
         return None
 
     async def _commit(self, message: Commit) -> Any:
@@ -436,8 +554,18 @@ class Replica(Supervisor):
         woven, self._prepared = self._prepared, None
         if woven is None or woven.config != message.config:
             self._prepared = woven
-            return self._fail(MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared"))
-        await self._catch_up()
+            return MechanismRefused(self.ctx.path, f"configuration {message.config} was not prepared")
+        try:
+            async with asyncio.timeout(CAUGHT_UP_WITHIN):
+                await self._catch_up()
+        except TimeoutError:
+            if message.insists:  # What is in the bricks that hang is asked for again.
+                return await self._change_to(woven)
+            self._prepared = woven
+            return MechanismRefused(self.ctx.path, f"it had more to do than it could do in {CAUGHT_UP_WITHIN:g} s")
+        return await self._change_to(woven)
+
+    async def _change_to(self, woven: Woven) -> int:
         await self._take_up(woven, behind=True)
         self._standing.peer_turn = -2  # What the other one has is not known to the new bricks.
         return self._server.turn
@@ -446,7 +574,7 @@ class Replica(Supervisor):
         """Nothing is inside the one that leads, but a follower may be behind it."""
         names = self._woven.names
         for slot in (*(slot for slot in names if slot.endswith(".before")), "proceed"):
-            await self._settled(names[slot])
+            await self._cell(names[slot]).ref.ask(Settle(), timeout=FOREVER)
         await self._cell(names["proceed"]).ref.ask(Flush(), timeout=FOREVER)
 
     async def _end(self, message: EndBricks) -> None:

@@ -51,7 +51,7 @@ class Reports(Points):
         stash = [fed.feed.id for fed in life.stash]
         parts, pause = pieces(data), time.perf_counter() - begin
         for index, one in enumerate(parts, 1):
-            self.more.append(Snapshot(life.turn, one, index == len(parts), stash, pause))
+            self.more.append(Snapshot(life.turn, one, index == len(parts), stash, pause, traps=life.traps))
 
     def last_snapshot(self) -> None:
         """The life ends in good order."""

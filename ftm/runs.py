@@ -21,6 +21,7 @@ from ..actors.errors import HoldfastError, type_name
 from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.values import decode_value, state_digest
 from ..checkpoint.records import (
+    AWAITED,
     CRASH,
     DROPPED,
     FAILED,
@@ -37,6 +38,7 @@ from .server import Server
 from .voters import Agreed, AnyVoter, Undecided, _decide
 
 if TYPE_CHECKING:
+    from .images import Image
     from .standing import Standing
 
 _NUMBERS: Final = itertools.count(1)
@@ -107,11 +109,34 @@ def state_form(state: State) -> Any:
 
 
 def digest_of_state(state: State) -> bytes:
-    """A digest of a state; the order of sets and dicts does not count."""
-    stash, saved = [feed.id for feed in state.stash], state.data.value()
-    if saved is not None and type(saved[2]) is dict and all(type(name) is str for name in saved[2]):
-        saved = (*saved[:2], sorted(saved[2].items()))  # Large and small ones have their own order in an image.
-    return state_digest([state.turn, stash, [saved, *map(decode_value, state.deltas)]])
+    """A digest of a state; the order of sets and dicts does not count. See `Digests`, if it is one of many."""
+    return Digests().of(state)
+
+
+class Digests:
+    """Takes digests of states that follow each other: of what was there the last time, only deltas that are new count.
+
+    The digest is a chain: that of the whole state, then that of each delta on top of it. So replicas that have come to
+    the same state in the same steps come to the same digest, and an actor with `get_delta` pays for what has changed.
+    """
+
+    def __init__(self) -> None:
+        self._data: Image | None = None
+        self._deltas: list[bytes] = []
+        self._chain = b""
+
+    def of(self, state: State) -> bytes:
+        """The digest of one state."""
+        known = len(self._deltas)
+        if state.data is not self._data or state.deltas[:known] != self._deltas:
+            saved = state.data.value()
+            if saved is not None and type(saved[2]) is dict and all(type(name) is str for name in saved[2]):
+                saved = (*saved[:2], sorted(saved[2].items()))  # Large and small ones have their own order in an image.
+            self._data, self._chain, known = state.data, state_digest(saved), 0
+        for delta in state.deltas[known:]:
+            self._chain = state_digest([self._chain, decode_value(delta)])
+        self._deltas = state.deltas
+        return state_digest([state.turn, [feed.id for feed in state.stash], self._chain])
 
 
 def vote(voter: AnyVoter, runs: Sequence[Run | None], *, with_state: bool = True) -> Agreed[Run] | Undecided:
@@ -238,7 +263,7 @@ class Shadow(Server):
     def wants_out(self, life: ServerLife) -> None:
         if life is not self.life:
             return
-        known = [self.heard.get((life.turn, out.k)) for out in life.outs if out.verb in ("ask", "send")]
+        known = [self.heard.get((life.turn, out.k)) for out in life.outs if out.verb in AWAITED]
         if any(one is None for one in known):
             self._fail("it has asked what the first run has not asked")
             return

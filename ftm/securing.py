@@ -12,6 +12,8 @@ from ..actors.ref import ActorRef
 from .sealed import ORDERS, LinkLost, Part
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable
+
     from ..actors.node import Node
     from .mechanism import Mechanism
     from .sealed import Reach, SecuredLink
@@ -37,18 +39,22 @@ class Securing:
         """The number of the life that a replica lives now; 0 if none."""
         raise NotImplementedError
 
-    def secure(self, outermost: Mechanism) -> None:
-        """Have the link that the outermost mechanism wants, from here on."""
+    def secure(self, outermost: Mechanism, link: SecuredLink | None = None) -> None:
+        """Have the link that the outermost mechanism wants, from here on; `link`, if it is open already."""
         if self.link is not None:
             if self.link.mechanism == outermost:
                 return
             self.link.close()
-        self.link = outermost.open_link(
+        self.link = link or self.linked(outermost, lambda: self.names)
+
+    def linked(self, outermost: Mechanism, names: Callable[[], Iterable[str]]) -> SecuredLink | None:
+        """The root's end of the link that a mechanism wants, to replicas of these names; None if it wants none."""
+        return outermost.open_link(
             self.node,
             self.path,
             self.place("proxy"),
             lambda: self.epoch,
-            lambda: [self.place(one) for one in self.names],
+            lambda: [self.place(one) for one in names()],
         )
 
     def is_plain(self) -> bool:

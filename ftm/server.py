@@ -19,12 +19,14 @@ from ..actors.errors import StartFailed
 from ..actors.exits import ExitReason, pack_exit
 from ..actors.message import message_name
 from ..checkpoint.records import (
+    AWAITED,
     FAILED,
     START,
     Answer,
     Closed,
     Feed,
     Go,
+    Hooked,
     Ignored,
     Live,
     Outcome,
@@ -135,8 +137,10 @@ class Server(Reports):
         self._is_given_up = False
         self._pending = pending
         while pending and not self.is_over:
-            if self.life is None:
-                await self._begin()
+            await self.ensure()
+            if self.life is None:  # It was dropped again: another state is put here.
+                self._give_up(pending)
+                break
             chunk = self._next(pending)
             if not chunk:
                 break  # It runs alone, when home has all that comes before it.
@@ -174,22 +178,29 @@ class Server(Reports):
         return ends
 
     def _take_back(self, pending: deque[Request]) -> None:
-        """Nothing of this part has happened: the life begins again where it began."""
+        """Nothing of this part has happened: the life, which has ended, begins again where it began.
+
+        Somebody else may have begun it already: that one is as good, and it must not be begun twice.
+        """
         pending.extendleft(reversed(self.begun))
-        self.begun, self.ends, self.life, self._withheld = [], [], None, []
+        self.begun, self.ends, self._withheld = [], [], []
         last = -1 if self.point is None else self.point.turn
         self.released = {turn: digests for turn, digests in self.released.items() if turn <= last}
         self.more = [one for one in self.more if not isinstance(one, PipeDone) or one.turn <= last]
+
+    def _give_up(self, pending: deque[Request]) -> None:
+        """What was to be run does not count any more: another state is put in the place of what it leads to."""
+        self._is_given_up = True
+        pending.clear()
+        self.begun, self.ends = [], []
 
     def _after_end(self, pending: deque[Request], chunk: list[Request]) -> bool:
         """The life has ended in the middle of a part. Whether to go on."""
         failed, self._failed = self._failed, None
         if self._is_abandoned:
-            self._is_abandoned, self._is_given_up = False, True
-            pending.clear()
-            self.begun, self.ends = [], []
+            self._is_abandoned = False
+            self._give_up(pending)
             return False
-        self.life = None
         if self._is_stopping or self.is_over:
             return False
         if failed is None:
@@ -213,6 +224,13 @@ class Server(Reports):
         self._start_turn = max(self._start_turn, self.ends[-1].turn if self.ends else -1)
         self.point = None
         return True
+
+    def has_taken(self, request: Request) -> bool:
+        """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
+        life, number = self.life, request.feed.id
+        if life is None or request.feed.origin:
+            return True
+        return number in life.returned or any(fed.feed.id == number for fed in life.stash)
 
     def end_turn(self, number: int, *, again: bool) -> None:
         """The turn of this input hangs: if it is in hand, it has failed, as if its handler had raised.
@@ -238,7 +256,7 @@ class Server(Reports):
         if life is not self.life:
             return
         if self._is_quiet or self._is_again or not self.standing.leads:
-            asked = [out for out in life.outs if out.verb in ("ask", "send")]
+            asked = [out for out in life.outs if out.verb in AWAITED]
             known = [self.heard.get((life.turn, out.k)) for out in asked]
             if all(one is not None for one in known):
                 self._note_released(life)
@@ -292,7 +310,10 @@ class Server(Reports):
             return UNDONE
         resting = self._on_to_rest()
         if not self._is_again:
+            leads = self.standing.leads
             await self._hand_over_before(feed)
+            if self.standing.leads and not leads:  # Since then: home has to have what was handed over before.
+                await self._hand_over_before(feed)
         if self.standing.leads and self.life is life and life.feed is feed:
             self._take_up_withheld(life)
             if life.outs:
@@ -345,7 +366,7 @@ class Server(Reports):
         self.objections.clear()
         if self.life is None:
             self.point, self.tail = before, []
-            await self._begin()
+            await self.ensure()
         else:
             self.rewind(before)
         self.released = {turn: digests for turn, digests in self.released.items() if turn <= before.turn}
@@ -358,8 +379,7 @@ class Server(Reports):
                 ends += new
         finally:
             self._is_again = False
-        if self.life is None and not self.is_over:
-            await self._begin()
+        await self.ensure()
         skips = dict(self._skips)
         self._skips.clear()
         try:
@@ -395,7 +415,7 @@ class Server(Reports):
         before, _ = self.previous
         if self.life is None:
             self.point, self.tail = before, []
-            await self._begin()
+            await self.ensure()
         else:
             self.rewind(before)
         return before
@@ -418,7 +438,7 @@ class Server(Reports):
                 self.outward(record)
             case Live():
                 self._live = record
-            case Snapshot() | PipeDone() | Unsaved() | Ignored():
+            case Snapshot() | PipeDone() | Unsaved() | Ignored() | Hooked():
                 self.tell_more(record)
             case _:
                 pass

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ..actors.errors import HoldfastError
 from ..checkpoint.records import TurnEnd
+from .alarms import ProtectionCostly
+from .looking import Looking
 from .messages import FORWARDED, ConfigMismatch, Logged, Request, StaleEpoch
 from .replylog import ReplyLog
 
@@ -19,6 +21,8 @@ if TYPE_CHECKING:
     from .sealed import SecuredLink
     from .server import Server
 
+COSTLY = 0.01
+"""Seconds from which on it is told what going through the state takes."""
 PeerState = Literal["none", "joining", "live"]
 
 
@@ -51,11 +55,13 @@ class Standing:
         self.forwarded_as = FORWARDED  # the number of batches that lead on from the state that is here
         self.paths: dict[str, str] = {}  # of its bricks, by slot
         self.forwarded: list[asyncio.Task[bool]] = []  # batches on their way to a follower
+        self.looking = Looking()
         self.refused = 0  # messages of other epochs or configurations
         self.server: Server = None  # type: ignore[assignment]  # made with it, by the replica
         self.shadows: set[Server] = set()  # more lives of it, which only compute
         self.link: SecuredLink | None = None  # what comes and goes has to be sealed
         self._opened: dict[int, Message[Any]] = {}  # came over it, and waits for its handler
+        self._is_costly = False  # that was told
         self._opened_keys = itertools.count()
         self._bricks: dict[str, Outbox] = {}  # of the other replica, by slot
         self._unready: list[asyncio.Future[None]] = []
@@ -83,6 +89,12 @@ class Standing:
     def take_opened(self, key: int, kinds: tuple[type[Message[Any]], ...]) -> Message[Any] | None:
         """What has come, once; None if it is not for whoever understands these."""
         return self._opened.pop(key) if isinstance(self._opened.get(key), kinds) else None
+
+    def took(self, seconds: float, size: int) -> None:
+        """The state was gone through to compare runs: tell, once, if that takes long."""
+        if seconds > COSTLY and not self._is_costly:
+            self._is_costly = True
+            self.node.emit(ProtectionCostly(self.address, self.path, seconds, size))
 
     def entries(self, ends: list[TurnEnd]) -> list[Logged]:
         """Outcomes as the reply log has them."""

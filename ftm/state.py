@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, ClassVar, Final
 
 import msgspec
 
@@ -67,6 +67,8 @@ class Undo(Message[State]):
 
 class StateManager(Actor):
     """Between the bricks and the protected actor's state. It is asked between two parts, never while one runs."""
+
+    _is_part: ClassVar[bool] = True
 
     server: Binding[Actor]
 

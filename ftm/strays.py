@@ -48,9 +48,9 @@ class Strays:
     def told(self, path: str) -> None:
         """The leader says that the one at this path has lost it."""
         group, name = self._group, path.rpartition("/")[2]
-        life = group.life_of(name)
-        if name not in group.names or not life:
-            return
+        life = group.members.get(name, 0) or group.joining.get(name, 0)
+        if not life:
+            return  # It does not count as it is; or that life is over, and the next one has to join anyway.
         self.count += 1
         record = self._of(name, life)
         record.times = 1 if group.switch.turn - record.turn > STEADY else record.times + 1

@@ -27,7 +27,7 @@ from ..supervision.respec import recipe_spec
 from .adaptation import REST_WITHIN, Reconfiguration
 from .adaptation_rules import check_stack, describe
 from .host import GroupHost
-from .mechanism import COMMON, Description, Mechanism, MechanismRefused, revive
+from .mechanism import COMMON, Code, Description, Mechanism, MechanismRefused, revive
 from .unkept import forget_later, is_unkept
 
 if TYPE_CHECKING:
@@ -62,7 +62,12 @@ class SubtreeGroup(GroupHost):
         self._stop_wanted, self._is_restarting, self._last = None, False, None
         for name, path in made.bindings.items():
             cell.extra().bindings.setdefault(name, cell.node.cell_at(path))
-        entered = self.enter(cell)  # Now: from here on what is sent is admitted by the home.
+        try:
+            entered = self.enter(cell)  # Now: from here on what is sent is admitted by the home.
+        except StartFailed as error:  # What is recorded does not fit its class.
+            self._wanted = None
+            port.to_life(Started(wanted.number, error.reason))
+            return
         self._starting = cell.node.loop.create_task(
             self._begin(cell, wanted, port, entered),
             name=f"start of {cell.path}",
@@ -239,4 +244,9 @@ def known(description: Description) -> Mechanism:
         if module not in sys.modules and module not in COMMON:
             why = "the root has not loaded it, and loads nothing that an actor process names: import it there"
             raise MechanismRefused(kind, why)
+    whole = Code(description.kind, description.file, description.sha256)
+    for code in (whole, *(code for _, _, code in description.bricks)):
+        file = getattr(sys.modules.get(code.kind.partition(":")[0]), "__holdfast_file__", ("", ""))
+        if code.file and (code.file, code.sha256) != file:
+            raise MechanismRefused(code.kind, "the root has not loaded that file, nor does it for a process")
     return revive(description)

@@ -39,6 +39,12 @@ class Assume(Message[None]):
     leads: bool
 
 
+class Play(Message[None]):
+    """To a replica that is no part of a group yet: have the bricks of this role, but not the protected actor."""
+
+    leads: bool
+
+
 class Astray(Message[None]):
     """To the RequestProtocol of the leader: this follower does not have your state any more. Do not count on it."""
 

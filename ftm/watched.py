@@ -69,7 +69,7 @@ def watch_of(
             if not layers:
                 step.detach(adapt.address)
             elif protected:
-                step.transition(adapt.address, layers)
+                step.transition(adapt.address, layers, whole=True)
             else:
                 step.attach(adapt.address, layers)
 

@@ -8,7 +8,7 @@ import msgspec
 
 from ..actors.codec import Packed
 from ..actors.errors import HoldfastError, SpecError
-from ..actors.message import Message, Refusal
+from ..actors.message import Message, Order, Refusal
 from ..actors.node import Node
 from ..actors.process.recipe import pack_data, unpack_data
 from ..actors.ref import ActorRef
@@ -34,6 +34,12 @@ class ChildBusy(Refusal):
 
     id: str
     state: str
+
+
+class ChildParked(Refusal):
+    """The child was stopped by order: repair leaves it alone until it is started by order again."""
+
+    id: str
 
 
 class NoSuchChild(Refusal):
@@ -107,7 +113,7 @@ def opened(value: Any, node: Node) -> Any:
         raise SpecError("supervisor", str(error)) from error
 
 
-class StartChild(Message[Any]):
+class StartChild(Order[Any]):
     """Start one more child; the reply is its ref, or None if it did not want to be started (`Ignore`).
 
     `spec` is a child spec; a dynamic supervisor takes a bare `start(...)` too. From a template a child is started by
@@ -124,27 +130,33 @@ class StartChild(Message[Any]):
         msgspec.structs.force_setattr(self, "spec", boxed(self.spec))
 
 
-class TerminateChild(Message[None]):
+class TerminateChild(Order[None]):
     """Stop a child by its spec; the spec stays, unless it is temporary. A pending restart is void.
 
-    `reason` is what `pack_exit` gives; None is SHUTDOWN.
+    `reason` is what `pack_exit` gives; None is SHUTDOWN. The child is parked then: repair does not start it
+    again before you do, unless `parks` is False.
     """
 
     id: str
     reason: dict[str, Any] | None = None
+    parks: bool = True
 
 
-class RestartChild(Message[Any]):
+class RestartChild(Order[Any]):
     """Start a stopped child again; the reply is its ref, or None if it did not want to be started.
 
-    With `fresh` what was recorded of it (of a supervisor: of all below it) is erased first.
+    With `fresh` what was recorded of it (of a supervisor: of all below it) is erased first. With `running` a child that
+    runs is stopped first: from there to its start it is one call, which goes on if whoever has asked ends meanwhile.
+    With `unless_parked` a child that was stopped by order is refused (ChildParked): so asks repair.
     """
 
     id: str
     fresh: bool = False
+    running: bool = False
+    unless_parked: bool = False
 
 
-class DeleteChild(Message[None]):
+class DeleteChild(Order[None]):
     """Forget a stopped child, and (unless `erase` is False) what was recorded of it and of all below it."""
 
     id: str
@@ -183,7 +195,7 @@ class GetChildSpec(Message[Any]):
     id: str
 
 
-class ChangeSupervisor(Message[None]):
+class ChangeSupervisor(Order[None]):
     """Change a supervisor while it works. What is left out stays; with nothing given its `init` is asked anew.
 
     Flags hold at once. A child whose id is known gets its new spec and goes on; a new one is added and not started; one

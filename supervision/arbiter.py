@@ -16,14 +16,20 @@ import dataclasses
 import enum
 import itertools
 import math
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
+from typing import Final
 
-from ..actors.cell import Cell
+from ..actors.cell import DOWN, ENDING, Cell
 from ..actors.errors import HoldfastError
-from ..actors.events import ChildRestarted, Event
+from ..actors.events import ChildRestarted, Event, SupervisorGaveUp
 from ..actors.node import Node
-from .children import RECOVERING, RESTARTING
+from .children import RECOVERING, RESTARTING, STOPPED, UP
 from .supervisor import Supervisor
+
+SUPERVISOR: Final = "its supervisor"
+OPERATOR: Final = "an operator"
+"""In whose hands is what was stopped by order."""
+AGAIN: Final = (RESTARTING, RECOVERING)
 
 
 class Hand(enum.IntEnum):
@@ -145,9 +151,7 @@ class Arbiter:
             if not (_is_one(errand, other) or hand.goes_before(other.hand) or hand.goes_beside(other.hand)):
                 return InOtherHands(other.address, other.hand.name.lower(), other.reason)
         # An adaptation waits by itself until its actor is up.
-        if hand is Hand.REPAIR and (busy := self._supervised(address)) is not None:
-            return InOtherHands(busy, "its supervisor", "it is being restarted")
-        return None
+        return self._supervised(address) if hand is Hand.REPAIR else None
 
     @contextlib.contextmanager
     def held(
@@ -189,21 +193,38 @@ class Arbiter:
             lost(reason)
 
     def _heard(self, event: Event) -> None:
-        """A supervisor restarts a child: who goes behind it loses the child."""
+        """A supervisor restarts a child, or gives up: who goes behind it loses what is below."""
         if isinstance(event, ChildRestarted):
-            for grant in list(self._overlapping(event.address)):
-                if Hand.SUPERVISOR.goes_before(grant.hand):
-                    self._take_away(grant, f"its supervisor restarts {event.address}: {event.reason}")
+            self._is_at(event.address, f"its supervisor restarts {event.address}: {event.reason}")
+        elif isinstance(event, SupervisorGaveUp):
+            self._is_at(event.address, f"{event.address} gives up")
 
-    def _supervised(self, address: str) -> str | None:
-        """Who at, above or below the address is being restarted by its supervisor, or brought back."""
-        cell = self._node.find(address) if self._node is not None else None
-        above = cell
-        while above is not None:
-            if _is_being_restarted(above):
-                return above.path
-            above = above.parent
-        return next((one.path for one in _below(cell) if _is_being_restarted(one)), None)
+    def _is_at(self, address: str, reason: str) -> None:
+        """A supervisor is at work."""
+        for grant in list(self._overlapping(address)):
+            if Hand.SUPERVISOR.goes_before(grant.hand):
+                self._take_away(grant, reason)
+
+    def _supervised(self, address: str) -> InOtherHands | None:
+        """Who at, above or below the address is in its supervisor's hands, or was stopped by order."""
+        if self._node is None:
+            return None
+        return self._covered(address) or next(_below(self._node.find(address)), None)
+
+    def _covered(self, address: str) -> InOtherHands | None:
+        node, at = self._node, ""
+        if node is None:
+            return None
+        for name in address.split("/")[1:]:  # From above: of what has gone, only its supervisor knows.
+            above, at = at, f"{at}/{name}"
+            if (busy := _in_hands(node.find(above), name)) is not None:
+                return busy
+        return None
+
+    def is_parked(self, address: str) -> bool:
+        """Whether it, or a supervisor above it, was stopped by order, and not started since."""
+        busy = self._covered(address)
+        return busy is not None and busy.hand == OPERATOR
 
 
 def covers(above: str, address: str) -> bool:
@@ -227,13 +248,29 @@ def _is_one(errand: object, grant: Grant) -> bool:
     return errand is not None and grant.errand is errand
 
 
-def _is_being_restarted(cell: Cell) -> bool:
-    keeper = cell.parent.actor if cell.parent is not None else None
-    child = keeper._children.get(cell.name) if isinstance(keeper, Supervisor) else None
-    return child is not None and child.cell is cell and child.state in (RESTARTING, RECOVERING)
+def _in_hands(above: Cell | None, name: str) -> InOtherHands | None:
+    """Whether somebody else has to do with a child just now; of one that nobody supervises, nobody has."""
+    keeper = None if above is None else above.actor
+    if above is None or not isinstance(keeper, Supervisor):
+        return None
+    path, child, cell = f"{above.path}/{name}", keeper._listed().get(name), (above.children or {}).get(name)
+    if child is None or child.state == STOPPED:
+        return InOtherHands(path, OPERATOR, "it was stopped by order") if name in keeper._all_parked() else None
+    if child.state != UP:
+        return InOtherHands(path, SUPERVISOR, f"it is {'being restarted' if child.state in AGAIN else child.state}")
+    if cell is not None and cell.state in (ENDING, DOWN):
+        return InOtherHands(path, SUPERVISOR, "it is ending")
+    return None
 
 
-def _below(cell: Cell | None) -> Iterator[Cell]:
-    for one in list((cell.children or {}).values()) if cell is not None else ():
-        yield one
-        yield from _below(one)
+def _below(cell: Cell | None) -> Iterator[InOtherHands]:
+    """Those below it who are in the hands of others."""
+    if cell is None:
+        return
+    parked: Iterable[str] = cell.actor._all_parked() if isinstance(cell.actor, Supervisor) else ()
+    living = cell.children or {}
+    for name in [*living, *(name for name in parked if name not in living)]:
+        busy = _in_hands(cell, name)
+        if busy is not None:
+            yield busy
+        yield from _below(living.get(name))

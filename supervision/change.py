@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ..actors.cell import GONE
 from ..actors.errors import HoldfastError, Ignore, SpecError, StartIgnored, remote_crash, type_name
@@ -115,12 +115,4 @@ def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:
     for spec in specs:
         yield spec
         if spec.is_supervisor:
-            yield from everything(_specs_in((*spec.start.args, *spec.start.kwargs.values())))
-
-
-def _specs_in(values: Iterable[Any]) -> Iterator[ChildSpec]:
-    for value in values:
-        if isinstance(value, ChildSpec):
-            yield value
-        elif isinstance(value, (list, tuple)):
-            yield from _specs_in(value)
+            yield from everything(spec.below())

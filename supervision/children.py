@@ -5,21 +5,23 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Iterable
 from typing import Any
 
 from ..actors.cell import Cell
-from ..actors.errors import HoldfastError, NoSuchActor, StartFailed
+from ..actors.errors import NoSuchActor, StartFailed
 from ..actors.exits import ExitReason
-from ..actors.mail import Item, ReplyHandle
+from ..actors.mail import Item
 from .admin import ChildInfo
 from .spec import ChildSpec
 
 # What a child may be in, as `WhichChildren` tells it.
 STOPPED = "stopped"
+STARTING = "starting"
 UP = "running"
 RESTARTING = "restarting"
 RECOVERING = "recovering"
+STOPPING = "stopping"
 
 
 @dataclasses.dataclass(slots=True, eq=False)
@@ -76,26 +78,76 @@ def new_cell(own: Cell, one: Child) -> Cell:
     return cell
 
 
-@dataclasses.dataclass(slots=True, eq=False)
 class Row:
-    """Children that are started one after another; what waits for a slow one is served meanwhile."""
+    """Children that are started one after another. Each is in one row at most: who is stopped meanwhile is in none."""
 
-    waiting: deque[Child]
-    reason: ExitReason  # of the end for which they are started again
-    asked: Asked | None = None  # it is a first start, of one child
+    __slots__ = ("_waiting",)
+
+    def __init__(self, children: Iterable[Child], state: str) -> None:
+        self._waiting = deque(children)
+        for one in self._waiting:
+            one.state, one.row = state, self
+
+    def next(self) -> Child | None:
+        """The next one that is to be started."""
+        while self._waiting:
+            one = self._waiting.popleft()
+            if one.row is self:
+                return one
+        return None
+
+    def leave(self) -> None:
+        """Those that wait are not started."""
+        while (one := self.next()) is not None:
+            one.state, one.row = STOPPED, None
 
 
-@dataclasses.dataclass(slots=True, eq=False)
-class Asked:
-    """Who waits for a start that takes longer than the turn in which it was asked for."""
+LOOKS = 4
+"""How often the progress of a start is looked at within its time."""
 
-    handle: ReplyHandle[Any]
-    undo: Callable[[], None]  # what follows if it fails
 
-    def failed(self, error: HoldfastError) -> None:
-        """It has not come up: the answer is an error, and it is not tried again."""
-        self.undo()
-        self.handle.fail(error)
+class StartLimit:
+    """The time that a start may take. A child that is brought back has it anew with all that it has handled again."""
+
+    __slots__ = ("_cell", "_reached", "_since", "_timer", "is_over", "seconds")
+
+    def __init__(self, one: Child) -> None:
+        assert one.cell is not None
+        self._cell, self.seconds = one.cell, one.spec.start_timeout or "infinity"
+        self.is_over = False
+        self._timer: asyncio.TimerHandle | None = None
+        self._reached, self._since = one.cell.host.progress(one.cell), one.cell.node.loop.time()
+        if not isinstance(self.seconds, str):
+            self._wait(self.seconds)
+
+    def _wait(self, seconds: float) -> None:
+        cell = self._cell
+        loop = cell.node.loop
+        left = self._since + seconds - loop.time()
+        if left <= 0:
+            self.is_over = True
+            cell.kill()
+            return
+        if self._reached is not None:
+            left = min(left, seconds / LOOKS)
+        self._timer = loop.call_later(left, self._look, seconds)
+
+    def _look(self, seconds: float) -> None:
+        reached = self._cell.host.progress(self._cell)
+        if reached != self._reached:
+            self._reached, self._since = reached, self._cell.node.loop.time()
+        self._wait(seconds)
+
+    def close(self) -> None:
+        """The start is over."""
+        if self._timer is not None:
+            self._timer.cancel()
+
+    @property
+    def told(self) -> str:
+        """What is said of a start that took too long."""
+        what = "did not start" if self._reached is None else "came no step further"
+        return f"it {what} within {self.seconds:g} s (start_timeout)"
 
 
 class Retry(Item):
@@ -108,17 +160,5 @@ class Retry(Item):
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        return actor._retry(item.child, item.number, item.reason)
-
-
-class StartOver(Item):
-    """A child's start, waited for outside the supervisor's turn, has come to its end."""
-
-    __slots__ = ("child", "up")
-
-    def __init__(self, child: Child, up: asyncio.Future[None]) -> None:
-        self.child, self.up = child, up
-
-    @staticmethod
-    def run(actor: Any, item: Any) -> object:
-        return actor._start_over(item.child, item.up)
+        actor._retry(item.child, item.number, item.reason)
+        return None

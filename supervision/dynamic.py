@@ -22,7 +22,7 @@ from ..actors.process.limits import Limits
 from ..actors.process.recipe import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .change import check_place, check_subtree
-from .children import Child
+from .children import STARTING, Child, Row
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
@@ -48,21 +48,23 @@ class DynamicSupervisor(Supervisor):
         super()._begin(Plan.of(plan.flags, ()))
         self._template = plan.children[0] if plan.children else None
 
-    async def on_start(self, restored: bool) -> None:
+    async def _start_all(self) -> None:
         """Start empty, or with the children that were there before, if there is a journal of them."""
-        await super().on_start(restored)
         node, where = self.ctx.cell.node, child_key(self.ctx.path, "")
+        noted: list[Child] = []
         for key, data in node.keeper.notes(where).items() if self._flags.journal else ():
             name = key.removeprefix(where)
             if "/" in name:
                 continue  # It is the child of a supervisor below us.
             try:
-                one = self._children[name] = Child(self._noted(name, data))
+                noted.append(Child(self._noted(name, data)))
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
                 node.emit(ChildStartFailed(f"{self.ctx.path}/{name}", str(error)))
-                continue
+        self._children.update((one.spec.id, one) for one in noted)
+        row = Row(noted, STARTING)
+        while (one := row.next()) is not None:
             try:
-                await self._start(one)
+                await self._come_up_in(row, one)
             except HoldfastError as error:  # One that fails must not keep the others from coming back.
                 self._again(one, exits.crash(error))
 
@@ -125,7 +127,8 @@ class DynamicSupervisor(Supervisor):
             return dataclasses.replace(spec, id=message.id)
         if spec.id != NAMELESS and self._template is None:
             return spec
-        return dataclasses.replace(spec, id=self._new_id(spec))
+        # Without a journal nobody knows this id when we have been restarted: what waits for it waits for nobody.
+        return dataclasses.replace(spec, id=self._new_id(spec), comes_back=self._flags.journal)
 
     def _new_id(self, spec: ChildSpec) -> str:
         """An id that nobody has here: the template's or the class's name, and a number."""
@@ -141,8 +144,7 @@ class DynamicSupervisor(Supervisor):
     def _check_free(self, spec: ChildSpec) -> None:
         known = self._children.get(spec.id)
         if known is not None:
-            assert known.cell is not None  # Here a child is known only while its address is.
-            raise AlreadyStarted(spec.id, known.cell.ref)
+            raise AlreadyStarted(spec.id, self.ctx.cell.node.cell_at(f"{self.ctx.path}/{spec.id}").ref)
         most = self._flags.max_children
         if most is not None and len(self._children) >= most:
             raise MaxChildren(most)
@@ -155,13 +157,17 @@ class DynamicSupervisor(Supervisor):
 
     async def _stop_children(self) -> None:
         """We end: all children are told at once, and each has the time its spec gives it."""
+        for one in list(self._listed().values()):
+            self._has_ended(one)
         await stop_together(list((self.ctx.cell.children or {}).values()))
 
     # -- what makes no sense here -----------------------------------------------------------------------------------
 
     @on(RestartChild)
-    async def _restart_child(self, message: RestartChild) -> Any:
-        """A stopped child is forgotten here."""
+    def _restart_child(self, message: RestartChild) -> Any:
+        """A stopped child is forgotten here; one that runs can be restarted."""
+        if message.running:
+            return super()._restart_child(message)
         self._child(message.id)
         raise NotSupported("a dynamic supervisor forgets stopped children: start it anew with StartChild")
 

@@ -25,8 +25,17 @@ def admit_restart(
     >>> admit_restart((3.0, 4.0), 5.0, intensity=2, period=3.0) is None
     True
     """
+    recent = (*recent_restarts(restarts, now, period), now)
+    return recent if len(recent) <= intensity else None
+
+
+def recent_restarts(restarts: tuple[float, ...], now: float, period: float) -> tuple[float, ...]:
+    """Those of the restarts, oldest first, that are not longer than `period` ago.
+
+    >>> recent_restarts((0.0, 4.0), 5.0, 3.0)
+    (4.0,)
+    """
     old, count = 0, len(restarts)
     while old < count and now - restarts[old] > period:
         old += 1
-    recent = (*restarts[old:], now)
-    return recent if len(recent) <= intensity else None
+    return restarts[old:]

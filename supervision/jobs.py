@@ -15,15 +15,15 @@ from typing import Any, cast
 
 from ..actors import lives
 from ..actors.actor import Actor, on
-from ..actors.cell import DOWN, Cell
+from ..actors.cell import DOWN
 from ..actors.control.orders import unpack_function
 from ..actors.errors import AskFailed, HoldfastError, remote_crash
 from ..actors.exits import KILLED, ExitReason, Shutdown, crash
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message, Refusal
 from ..actors.ref import current
-from ..actors.threads import ThreadContext
-from .children import Child
+from ..actors.threads import ThreadContext, is_async
+from .children import Child, StartLimit
 from .dynamic import DynamicSupervisor
 from .spec import ChildSpec
 
@@ -50,6 +50,7 @@ class JobActor(Actor):
         self._args, self._is_awaited, self._is_coded = args, is_awaited, is_coded
         self._handle: ReplyHandle[Any] | None = None
         self._work: asyncio.Task[None] | None = None
+        self._is_ended = False  # it was told to end, and its work is cancelled for that
 
     def on_start(self, restored: bool) -> None:
         """Begin, unless somebody waits for the result: then it begins when the way back is known."""
@@ -69,13 +70,15 @@ class JobActor(Actor):
             if self._is_coded and self._handle is not None:
                 value = self.ctx.cell.node.codec.encode(value, self.ctx.path)
         except asyncio.CancelledError:
-            task = asyncio.current_task()
-            if not self.ctx.closed and task is not None and not task.cancelling():
-                # Nobody has cancelled us: what the function waited for was cancelled by somebody else.
-                self._fail(AskFailed(self.ctx.path, "what it waited for was cancelled"))
-                self.ctx.stop(Shutdown("what it waited for was cancelled"))
+            if not self.ctx.closed and not self._is_ended:
+                # Not by us: the function has cancelled its own task, or what it waited for was cancelled.
+                task = asyncio.current_task()
+                is_own = task is not None and task.cancelling()
+                why = "it was cancelled from within" if is_own else "what it waited for was cancelled"
+                self._fail(AskFailed(self.ctx.path, why))
+                self.ctx.stop(Shutdown(why))
             raise
-        except Exception as error:
+        except (Exception, SystemExit, KeyboardInterrupt) as error:
             self._fail(error if isinstance(error, HoldfastError) else remote_crash(error))
             if not isinstance(error, Refusal):
                 raise  # Now the job crashes.
@@ -89,11 +92,9 @@ class JobActor(Actor):
         function = self._function
         if is_async(function):
             return await function(*self._args)
-        from anyio import to_thread  # Not needed by most, and slow to import.
-
         threaded = ThreadContext(self.ctx)
         try:
-            found = await to_thread.run_sync(_in_thread, threaded, function, self._args, abandon_on_cancel=True)
+            found = await self.ctx.cell.node.threads.run(_in_thread, threaded, function, self._args)
         finally:
             threaded._is_over = True
         return await found if inspect.isawaitable(found) else found
@@ -104,18 +105,11 @@ class JobActor(Actor):
 
     async def on_stop(self, reason: ExitReason) -> None:
         """Cancel what still runs, and wait until it has cleaned up."""
-        work = self._work
+        work, self._is_ended = self._work, True
         if work is not None and not work.done():
             work.cancel()
             await asyncio.wait((work,))
         self._fail(AskFailed(self.ctx.path, str(reason)))  # No more than the first outcome counts.
-
-
-def is_async(function: Callable[..., Any]) -> bool:
-    """Whether calling it gives a coroutine; anything else may block."""
-    while isinstance(function, functools.partial):
-        function = function.func
-    return inspect.iscoroutinefunction(function) or inspect.iscoroutinefunction(getattr(function, "__call__", None))  # noqa: B004
 
 
 def _in_thread(threaded: ThreadContext, function: Callable[..., Any], args: tuple[Any, ...]) -> Any:
@@ -136,25 +130,23 @@ class TaskSupervisor(DynamicSupervisor):
             if name not in self._children:
                 return name
 
-    async def _start(self, one: Child) -> bool:
-        """A process takes long to come up: others are served meanwhile, and its queue waits for it."""
+    async def _come_up(self, one: Child) -> None:
+        """A process takes long to come up: whoever asked has the job at once, and its queue waits for it."""
         if not issubclass(one.spec.start.kind, JobActor):
-            return await super()._start(one)
+            await super()._come_up(one)
+            return
         before = one.cell.life if one.cell is not None else 0
-        try:
-            up = self._launch(one)
-        except HoldfastError as error:
-            self._start_failed(one, error)
-            raise
-        self._is_up(one)
-        if up is not None and one.cell is not None:
-            up.add_done_callback(functools.partial(self._over, one.cell, before))
-        return True
+        up = self._launch(one)
+        if up is not None:
+            up.add_done_callback(functools.partial(self._over, one, before, StartLimit(one)))
 
-    def _over(self, cell: Cell, before: int, up: asyncio.Future[None]) -> None:
+    def _over(self, one: Child, before: int, limit: StartLimit, up: asyncio.Future[None]) -> None:
         """A start that failed before there was a life: no end will be told of it, so we do."""
-        if cell.state is DOWN and cell.life == before:
+        limit.close()
+        cell = one.cell
+        if cell is not None and cell.state is DOWN and cell.life == before:
             error = None if up.cancelled() else up.exception()
             reason = KILLED if error is None else crash(error)
             cell.extra().reason = reason
+            one.ignored_life = min(one.ignored_life, cell.life - 1)
             self._post(lives.ChildExit(cell, cell.life, reason))

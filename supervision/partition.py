@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import os
 from collections.abc import Callable
@@ -10,7 +11,8 @@ from typing import Any
 from ..actors.actor import Start, on
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.exits import SHUTDOWN
-from ..actors.message import Message
+from ..actors.mail import ReplyHandle
+from ..actors.message import Message, Order
 from ..actors.process.limits import Limits
 from ..actors.ref import ActorRef
 from ..actors.values import state_digest
@@ -31,7 +33,7 @@ class CountPartitions(Message[int]):
     """How many partitions there are now."""
 
 
-class ResizePartitions(Message[int]):
+class ResizePartitions(Order[int]):
     """Have this many partitions, at most as many as at the start; the reply is how many there were."""
 
     count: int
@@ -65,6 +67,7 @@ class PartitionSupervisor(Supervisor):
         if [spec.id for spec in plan.children] != [str(number) for number in range(len(plan.children))]:
             raise SpecError(self.ctx.path, "the ids of partitions are their numbers: make it with partitions(...)")
         self._now, self._all = len(plan.children), plan.children
+        self._resizing = asyncio.Lock()
         super()._begin(plan)
 
     def _take(self, plan: Plan) -> None:
@@ -93,28 +96,31 @@ class PartitionSupervisor(Supervisor):
         return self._now
 
     @on(ResizePartitions)
-    async def _resize(self, message: ResizePartitions) -> Any:
+    def _resize(self, message: ResizePartitions) -> ReplyHandle[Any]:
         """Stop the uppermost partitions, or start those that were stopped."""
+        return self._answered(self._resized(message))
+
+    async def _resized(self, message: ResizePartitions) -> int:
         if not 0 <= message.count <= len(self._all):
-            return self._fail(
-                SpecError("ResizePartitions", f"count must be from 0 to {len(self._all)}, not {message.count}")
-            )
-        before = self._now
-        for number in reversed(range(message.count, before)):
-            self._now = number  # Nobody is routed to one that is being stopped.
-            one = self._partition(number)
-            await self._stop(one)
-            self._give_up_address(one, SHUTDOWN)
-        for number in range(before, message.count):
-            one = self._partition(number)
-            try:
-                if one.state == STOPPED:
-                    await self._start(one)
-            except HoldfastError as error:
-                self._give_up_address(one, "it could not be started")
-                return self._fail(error)
-            self._now = number + 1
-        return before
+            raise SpecError("ResizePartitions", f"count must be from 0 to {len(self._all)}, not {message.count}")
+        async with self._resizing:  # One after another.
+            before = self._now
+            for number in reversed(range(message.count, before)):
+                self._now = number  # Nobody is routed to one that is being stopped.
+                one = self._partition(number)
+                await self._stop(one)
+                if one.row is None:  # Else it is started again with others meanwhile.
+                    self._give_up_address(one, SHUTDOWN)
+            for number in range(before, message.count):
+                one = self._partition(number)
+                try:
+                    if one.state == STOPPED:
+                        await self._start(one)
+                except HoldfastError:
+                    self._give_up_address(one, "it could not be started")
+                    raise
+                self._now = number + 1
+            return before
 
     def _partition(self, number: int) -> Child:
         """A partition; a temporary one that was stopped is made anew."""
@@ -122,7 +128,7 @@ class PartitionSupervisor(Supervisor):
         return self._children.setdefault(name, Child(self._all[number]))
 
     @on(StartChild)
-    async def _start_child(self, message: StartChild) -> Any:
+    def _start_child(self, message: StartChild) -> Any:
         """Partitions are all alike."""
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 

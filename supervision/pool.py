@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import itertools
 from collections.abc import Iterable
@@ -13,10 +14,12 @@ from ..actors import lives
 from ..actors.actor import Actor, Start, on, start
 from ..actors.control.drain import drain
 from ..actors.errors import HoldfastError, SpecError, StartIgnored, WrongActor, type_name
+from ..actors.events import StoreRefused
 from ..actors.exits import SHUTDOWN
-from ..actors.mail import Item, ReplyHandle
+from ..actors.keeper import child_key
+from ..actors.mail import ReplyHandle
 from ..actors.mailbox import Bounded
-from ..actors.message import Message
+from ..actors.message import Message, Order
 from ..actors.node import Node
 from ..actors.ref import ActorRef
 from .admin import DeleteChild, NotSupported, StartChild
@@ -49,7 +52,7 @@ class PoolInfo(Message[PoolStatus]):
     """Asks a pool how it is."""
 
 
-class ResizePool(Message[int]):
+class ResizePool(Order[int]):
     """Have this many workers; the reply is how many there were, and comes when it is done.
 
     New ones are started. Those that go get nothing new, handle what they have for up to `deadline` seconds, and are
@@ -63,7 +66,8 @@ class ResizePool(Message[int]):
 class PoolSupervisor(Supervisor):
     """Keeps a pool's workers and its router alive. Built by `pool(...)`.
 
-    When it is itself restarted the pool has its first size again.
+    When it is itself restarted the pool has its first size again. What was sent to recorded workers waits for them in
+    their journals, so those that were added come back too.
     """
 
     _crew: list[Child]  # who gets messages, in the router's order; not those that are on their way out
@@ -72,9 +76,24 @@ class PoolSupervisor(Supervisor):
     def _begin(self, plan: Plan) -> None:
         self._check(plan)
         self._leaving: set[str] = set()
+        self._growing = asyncio.Lock()
         self._template = plan.children[0]
-        super()._begin(plan)
+        *workers, router = plan.children
+        ids = {spec.id for spec in workers}
+        added = [dataclasses.replace(self._template, id=name) for name in self._added() if name not in ids]
+        super()._begin(Plan.of(plan.flags, (*workers, *added, router)))
         self._crew = [one for one in self._children.values() if one.spec.id != ROUTER]
+
+    def _added(self) -> list[str]:
+        """The recorded workers that an earlier life of ours has added, the lowest number first."""
+        above = child_key(self.ctx.path, "")
+        names = (key.removeprefix(above) for key in self.ctx.cell.node.keeper.notes(above))
+        return sorted((name for name in names if name.isdecimal()), key=int)
+
+    def _note(self, name: str, value: bytes | None) -> None:
+        """Keep in mind that there is a recorded worker more than at the start. Raises HoldfastError."""
+        if self._template.has_home:
+            self.ctx.cell.node.keeper.note(child_key(self.ctx.path, name), value)
 
     def _check(self, plan: Plan) -> None:
         *workers, router = (spec.id for spec in plan.children) if plan.children else ("",)
@@ -95,6 +114,10 @@ class PoolSupervisor(Supervisor):
 
     def _forget(self, one: Child) -> None:
         super()._forget(one)
+        try:
+            self._note(one.spec.id, None)
+        except HoldfastError as error:  # It is over all the same, but will come back with us.
+            self.ctx.cell.node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
         if one in self._crew:  # A temporary one that has ended is none any more.
             self._crew.remove(one)
 
@@ -109,25 +132,26 @@ class PoolSupervisor(Supervisor):
         return PoolStatus(len(self._crew), up, len(self._leaving), 0 if cell is None else cell.host.backlog(cell))
 
     @on(ResizePool)
-    async def _resize(self, message: ResizePool) -> Any:
+    def _resize(self, message: ResizePool) -> ReplyHandle[Any]:
         """Start new workers, or let the uppermost ones go."""
+        return self._answered(self._resized(message))
+
+    async def _resized(self, message: ResizePool) -> int:
         if message.size < 0 or not message.deadline >= 0:
-            return self._fail(SpecError("ResizePool", f"size and deadline must be >= 0, not {message!r}"))
-        before = len(self._crew)
-        going = self._crew[message.size :]
-        del self._crew[message.size :]  # From here on the router passes them over.
-        try:
+            raise SpecError("ResizePool", f"size and deadline must be >= 0, not {message!r}")
+        async with self._growing:  # One after another; who goes is not waited for by who comes.
+            before = len(self._crew)
+            going = self._crew[message.size :]
+            del self._crew[message.size :]  # From here on the router passes them over.
             while len(self._crew) < message.size:
                 await self._grow()
-        except HoldfastError as error:
-            return self._fail(error)
-        if not going:
-            return before
-        leave = Leave(going, before, self.ctx.reply_handle())
         self._leaving.update(one.spec.id for one in going)
-        for one in going:
-            self.ctx.create_task(self._drain(one, message.deadline, leave))
-        return leave.handle
+        gone = [self.ctx.cell.node.loop.create_future() for _ in going]
+        for one, future in zip(going, gone, strict=True):
+            self._errand(self._let_go(one, message.deadline, future))
+        for future in gone:
+            await future
+        return before
 
     async def _grow(self) -> None:
         """Start one more worker.
@@ -136,6 +160,7 @@ class PoolSupervisor(Supervisor):
             HoldfastError: it could not be started, or did not want to be.
         """
         number = next(number for number in itertools.count() if str(number) not in self._children)
+        self._note(str(number), b"")  # First: what it accepts is not lost, also if we die in the middle of its start.
         one = self._children[str(number)] = Child(dataclasses.replace(self._template, id=str(number)))
         self._children[ROUTER] = self._children.pop(ROUTER)  # It stays the last: the first to be stopped.
         try:
@@ -148,24 +173,18 @@ class PoolSupervisor(Supervisor):
             raise
         self._crew.append(one)
 
-    async def _drain(self, one: Child, seconds: float, leave: Leave) -> None:
-        """Outside of our turn: if the worker crashes meanwhile, it is restarted and goes on with what it has."""
+    async def _let_go(self, one: Child, seconds: float, gone: asyncio.Future[None]) -> None:
+        """Have a worker handle what it has, and end. If it crashes meanwhile, it is restarted and goes on with that."""
         if one.cell is not None:
-            await drain(one.cell, seconds)
-        self._post(Drained(one, leave))
-
-    async def _drained(self, one: Child, leave: Leave) -> None:
-        """A worker has handled what it had."""
+            await self.ctx.create_task(drain(one.cell, seconds))
         await self._stop(one)
         self._give_up_address(one, SHUTDOWN)
         self._forget(one)
         self._leaving.discard(one.spec.id)
-        leave.going.remove(one)
-        if not leave.going:
-            leave.handle.reply(leave.before)
+        gone.set_result(None)
 
     @on(StartChild)
-    async def _start_child(self, message: StartChild) -> Any:
+    def _start_child(self, message: StartChild) -> Any:
         """Workers are all alike."""
         raise NotSupported("the children of a pool are its workers: use ResizePool")
 
@@ -174,28 +193,6 @@ class PoolSupervisor(Supervisor):
         """Workers are all alike."""
         self._child(message.id)
         raise NotSupported("the children of a pool are its workers: use ResizePool")
-
-
-@dataclasses.dataclass(slots=True, eq=False)
-class Leave:
-    """Workers that go because of one ResizePool."""
-
-    going: list[Child]
-    before: int
-    handle: ReplyHandle[int]
-
-
-class Drained(Item):
-    """A worker that goes has nothing left to do, or its time is over."""
-
-    __slots__ = ("child", "leave")
-
-    def __init__(self, child: Child, leave: Leave) -> None:
-        self.child, self.leave = child, leave
-
-    @staticmethod
-    def run(actor: Any, item: Any) -> object:
-        return actor._drained(item.child, item.leave)
 
 
 def pool(

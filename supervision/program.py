@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import functools
 import os
 import re
 import signal
@@ -100,10 +101,14 @@ class Program(Actor):
 
     async def on_start(self, restored: bool) -> None:
         """Start the program and wait until it is ready; if it is not, it is stopped and the start has failed."""
-        own, remains = self.ctx.path, self.ctx.cell.node.remains
+        cell, own = self.ctx.cell, self.ctx.path
+        remains, before = cell.node.remains, cell.node.kept.get(cell)
         if left := [ended for ended, address in remains.items() if address == own]:
             await asyncio.wait(left)  # The last life was killed: its program must be gone before the next one begins.
         order = self._order
+        if isinstance(before, Kept) and not before.ended.done():
+            why = f"that of an earlier life still runs, and cannot be ended from here ({before.denied.result()})"
+            raise ProgramFailed(order.command[0], why)
         self._sign = None if order.ready is None else Sign(order.ready)
         kept = self._kept = self._keep(order.command, stdin=order.stdin)
         self._since = self._now()
@@ -128,8 +133,14 @@ class Program(Actor):
             on_part=self._part,
             stdin=stdin,
         )
+        kept.denied.add_done_callback(functools.partial(self._denied, command[0]))
         _Leash(self.ctx.cell, kept)
         return kept
+
+    def _denied(self, program: str, denied: asyncio.Future[str]) -> None:
+        """It cannot be ended: somebody has to know."""
+        why = f"it cannot be ended from here, and runs on until somebody else ends it ({denied.result()})"
+        self.ctx.cell.node.emit(HookFailed(self.ctx.path, "stop", exits.crash(ProgramFailed(program, why))))
 
     async def _until_ready(self, kept: Kept, sign: Sign) -> None:
         """Wait for the sign.
@@ -138,7 +149,9 @@ class Program(Actor):
             ProgramFailed: it did not come in time, or the program ended before.
         """
         timeout = self._order.ready_timeout
-        waiting = self.ctx.cell.node.loop.create_task(reached(sign), name=f"ready of {self.ctx.path}")
+        waiting = self.ctx.cell.node.loop.create_task(
+            reached(sign, self.ctx.cell.node.threads), name=f"ready of {self.ctx.path}"
+        )
         try:
             first: set[asyncio.Future[Any]] = {waiting, kept.ended}
             await asyncio.wait(first, timeout=timeout, return_when=asyncio.FIRST_COMPLETED)
@@ -146,6 +159,8 @@ class Program(Actor):
                 raise self._failed(f"it ended before it was ready: {kept.ended.result()}")
             if not waiting.done():
                 raise self._failed(f"it was not ready after {timeout:g} s")
+            if waiting.cancelled():
+                raise self._failed("what `ready` waited for was cancelled")
             try:
                 waiting.result()
             except Exception as error:
@@ -170,11 +185,11 @@ class Program(Actor):
         if self._sign is not None:
             self._sign.line(text)
 
-    def _part(self, stream: str, text: str) -> None:
-        """A line that has no end yet; it comes again, whole."""
+    def _part(self, stream: str, text: str, whole: str) -> None:
+        """A line that has no end yet; it comes again. What came before of a very long one is there in `whole`."""
         self._parts[stream] = text
-        if text and self._sign is not None:
-            self._sign.line(text)
+        if whole and self._sign is not None:
+            self._sign.line(whole)
 
     def _last(self) -> list[str]:
         """What it said last."""
@@ -231,7 +246,7 @@ class Program(Actor):
             await asyncio.wait({kept.ended}, timeout=None if patience is None else patience / 2)
         if not kept.ended.done():
             kept.kill()
-        await kept.wait()
+        await kept.wait_killed()
 
     async def _asked(self, kept: Kept, patience: float | None) -> bool:
         """Ask the program to end; whether it did so in time."""
@@ -241,7 +256,9 @@ class Program(Actor):
                 await kept.wait()
         except TimeoutError:
             pass
-        except Exception as error:  # The user's own way of stopping it: the rest of the ladder is left.
+        except (Exception, asyncio.CancelledError) as error:  # The user's own way: the rest of the ladder is left.
+            if isinstance(error, asyncio.CancelledError) and _is_cancelled():
+                raise
             self.ctx.cell.node.emit(HookFailed(self.ctx.path, "stop", exits.crash(error)))
         return kept.ended.done()
 
@@ -270,7 +287,7 @@ class Program(Actor):
         finally:
             if not kept.ended.done():  # It takes too long.
                 kept.kill()
-                await kept.wait()
+                await kept.wait_killed()
         kept.started.result()
         if not reason.is_clean:
             raise ProgramFailed(command[0], str(reason))
@@ -290,9 +307,11 @@ class _Leash:
         if kept.ended.done():
             return
         kept.kill()
+        gone = cell.node.loop.create_task(kept.wait_killed(), name=f"end of {cell.path}")
         remains = cell.node.remains
-        remains[kept.ended] = cell.path
-        kept.ended.add_done_callback(remains.pop)
+        remains[gone] = cell.path
+        gone.add_done_callback(lambda gone: remains.pop(gone, None))
+        cell.node.kept[cell] = kept  # If we may not end it, no second one is started beside it.
 
 
 def program(
@@ -376,6 +395,12 @@ def program(
     )
     patience: Shutdown = "infinity" if isinstance(shutdown, str) else shutdown + SLACK
     return dataclasses.replace(own, shutdown=patience)
+
+
+def _is_cancelled() -> bool:
+    """Whether this very task is cancelled; else what it waited for was."""
+    task = asyncio.current_task()
+    return task is not None and task.cancelling() > 0
 
 
 def _stop_in(where: str, stop: Any) -> Any:

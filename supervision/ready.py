@@ -13,9 +13,10 @@ import stat
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from ..actors.errors import SpecError
+from ..actors.threads import Threads, is_async
 
 FIRST_LOOK, LAST_LOOK = 0.01, 0.2
 """Seconds between two looks at the world outside, which tells nobody when it changes; they grow."""
@@ -80,10 +81,15 @@ class Named:
     name: str
 
     def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
+
+    @property
+    def function(self) -> Callable[..., Any]:
+        """The function itself. Raises LookupError."""
         function = _found(self.module, self.name)
         if function is None:
             raise LookupError(f"there is no {self.module}.{self.name} here")
-        return function(*args)
+        return cast("Callable[..., Any]", function)
 
 
 def by_name(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -120,8 +126,8 @@ class Sign:
         self._pattern = None
 
 
-async def reached(sign: Sign) -> None:
-    """Wait until the sign is there."""
+async def reached(sign: Sign, threads: Threads) -> None:
+    """Wait until the sign is there; a function that may block is asked in a thread."""
     match sign.ready.kind:
         case "line":
             await sign.seen.wait()
@@ -129,17 +135,17 @@ async def reached(sign: Sign) -> None:
             await asyncio.sleep(sign.ready.value)
         case _:
             pause = FIRST_LOOK
-            while not await _there(sign):
+            while not await _there(sign, threads):
                 await asyncio.sleep(pause)
                 pause = min(LAST_LOOK, pause * 1.5)
 
 
-async def _there(sign: Sign) -> bool:
+async def _there(sign: Sign, threads: Threads) -> bool:
     value = sign.ready.value
     if sign.ready.kind == "port":
         return await _answers(socket.AF_UNSPEC, value)
     if sign.ready.kind == "call":
-        found: object = value()
+        found: object = value() if is_async(_plain(value)) else await threads.run(value)
         answer = await found if isinstance(found, Awaitable) else found
         if not isinstance(answer, bool):
             raise TypeError(f"it must return True or False, not {answer!r}")
@@ -150,6 +156,10 @@ async def _there(sign: Sign) -> bool:
     if stamp.is_socket:  # The file of a dead listener stays: only a connection says that somebody is there.
         return await _answers(socket.AF_UNIX, value)
     return stamp != sign.before
+
+
+def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
+    return function.function if isinstance(function, Named) else function
 
 
 async def _answers(family: socket.AddressFamily, address: Any) -> bool:

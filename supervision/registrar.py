@@ -17,7 +17,7 @@ import msgspec
 
 from ..actors.actor import Actor, on
 from ..actors.cell import DOWN, GONE, Cell
-from ..actors.errors import HoldfastError
+from ..actors.errors import ActorStopped, HoldfastError
 from ..actors.exits import ExitReason
 from ..actors.links import Monitor
 from ..actors.mail import Ask, ReplyHandle
@@ -184,11 +184,18 @@ class Book:
     locks: dict[bytes, deque[Claim]] = dataclasses.field(default_factory=dict[bytes, deque[Claim]])
     holders: dict[Cell, Holdings] = dataclasses.field(default_factory=dict[Cell, Holdings])
 
+    def given_up(self, error: ActorStopped) -> None:
+        """Nobody gets a lock here any more."""
+        for waiting in self.locks.values():
+            for claim in waiting:
+                claim.handle.fail(error)
+
 
 class RegistryActor(Actor):
     """Keeps the book of one registry. Started by `registry(...)`, used through `Registry(ref)`."""
 
     deterministic = False
+    _keeps_promises = True
 
     def __init__(self, keys: Keys, listeners: tuple[str, ...], meta: dict[str, Any]) -> None:
         self._is_unique = keys == "unique"
@@ -198,8 +205,8 @@ class RegistryActor(Actor):
     def on_start(self, restored: bool) -> None:
         """Go on with the book that earlier lives at this address have kept, without those who are dead by now."""
         cell = self.ctx.cell
-        book: Book | None = cell.node.kept.get(cell)
-        if book is None:
+        book = cell.node.kept.get(cell)
+        if not isinstance(book, Book):
             book = cell.node.kept[cell] = Book(dict(self._first_meta))
         self._book = book
         for holder, holdings in list(book.holders.items()):

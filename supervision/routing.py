@@ -12,7 +12,7 @@ from ..actors.actor import Actor, Start
 from ..actors.cell import GONE, Cell
 from ..actors.context import Stashed
 from ..actors.errors import AskDeadlock, HoldfastError, SendError
-from ..actors.mail import Ask, Table
+from ..actors.mail import Ask, Envelope, Table
 from ..actors.message import Message, Refusal
 from .admin import NotSupported
 from .children import STOPPED, Child
@@ -68,7 +68,7 @@ class Router(Actor):
             item.fail(AskDeadlock(crew[0].path, tuple(path for path, _ in chain)))
             self.ctx.cell.item = Stashed.of(item)
             return
-        able = [cell for cell in free if has_room(cell)]
+        able = [cell for cell in free if cell.has_room]
         if able:
             self._hand_on(item, self._choose(able))
         else:
@@ -115,7 +115,7 @@ class Router(Actor):
             case "least_loaded":
                 self._next += 1
                 turned = [able[(self._next + at) % len(able)] for at in range(len(able))]
-                return min(turned, key=load)  # The first of several: they take turns.
+                return min(turned, key=lambda cell: cell.host.load(cell))  # The first of several: they take turns.
             case _:
                 return self._in_turn(able)
 
@@ -132,12 +132,26 @@ class Router(Actor):
         if isinstance(item, Ask):
             item.started = False  # What we did was not its turn.
         try:
-            self.ctx.forward(cell.ref)
-        except HoldfastError as error:
             if isinstance(item, Ask):
-                item.fail(error)
-            else:
-                self.ctx.cell.node.dead_letter(cell, getattr(item, "message", item), str(error))
+                self.ctx.forward(cell.ref)
+            else:  # As a `send` that does not wait here: its home may be elsewhere, and say only then that it is full.
+                sent = Envelope(item.message, item.sender) if isinstance(item, Envelope) else item
+                taken = cell.host.offer(cell, sent)
+                if taken is not None:
+                    asyncio.ensure_future(taken).add_done_callback(functools.partial(self._offered, item, cell))
+        except HoldfastError as error:
+            self._refused(item, cell, error)
+
+    def _offered(self, item: Any, cell: Cell, done: asyncio.Future[None]) -> None:
+        error = None if done.cancelled() else done.exception()
+        if isinstance(error, HoldfastError):
+            self._refused(item, cell, error)
+
+    def _refused(self, item: Any, cell: Cell, error: HoldfastError) -> None:
+        if isinstance(item, Ask):
+            item.fail(error)
+        else:
+            cell.node.dead_letter(cell, getattr(item, "message", item), str(error))
 
     def _to_all(self, item: Any) -> None:
         if isinstance(item, Ask):
@@ -173,14 +187,11 @@ class Router(Actor):
             self.ctx.cell.node.loop.call_soon(self.look_again)
             return
         self._rooms.append(room)
-        room.add_done_callback(functools.partial(self._room, cell))
+        room.add_done_callback(self._room)
 
-    def _room(self, cell: Cell, room: asyncio.Future[None]) -> None:
-        if room.cancelled():
-            return
-        self.look_again()
-        if cell.more is not None and cell.more.bound is not None:
-            cell.more.bound.wake_sender()  # We may choose another worker: whoever waits for this one is to look too.
+    def _room(self, room: asyncio.Future[None]) -> None:
+        if not room.cancelled():
+            self.look_again()
 
     def look_again(self) -> None:
         """Something has changed: a worker is up, or has room."""
@@ -220,25 +231,3 @@ def routing_to(kind: type[Actor]) -> type[Router]:
     made._table = table
     routing: type[Router] = made
     return routing
-
-
-def has_room(cell: Cell) -> bool:
-    """Whether a worker takes a message now; only a bounded mailbox whose policy is to wait says no."""
-    bound = cell.more.bound if cell.more is not None else None
-    if bound is None or bound.overflow != "block":
-        return True
-    if bound.count >= bound.capacity:
-        bound.moved(cell)
-    return bound.count < bound.capacity and not bound.waiting
-
-
-def load(cell: Cell) -> int:
-    """How many messages a worker has: those that wait, and the one that it is at."""
-    more = cell.more
-    queued = len(cell.queue or ())
-    if more is None:
-        return queued
-    outlet = more.outlet
-    if outlet is None:
-        return cell.host.backlog(cell) if cell.spec.recovery is not None else queued + (more.turn is not None)
-    return queued if outlet.worker is None else queued + int(outlet.sent - outlet.worker.page[1])

@@ -5,8 +5,10 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import inspect
-from collections.abc import Iterable, Mapping
-from typing import Any, Literal, TypeGuard, get_args
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, Generic, Literal, TypeGuard, get_args
+
+from typing_extensions import TypeVar
 
 from ..actors.actor import Actor, Start
 from ..actors.cell import Cell
@@ -19,18 +21,25 @@ from ..actors.process.recipe import pack_recipe
 from ..actors.values import UnsavableValue
 from .backoff import Backoff
 from .decisions import decide, is_as_told
+from .patience import end_within
 from .rules import Rule
+
+A = TypeVar("A", bound=Actor)
+A_co = TypeVar("A_co", bound=Actor, default=Any, covariant=True)
 
 Restart = Literal["permanent", "transient", "temporary"]
 Strategy = Literal["one_for_one", "one_for_all", "rest_for_one"]
 AutoShutdown = Literal["never", "any_significant", "all_significant"]
 Isolation = Literal["task", "process"]
 Shutdown = float | Literal["brutal_kill", "infinity"]
+StartTimeout = float | Literal["infinity"]
 
 NAMELESS = "*"
 """The id of a spec without one: a dynamic supervisor makes one up at each start."""
 PATIENCE = 5.0
 """Seconds a child may take to stop in good order when its spec does not say; a supervisor takes what it needs."""
+START_TIMEOUT = 60.0
+"""Seconds a child may take to start when its spec does not say; a supervisor takes what its children need."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -62,11 +71,14 @@ class Flags:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class ChildSpec:
-    """One child: how it starts, when it is restarted, how it is stopped, where it lives. Made by `child`."""
+class ChildSpec(Generic[A_co]):
+    """One child: how it starts, when it is restarted, how it is stopped, where it lives. Made by `child`.
+
+    It is typed by the actor's class, as the ref is that `ActorSystem.start` makes of it.
+    """
 
     id: str
-    start: Start[Any]
+    start: Start[A_co]
     restart: Restart = "permanent"
     shutdown: Shutdown = 5.0
     isolation: Isolation = "task"
@@ -79,6 +91,8 @@ class ChildSpec:
     significant: bool = False
     rules: tuple[Rule, ...] = ()
     mechanism: Any = None
+    comes_back: bool = True  # whether its supervisor starts it again when that has itself been restarted
+    start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"
@@ -99,6 +113,12 @@ class ChildSpec:
             _number(self.shutdown) and 0 <= self.shutdown < float("inf")
         ):
             raise SpecError(where, f"shutdown must be seconds >= 0, 'brutal_kill' or 'infinity', not {self.shutdown!r}")
+        if self.start_timeout is None:
+            object.__setattr__(self, "start_timeout", "infinity" if self.is_supervisor else START_TIMEOUT)
+        if self.start_timeout != "infinity" and not (
+            _number(self.start_timeout) and 0 < self.start_timeout < float("inf")
+        ):
+            raise SpecError(where, f"start_timeout must be seconds > 0 or 'infinity', not {self.start_timeout!r}")
         if not isinstance(self.significant, bool):
             raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
         if self.significant and self.restart == "permanent":
@@ -134,6 +154,10 @@ class ChildSpec:
         """Whether what is sent to it waits outside of its lives, so that its starts may take their time."""
         return self.recovery is not None or self.mechanism is not None
 
+    def below(self) -> Iterator[ChildSpec]:
+        """The children that the spec of a supervisor names, its template among them."""
+        return _specs_in((*self.start.args, *self.start.kwargs.values()))
+
     def restarts(self, reason: ExitReason) -> bool:
         """Whether an end by itself for this reason is followed by another life."""
         return decide(self.restart, self.rules, reason) == "restart"
@@ -153,12 +177,14 @@ class ChildSpec:
         return ended
 
     def begin_stop(self, cell: Cell, reason: ExitReason = SHUTDOWN) -> asyncio.Future[ExitReason]:
-        """Tell the child to stop, or kill it if its spec says so; whoever calls keeps the time."""
+        """Tell the child to stop, or kill it if its spec says so; whoever calls keeps the time, if it gives any."""
         gone = cell.ended()
         if self.shutdown == "brutal_kill":
             cell.kill()
         else:
             cell.request_stop(reason)
+        if self.is_supervisor and self.shutdown == "infinity":
+            end_within(cell, gone)
         return gone
 
     def judge(self, cell: Cell, told: ExitReason, ended: ExitReason) -> None:
@@ -168,9 +194,17 @@ class ChildSpec:
             cell.node.emit(ShutdownError(cell.path, ended))
 
 
+def _specs_in(values: Iterable[Any]) -> Iterator[ChildSpec]:
+    for value in values:
+        if isinstance(value, ChildSpec):
+            yield value
+        elif isinstance(value, (list, tuple)):
+            yield from _specs_in(value)
+
+
 def child(
     id: str | None,
-    start: Start[Any],
+    start: Start[A],
     *,
     restart: Restart = "permanent",
     shutdown: Shutdown | None = None,
@@ -183,7 +217,8 @@ def child(
     significant: bool = False,
     rules: Iterable[Rule] = (),
     mechanism: Any = None,
-) -> ChildSpec:
+    start_timeout: StartTimeout | None = None,
+) -> ChildSpec[A]:
     """A child spec.
 
     Args:
@@ -202,6 +237,10 @@ def child(
         rules: from `rule(...)`; the first that fits an end decides, then `restart`.
         mechanism: a fault-tolerance mechanism such as `PBR()`, or several, outermost first: the actor is lived by
             replicas in processes of their own.
+        start_timeout: seconds that `__init__` and `on_start` may take (with a process of its own, that too), or
+            "infinity"; if left out 60, and "infinity" for a supervisor, whose children have limits of their own. A
+            start that takes longer is killed, and has failed. A child that is brought back may take longer altogether,
+            but not longer without having handled one more input again; pauses that a paced replay repeats do not count.
 
     Raises:
         MechanismRefused: the class does not have what the mechanism needs.
@@ -225,6 +264,7 @@ def child(
         significant,
         tuple(rules),
         mechanism,
+        start_timeout=start_timeout,
     )
 
 

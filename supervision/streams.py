@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Callable, Iterable, Iterator
 from typing import Any, Literal, cast
 
@@ -17,24 +17,76 @@ OnTimeout = Literal["exit", "kill_task"]
 class _Slot:
     """An item between its source and the taker of its result."""
 
-    __slots__ = ("_done", "deadline", "is_refused", "item", "job", "result")
+    __slots__ = ("deadline", "item", "job", "result")
 
-    def __init__(self, item: Any, job: Job[Any], deadline: float, done: deque[_Slot]) -> None:
-        self.item, self.job, self.deadline, self._done = item, job, deadline, done
+    def __init__(self, item: Any, job: Job[Any], deadline: float) -> None:
+        self.item, self.job, self.deadline = item, job, deadline
         self.result: Ok[Any, Any] | Failed[Any] | None = None
-        self.is_refused = False  # there was no job at all
-        job._future.add_done_callback(self._ended)
 
-    def _ended(self, future: asyncio.Future[Any]) -> None:
-        if self.result is None:
-            error = cast("HoldfastError | None", future.exception())
-            self.is_refused = self.job._cell is None
-            self.set_result(Ok(self.item, future.result()) if error is None else Failed(self.item, error))
 
-    def set_result(self, result: Ok[Any, Any] | Failed[Any]) -> None:
+class _Window:
+    """What is between the source and the taker: whatever happens there costs the same, however much it is."""
+
+    def __init__(self, ordered: bool) -> None:
+        self._is_ordered = ordered
+        self.slots: OrderedDict[_Slot, None] = OrderedDict()  # in the order of the items
+        self._done: deque[_Slot] = deque()  # in that of their ends, if that is how they are taken
+        self._due: OrderedDict[_Slot, None] = OrderedDict()  # in that of their deadlines, which is that of the items
+        self._woken: asyncio.Future[None] | None = None
+        self.refused: HoldfastError | None = None  # why there was no job at all for one
+
+    def add(self, slot: _Slot) -> None:
+        """A job has been started."""
+        self.slots[slot] = None
+        if slot.deadline != math.inf:
+            self._due[slot] = None
+        slot.job._future.add_done_callback(lambda future: self._ended(slot, future))
+
+    def _ended(self, slot: _Slot, future: asyncio.Future[Any]) -> None:
+        if slot.result is not None:
+            return
+        error = cast("HoldfastError | None", future.exception())
+        if error is not None and slot.job._cell is None:
+            self.refused = error
+        self.set_result(slot, Ok(slot.item, future.result()) if error is None else Failed(slot.item, error))
+
+    def set_result(self, slot: _Slot, result: Ok[Any, Any] | Failed[Any]) -> None:
         """What is handed to the taker."""
-        self.result = result
-        self._done.append(self)
+        slot.result = result
+        self._due.pop(slot, None)
+        if not self._is_ordered:
+            self._done.append(slot)
+        self.wake()
+
+    def wake(self, _: object = None) -> None:
+        """Something has happened."""
+        if self._woken is not None and not self._woken.done():
+            self._woken.set_result(None)
+
+    def take(self) -> Ok[Any, Any] | Failed[Any] | None:
+        """The next result for the taker, if it is there."""
+        ready = next(iter(self.slots), None) if self._is_ordered else self._done[0] if self._done else None
+        if ready is None or ready.result is None:
+            return None
+        del self.slots[ready]
+        if not self._is_ordered:
+            self._done.popleft()
+        return ready.result
+
+    async def wait(self, loop: asyncio.AbstractEventLoop) -> None:
+        """Wait until something has happened, or the next deadline is there."""
+        soonest = next(iter(self._due), None)
+        left = None if soonest is None else max(0.0, soonest.deadline - loop.time())
+        self._woken = loop.create_future()
+        await asyncio.wait((self._woken,), timeout=left)
+
+    def late(self, now: float) -> _Slot | None:
+        """A job that has not ended in its time."""
+        while (soonest := next(iter(self._due), None)) is not None and soonest.deadline <= now:
+            del self._due[soonest]
+            if not soonest.job.is_done:
+                return soonest
+        return None
 
 
 class _Source:
@@ -65,12 +117,13 @@ class _Source:
             self._is_over = True
             return []
 
-    def pulling(self) -> asyncio.Task[Any] | None:
-        """What to wait for until the next item is there; None if there will be none, or it need not be waited for."""
+    def pulling(self, there: Callable[[object], None]) -> asyncio.Task[Any] | None:
+        """Pull the next item, and call `there` when it is there; None if there will be none, or it is there."""
         if self._async is None or self._is_over:
             return None
         if self._pulling is None:
             self._pulling = asyncio.get_running_loop().create_task(_next(self._async), name="pull of a stream")
+            self._pulling.add_done_callback(there)
         return self._pulling
 
     def close(self) -> None:
@@ -93,46 +146,34 @@ async def stream_of(
 ) -> AsyncGenerator[Any, None]:
     """The results of the jobs that `begin` starts; see `Tasks.stream`."""
     loop = asyncio.get_running_loop()
-    source = _Source(items)
-    window: deque[_Slot] = deque()  # in the order of the items
-    done: deque[_Slot] = deque()  # in that of their ends
+    source, window = _Source(items), _Window(ordered)
     is_hurried = False
     try:
         while True:
-            while len(window) < most and (found := source.take()):
+            while len(window.slots) < most and (found := source.take()):
                 deadline = math.inf if timeout is None else loop.time() + timeout
-                window.append(_Slot(found[0], begin(found[0]), deadline, done))
-            for slot in done:
-                if slot.is_refused and isinstance(slot.result, Failed):
-                    raise slot.result.error
-            ready = window if ordered else done
-            if ready and (result := ready[0].result) is not None:
-                slot = ready[0]
-                window.remove(slot)
-                done.remove(slot)
+                window.add(_Slot(found[0], begin(found[0]), deadline))
+            if window.refused is not None:
+                raise window.refused
+            if (result := window.take()) is not None:
                 yield result
                 continue
-            waited: list[asyncio.Future[Any]] = [slot.job._future for slot in window if slot.result is None]
-            if len(window) < most and (pulling := source.pulling()) is not None:
-                waited.append(pulling)
-            if not waited:
+            pulling = source.pulling(window.wake) if len(window.slots) < most else None
+            if pulling is None and not window.slots:
                 return
-            soonest = min((slot.deadline for slot in window if slot.result is None), default=math.inf)
-            left = None if soonest == math.inf else max(0.0, soonest - loop.time())
-            await asyncio.wait(waited, timeout=left, return_when=asyncio.FIRST_COMPLETED)
-            for slot in window:
-                if slot.result is None and slot.deadline <= loop.time() and not slot.job.is_done:
-                    late = AskTimeout(slot.job.path, timeout or 0.0, None)
-                    if on_timeout == "exit":
-                        raise late
-                    slot.set_result(Failed(slot.item, late))
-                    slot.job.kill()
+            await window.wait(loop)
+            while (slot := window.late(loop.time())) is not None:
+                late = AskTimeout(slot.job.path, timeout or 0.0, None)
+                if on_timeout == "exit":
+                    raise late
+                window.set_result(slot, Failed(slot.item, late))
+                slot.job.kill()
     except asyncio.CancelledError:
         is_hurried = True  # Whoever is killed must not wait for others.
         raise
     finally:
         source.close()
-        for slot in window:
+        for slot in window.slots:
             slot.job.cancel()
-        if window and not is_hurried:
-            await asyncio.wait([slot.job._future for slot in window])
+        if window.slots and not is_hurried:
+            await asyncio.wait([slot.job._future for slot in window.slots])

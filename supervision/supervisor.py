@@ -7,13 +7,11 @@ It decides in pure functions (`decisions.py`, `intensity.py`) and acts here. The
 from __future__ import annotations
 
 import asyncio
-import functools
-from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, ClassVar
 
 from ..actors import lives
-from ..actors.actor import on
+from ..actors.actor import Start, on
 from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
@@ -24,6 +22,7 @@ from .admin import (
     AlreadyStarted,
     ChangeSupervisor,
     ChildBusy,
+    ChildParked,
     DeleteChild,
     RestartChild,
     StartChild,
@@ -31,10 +30,24 @@ from .admin import (
     opened,
 )
 from .change import check_place, new_plan, succession
-from .children import RECOVERING, RESTARTING, STOPPED, UP, Asked, Child, Retry, Row, StartOver, complete, new_cell
+from .children import (
+    RECOVERING,
+    RESTARTING,
+    STARTING,
+    STOPPED,
+    STOPPING,
+    UP,
+    Child,
+    Retry,
+    Row,
+    StartLimit,
+    complete,
+    new_cell,
+)
 from .decisions import affected, decide, is_reported
+from .errands import Errand, answered
 from .inquiries import Inquiries
-from .intensity import admit_restart
+from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
 
 
@@ -46,32 +59,82 @@ class Supervisor(Inquiries):
 
     _flags: Flags
     _restarts: tuple[float, ...]
+    _planned: frozenset[str]
+    _parked: set[str]
+    _first: Errand | None = None  # the errand of our own start
+    _errands: Sequence[Errand] = ()  # those that wait; some that are over may be among them
 
     def __init__(self, flags: Flags | None = None, children: tuple[ChildSpec, ...] = ()) -> None:
         self._given = Plan.of(flags or Flags(), children)
+
+    @classmethod
+    def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
+        """What the bindings of those below it lead to, as far as its recipe names them."""
+        found: list[str] = []
+        for given in (*start.args, *start.kwargs.values()):
+            for spec in given if isinstance(given, (tuple, list)) else (given,):
+                if isinstance(spec, ChildSpec):
+                    found += (*spec.bindings.values(), *spec.start.kind._may_order(spec.start))
+        return tuple(found)
 
     def init(self) -> Plan:
         """Flags and children, asked for at each start and at a `ChangeSupervisor()`. May raise `Ignore`."""
         return self._given
 
+    # -- errands ----------------------------------------------------------------------------------------------------
+
+    def _errand(self, work: Coroutine[Any, Any, None], first: lives.FirstTurn | None = None) -> Errand:
+        """Begin what has to wait for others; what comes behind its first wait is done in turns of its own."""
+        errand = Errand(self.ctx, work, first)
+        errand.step()
+        if not errand.is_over:
+            self._errands = [*(one for one in self._errands if not one.is_over), errand]
+        return errand
+
+    def _outside(self) -> list[Coroutine[Any, Any, Any]]:
+        return [one.work for one in self._errands if not one.is_over]
+
+    def _answered(self, work: Coroutine[Any, Any, Any]) -> ReplyHandle[Any]:
+        """Do what was asked for as an errand, and answer at its end."""
+        handle = self.ctx.reply_handle()
+        self._errand(answered(self.ctx, handle, work))
+        return handle
+
     # -- start ------------------------------------------------------------------------------------------------------
 
     async def on_start(self, restored: bool) -> None:
-        """Start the children left to right; if one fails, the others are stopped in reverse and so do we."""
+        """Begin to start the children, left to right; if one fails, the others are stopped in reverse and so do we.
+
+        The start is over when all of them are up, which can be after this has returned: a child may take its time, and
+        we answer meanwhile.
+        """
         self.ctx.trap_exits = True  # Only our own parent can end us: the end of a stranger that is linked is no order.
         self._begin(new_plan(self))
-        for one in list(self._children.values()):
-            try:
-                await self._start(one)
-            except HoldfastError:
-                self._blame(one)
-                raise
+        self._first = self._errand(self._start_all(), self.ctx.item)
 
     def _begin(self, plan: Plan) -> None:
         """Take up the plan of this start."""
         self._flags = plan.flags
         self._children = {spec.id: Child(spec) for spec in plan.children}
+        self._planned, self._parked = frozenset(self._children), set[str]()
         self._restarts = ()
+        self._early: list[lives.ChildExit] = []
+
+    def _is_starting(self) -> bool:
+        return self._first is not None and not self._first.is_over
+
+    async def _start_all(self) -> None:
+        """The errand of our own start."""
+        row = Row(self._children.values(), STARTING)
+        while (one := row.next()) is not None:
+            try:
+                await self._come_up_in(row, one)
+            except HoldfastError:
+                self._blame(one)
+                raise
+        for early in self._early:
+            self.ctx.cell.push(early)
+        self._early.clear()
 
     async def _start(self, one: Child) -> bool:
         """Start a child and wait until it is up. False: it did not want to be.
@@ -79,27 +142,66 @@ class Supervisor(Inquiries):
         Raises:
             StartFailed, or another HoldfastError: naming the child and why.
         """
+        row = Row((one,), STARTING)
+        is_up = await self._come_up_in(row, one)
+        if is_up is None:
+            raise StartFailed(self._path_of(one), "it was stopped while it started")
+        return is_up
+
+    async def _come_up_in(self, row: Row, one: Child) -> bool | None:
+        """Start a child of a row and wait until it is up. False: it did not want to be; None: it is not ours any more.
+
+        Raises:
+            StartFailed, or another HoldfastError: naming the child and why.
+        """
         try:
-            up = self._launch(one)
-            if up is not None:
-                await self._wait(one, up)
+            await self._come_up(one)
         except StartIgnored:
+            if one.row is not row:
+                return None
             self._ignored(one)
             return False
         except HoldfastError as error:
+            if one.row is not row:
+                return None
             self._start_failed(one, error)
             raise
+        if one.row is not row:
+            return None
         self._is_up(one)
+        cell = one.cell
+        if cell is not None and cell.state is DOWN:  # It ended before we heard that it was up: its end in our queue
+            self.ctx.cell.push(lives.ChildExit(cell, cell.life, cell.extra().reason))  # may be passed over already.
         return True
 
-    async def _wait(self, one: Child, up: asyncio.Future[None]) -> None:
+    async def _come_up(self, one: Child) -> None:
+        """Launch a child and wait for it. Raises what `_launch` does, or how the start ended."""
+        up = self._launch(one)
+        if up is None:
+            return
+        if one.spec.has_home:
+            one.state = RECOVERING
+        one.up = up
+        limit = StartLimit(one)
         try:
             await up
         except asyncio.CancelledError as error:
-            task = asyncio.current_task()
-            if task is not None and task.cancelling():
+            turn = self.ctx.cell.extra().turn
+            if turn is not None and turn.killed:
                 raise  # It is our own turn that is killed.
             raise StartFailed(self._path_of(one), "it was killed while it started") from error
+        except StartFailed as error:
+            if limit.is_over:
+                raise StartFailed(self._path_of(one), limit.told) from error
+            raise
+        except HoldfastError:
+            raise
+        except Exception as error:
+            raise StartFailed(self._path_of(one), str(error)) from error
+        finally:
+            limit.close()
+            if one.up is up:
+                one.up = None
 
     def _launch(self, one: Child) -> asyncio.Future[None] | None:
         """Begin a life of the child; a future if it takes longer than this turn.
@@ -115,6 +217,7 @@ class Supervisor(Inquiries):
 
     def _is_up(self, one: Child) -> None:
         one.state = UP
+        self._parked.discard(one.spec.id)
         one.row = None
         one.up_since = self.ctx.cell.node.loop.time()
 
@@ -136,20 +239,26 @@ class Supervisor(Inquiries):
 
     # -- a child has ended ------------------------------------------------------------------------------------------
 
-    def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Coroutine[Any, Any, None] | None:
+    def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> None:
         """Decide what follows from the end of a child's life (called by the loop, in a turn of ours)."""
         one = self._children.get(cell.name)
         if cell.parent is not self.ctx.cell and cell.parent is not None:
             cell.parent.push(lives.ChildExit(cell, life, reason))  # It was moved since: another one decides.
-            return None
+            return
         if one is None or one.cell is not cell:
             lives.retire(cell, reason)
-            return None
-        if life <= one.ignored_life or one.state != UP:
-            return None  # We stopped it, or it ended while it started: that is told by who waits for the start.
-        spec, node = one.spec, self.ctx.cell.node
-        if node.watched and is_reported(spec.restart, reason):
-            node.emit(ChildTerminated(cell.path, reason))
+            return
+        if life <= one.ignored_life:
+            return  # We stopped it, or its start has failed.
+        if one.state != UP:
+            if cell.life == life and one.up is None:
+                self._report_end(one, life, reason)  # It is one of those that we are about to stop.
+            return  # Or it ended while it started: that is told by who waits for the start.
+        spec = one.spec
+        if self._is_starting() and self._flags.strategy != "one_for_one":
+            self._early.append(lives.ChildExit(cell, life, reason))  # First the others come up: they may go down again.
+            return
+        self._report_end(one, life, reason)
         action = decide(spec.restart, spec.rules, reason)
         if action == "escalate":
             self._give_up(one, reason, reason)
@@ -159,8 +268,16 @@ class Supervisor(Inquiries):
         elif spec.backoff is not None:
             self._later(one, reason)
         else:
-            return self._restart(one, reason)
-        return None
+            self._restart(one, reason)
+
+    def _report_end(self, one: Child, life: int, reason: ExitReason) -> None:
+        """Tell that a child has ended without having been told to."""
+        one.ignored_life = life
+        node = self.ctx.cell.node
+        if node.watched and is_reported(one.spec.restart, reason):
+            allowed, period = self._flags.intensity, self._flags.period
+            restarts = len(recent_restarts(self._restarts, node.loop.time(), period))
+            node.emit(ChildTerminated(self._path_of(one), reason, restarts, allowed))
 
     def _give_up_address(self, one: Child, reason: object) -> None:
         """The child is not restarted: its address goes, its spec too if it is temporary."""
@@ -172,7 +289,10 @@ class Supervisor(Inquiries):
 
     def _forget(self, one: Child) -> None:
         """The spec goes: the one way out of the list of children."""
-        self._children.pop(one.spec.id, None)
+        if self._children.get(one.spec.id) is one:
+            del self._children[one.spec.id]
+            if one.spec.id not in self._planned:  # Nobody brings it back: not our next life, either.
+                self._parked.discard(one.spec.id)
 
     def _end_with_significant(self, one: Child, reason: ExitReason) -> None:
         """A child has ended by itself for good: if it was significant, that may be the end of us."""
@@ -202,28 +322,26 @@ class Supervisor(Inquiries):
         if not self.ctx.closed:
             self.ctx.cell.push(item)
 
-    def _retry(self, one: Child, number: int, reason: ExitReason) -> Coroutine[Any, Any, None] | None:
+    def _retry(self, one: Child, number: int, reason: ExitReason) -> None:
         """A restart is due, unless the child was stopped or started meanwhile."""
-        if number != one.retry or one.state != RESTARTING:
-            return None
-        return self._restart(one, reason)
+        if number == one.retry and one.state == RESTARTING:
+            self._restart(one, reason)
 
-    def _restart(self, one: Child, reason: ExitReason) -> Coroutine[Any, Any, None] | None:
+    def _restart(self, one: Child, reason: ExitReason) -> None:
         """One attempt by the strategy, counted; gives up when there were too many."""
         node, flags = self.ctx.cell.node, self._flags
         window = admit_restart(self._restarts, node.loop.time(), intensity=flags.intensity, period=flags.period)
         if window is None:
             self._give_up(one, reason, SHUTDOWN)
-            return None
+            return
         self._restarts = window
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
             node.keeper.returned(self._path_of(one), flags.period)
         if node.watched:
-            node.emit(ChildRestarted(self._path_of(one), reason, len(window)))
-        if flags.strategy == "one_for_one":
-            self._start_row(Row(deque([one]), reason))
-            return None
-        return self._restart_group(one, reason)
+            node.emit(ChildRestarted(self._path_of(one), reason, len(window), flags.intensity))
+        order = list(self._children.values())
+        group = affected(flags.strategy, order, order.index(one))
+        self._errand(self._restart_group(one, [other for other in group if other.state != STARTING], reason))
 
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""
@@ -249,60 +367,24 @@ class Supervisor(Inquiries):
         if one.spec.is_supervisor or one.spec.has_home:
             self.ctx.cell.node.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
 
-    async def _restart_group(self, failed: Child, reason: ExitReason) -> None:
-        """one_for_all and rest_for_one: stop the others newest first, then start all of them in order."""
-        order = list(self._children.values())
-        group = affected(self._flags.strategy, order, order.index(failed))
-        for one in reversed(group):
-            if one is not failed and one.state != STOPPED:
-                await self._stop(one)
-                if one.spec.restart == "temporary":
-                    self._give_up_address(one, SHUTDOWN)
-        self._start_row(Row(deque(one for one in group if one.spec.id in self._children), reason))
-
-    def _start_row(self, row: Row) -> None:
-        """Start the children of a row; if one takes longer, its siblings wait for it, and we do not (`_start_over`)."""
-        for one in row.waiting:
-            one.state, one.row = RESTARTING, row
-        self._go_on(row)
-
-    def _go_on(self, row: Row) -> None:
-        while row.waiting:
-            one = row.waiting.popleft()
+    async def _restart_group(self, failed: Child, group: list[Child], reason: ExitReason) -> None:
+        """Stop the others newest first, then start all of them in order; siblings wait for one that takes its time."""
+        running = [one for one in group if one is not failed and one.state != STOPPED]
+        row = Row(group, RESTARTING)
+        for one in reversed(running):
             if one.row is not row:
-                continue  # Stopped by hand meanwhile.
+                continue
+            await self._stop(one, row=row)
+            if one.row is row and one.spec.restart == "temporary":
+                self._give_up_address(one, SHUTDOWN)
+        while (other := row.next()) is not None:
+            if self._children.get(other.spec.id) is not other:
+                continue
             try:
-                up = self._launch(one)
-            except StartIgnored:
-                self._ignored(one)
-            except HoldfastError as error:
-                self._attempt_failed(one, error, row)
-                return
-            else:
-                if up is not None:
-                    if one.spec.has_home:
-                        one.state = RECOVERING
-                    one.up = up
-                    up.add_done_callback(functools.partial(self._started, one))
-                    return
-                self._is_up(one)
-            if row.asked is not None:
-                row.asked.handle.reply(one.cell.ref if one.state == UP and one.cell is not None else None)
-
-    def _started(self, one: Child, up: asyncio.Future[None]) -> None:
-        self._post(StartOver(one, up))
-
-    def _attempt_failed(self, one: Child, error: HoldfastError, row: Row) -> None:
-        """A child of the row did not start: the others are stopped, or stay up, until it is tried again."""
-        if row.asked is not None:
-            self._start_failed(one, error)
-            row.asked.failed(error)
-            return
-        for other in row.waiting:
-            if other.row is row:
-                other.state, other.row = STOPPED, None
-        self._start_failed(one, error)
-        self._again(one, row.reason)
+                await self._come_up_in(row, other)
+            except HoldfastError:
+                row.leave()
+                self._again(other, reason)  # The others stay up, or are stopped, until it is tried again.
 
     def _again(self, one: Child, reason: ExitReason) -> None:
         """A start has failed: try once more, which counts."""
@@ -313,99 +395,96 @@ class Supervisor(Inquiries):
         one.retry += 1
         self.ctx.cell.push(Retry(one, one.retry, reason))  # Through our own mailbox: we answer in between.
 
-    def _start_over(self, one: Child, up: asyncio.Future[None]) -> Coroutine[Any, Any, None] | None:
-        """A restart has come to its end, unless the child was stopped meanwhile."""
-        cell, row = one.cell, one.row
-        if one.up is not up or cell is None or row is None:
-            return None
-        one.up = None
-        error = StartFailed(cell.path, "it was killed while it started") if up.cancelled() else up.exception()
-        if isinstance(error, StartIgnored):
-            self._ignored(one)
-        elif error is not None:
-            failure = error if isinstance(error, HoldfastError) else StartFailed(cell.path, str(error))
-            self._attempt_failed(one, failure, row)
-            return None
-        else:
-            self._is_up(one)
-        if row.asked is not None:
-            row.asked.handle.reply(cell.ref if one.state == UP else None)
-        self._go_on(row)
-        if one.state != UP or cell.state is not DOWN:
-            return None
-        life = cell.life  # It ended before we heard that it was up: its end in our queue is passed over.
-        more = self.child_exited(cell, life, cell.extra().reason)
-        one.ignored_life = life
-        return more
-
     # -- stopping ---------------------------------------------------------------------------------------------------
 
-    async def _stop(self, one: Child, reason: ExitReason = SHUTDOWN) -> None:
-        """Stop a child as its spec says; its address and queue stay."""
+    async def _stop(self, one: Child, reason: ExitReason = SHUTDOWN, *, row: Row | None = None) -> None:
+        """Stop a child as its spec says, and wait for its end; its address and queue stay.
+
+        `row` is that with which it will be started again; without one, whoever waits for its start hears that it was
+        stopped.
+        """
         cell = one.cell
         one.retry += 1
-        self._no_answer(one)
-        one.state, one.row = STOPPED, None
+        one.row = row
         starting, one.up = one.up, None
+        state = STOPPED if row is None else RESTARTING
         if cell is None or cell.state is GONE:
+            one.state = state
             return
         one.ignored_life = cell.life  # Also if it has ended just now: its end is in our queue, and is known here.
         if cell.state is not DOWN:
+            one.state = STOPPING
             await one.spec.stop(cell, reason)
         elif starting is not None:
             cell.kill()
-
-    def _no_answer(self, one: Child) -> None:
-        """The child is stopped while somebody waits for its first start."""
-        if one.row is not None and one.row.asked is not None:
-            one.row.asked.handle.fail(StartFailed(self._path_of(one), "it was stopped while it started"))
+        if one.row is row:
+            one.state = state
 
     async def _stop_children(self) -> None:
         """We end: the children go in reverse start order, which need not be the order in which their addresses came."""
         below = list((self.ctx.cell.children or {}).values())
-        children: dict[str, Child] = self.__dict__.get("_children", {})
-        for one in children.values():
-            self._no_answer(one)
+        children = self._listed()
         living = set(below)
-        ours = [one.cell for one in children.values() if one.cell is not None and one.cell in living]
-        places = set(ours)
+        ours = [one for one in children.values() if one.cell is not None and one.cell in living]
+        places = {one.cell for one in ours}
         for cell in reversed(below):  # Others may live below us too: each keeps its place.
-            child = ours.pop() if cell in places else cell
+            one = ours.pop() if cell in places else None
+            child = cell if one is None or one.cell is None else one.cell
+            if one is not None:
+                self._has_ended(one)
             await child.node.stop_child(child)
+
+    def _all_parked(self) -> set[str]:
+        """The children that were stopped by order, and not started since; also if their spec was deleted."""
+        parked: set[str] = self.__dict__.get("_parked", set[str]())
+        return parked
+
+    def _listed(self) -> dict[str, Child]:
+        """The children; none before our start has come so far."""
+        children: dict[str, Child] = self.__dict__.get("_children", {})
+        return children
+
+    def _has_ended(self, one: Child) -> None:
+        """We end: if this child has done so by itself, nobody will come to the notice of it in our queue."""
+        cell = one.cell
+        if cell is not None and cell.state is DOWN and one.state == UP and one.ignored_life < cell.life:
+            self._report_end(one, cell.life, cell.extra().reason)
 
     # -- administration ---------------------------------------------------------------------------------------------
 
     @on(StartChild)
-    async def _start_child(self, message: StartChild) -> Any:
+    def _start_child(self, message: StartChild) -> ReplyHandle[Any]:
         """Add and start a child."""
-        try:
-            spec = self._spec_in(message)
-        except HoldfastError as error:
-            return self._fail(error)
+        return self._answered(self._add(message))
+
+    async def _add(self, message: StartChild) -> Any:
+        spec = self._spec_in(message)
         self._check_free(spec)
         one = Child(spec)
+        return await self._start_by_hand(one, self._enlist, self._unlist, fresh=message.fresh)
+
+    async def _start_by_hand(
+        self, one: Child, enlist: Callable[[Child], None], undo: Callable[[Child], None], *, fresh: bool
+    ) -> Any:
+        """Start a child that somebody waits for; its ref, or None if it did not want to be started."""
+        row = Row((one,), STARTING)
         try:
-            if message.fresh:
+            if fresh:
                 self._erase(one)
-            self._enlist(one)
-            if spec.has_home:
-                return self._start_meanwhile(one, lambda: self._unlist(one))
-            return one.cell.ref if await self._start(one) and one.cell is not None else None
-        except HoldfastError as error:
-            self._unlist(one)
-            return self._fail(error)
+            enlist(one)
+            is_up = await self._come_up_in(row, one)
+        except HoldfastError:
+            undo(one)
+            raise
+        if is_up is None:  # Whoever has stopped it says what becomes of it.
+            raise StartFailed(self._path_of(one), "it was stopped while it started")
+        return one.cell.ref if is_up and one.cell is not None else None
 
     def _unlist(self, one: Child) -> None:
         """A child could not be started for the first time."""
         self._forget(one)
         if one.cell is not None:
             lives.retire(one.cell, "it could not be started")
-
-    def _start_meanwhile(self, one: Child, undo: Callable[[], None]) -> ReplyHandle[Any]:
-        """Start a child that may have much to replay: others are answered meanwhile, the caller when it is up."""
-        handle = self.ctx.reply_handle()
-        self._start_row(Row(deque([one]), SHUTDOWN, Asked(handle, undo)))
-        return handle
 
     def _enlist(self, one: Child) -> None:
         """A child is to be started for the first time. Raises HoldfastError if that cannot be."""
@@ -430,31 +509,42 @@ class Supervisor(Inquiries):
         return spec
 
     @on(TerminateChild)
-    async def _terminate_child(self, message: TerminateChild) -> None:
-        """Stop a child; a pending restart is void."""
+    def _terminate_child(self, message: TerminateChild) -> ReplyHandle[Any]:
+        """Stop a child; a pending restart is void, and a start that is under way fails."""
+        return self._answered(self._terminate(message))
+
+    async def _terminate(self, message: TerminateChild) -> None:
         one = self._child(message.id)
-        row = one.row if one.up is not None else None
         reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
+        if message.parks:
+            self._parked.add(one.spec.id)
         await self._stop(one, reason)
-        self._give_up_address(one, reason)
-        if row is not None:  # Its later siblings have waited for it.
-            self._go_on(row)
+        if one.row is None:  # Else it is started again with others meanwhile.
+            self._give_up_address(one, reason)
 
     @on(RestartChild)
-    async def _restart_child(self, message: RestartChild) -> Any:
-        """Start a stopped child again."""
+    def _restart_child(self, message: RestartChild) -> ReplyHandle[Any]:
+        """Start a stopped child again, or, if that is wanted, one that runs."""
+        return self._answered(self._begin_again(message))
+
+    async def _begin_again(self, message: RestartChild) -> Any:
         one = self._child(message.id)
+        if message.unless_parked and message.id in self._parked:
+            raise ChildParked(message.id)
+        self._parked.discard(message.id)
+        if message.running and one.state == UP:
+            row = Row((one,), RESTARTING)
+            await self._stop(one, row=row)
+            if one.row is not row:  # Whoever has it now says what becomes of it.
+                raise StartFailed(self._path_of(one), "it was stopped, or started by somebody else, meanwhile")
+            one.state = STOPPED
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
-        try:
-            if message.fresh:
-                self._erase(one)
-            if one.spec.has_home:
-                return self._start_meanwhile(one, lambda: self._give_up_address(one, "it could not be started"))
-            return one.cell.ref if await self._start(one) and one.cell is not None else None
-        except HoldfastError as error:
+
+        def undo(one: Child) -> None:
             self._give_up_address(one, "it could not be started")
-            return self._fail(error)
+
+        return await self._start_by_hand(one, lambda one: None, undo, fresh=message.fresh)
 
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
@@ -492,3 +582,14 @@ class Supervisor(Inquiries):
     def _specs(self) -> tuple[ChildSpec, ...]:
         """The specs as they are now."""
         return tuple(one.spec for one in self._children.values())
+
+
+def kill_starting(top: Cell) -> None:
+    """Kill all that are starting below an actor; a supervisor in this process ends by itself, for it answers."""
+    for cell in list((top.children or {}).values()):
+        above = top.actor
+        one = above._listed().get(cell.name) if isinstance(above, Supervisor) else None
+        if cell.actor is not None and isinstance(cell.actor, Supervisor):
+            kill_starting(cell)
+        elif one is not None and one.up is not None and not one.up.done():
+            cell.kill()

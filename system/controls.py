@@ -40,6 +40,7 @@ from .moving import Moves, check_isolation
 
 if TYPE_CHECKING:
     from ..actors.node import Node
+    from ..ftm.protected import ProtectionStatus
 
 A = TypeVar("A", bound=Actor)
 
@@ -118,7 +119,7 @@ class Controls:
             next_start(cell, start, keeps_arguments=keeps)  # What cannot be is refused before anything is done.
         recipe = await self._replace(ref, ReplaceCode(start, keeps, migrate), timeout)
         if recipe is not None:
-            start = unpack_recipe(recipe)
+            start = unpack_recipe(recipe, imports=False)
             cell.table = start.kind._table
             if cell.more is not None and cell.more.tap is not None:
                 cell.more.tap.attach()
@@ -145,6 +146,15 @@ class Controls:
             links=own.links,
             monitors=own.monitors,
         )
+
+    async def protection(self, ref: ActorRef[Any], *, timeout: float = DEFAULT_TIMEOUT) -> ProtectionStatus:
+        """Whether an actor is protected by mechanisms now, by which, who leads, and whether a replica may die.
+
+        It is what the root knows at this moment. (`timeout` is as for the other questions; nobody is asked.)
+        """
+        from ..ftm.protected import protection_of
+
+        return protection_of(self._living(ref))
 
     async def statistics(
         self, ref: ActorRef[Any], on: bool | None = None, *, timeout: float = DEFAULT_TIMEOUT

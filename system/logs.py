@@ -1,15 +1,18 @@
-"""Events as structlog records, with a limit on floods."""
+"""Events as log records: one for each crash, however many events tell of it, and a limit on floods."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import asyncio
+import logging
+import sys
+from typing import Any
 
-from ..actors.errors import type_name
+from ..actors.errors import portable
 from ..actors.events import (
     ActorCrashed,
     AutoShutdown,
-    ChildRestarted,
     ChildStartFailed,
+    ChildTerminated,
     DeadLetter,
     Event,
     HeldMessages,
@@ -26,6 +29,7 @@ from ..actors.events import (
     Recovered,
     RecoveryFailed,
     RecoveryHookFailed,
+    RecoveryTableUnused,
     RolledBack,
     SafeStateEntered,
     SafeStateKept,
@@ -34,42 +38,113 @@ from ..actors.events import (
     SafeStateOverdue,
     ShutdownError,
     SnapshotFailed,
+    StopOverdue,
     StoreRefused,
     SupervisorGaveUp,
+    TrustBreached,
 )
 from ..actors.exits import Crash
-from ..actors.node import message_of
+from ..actors.mail import Item, item_name
+from ..actors.message import Message, MessageText, message_of
 from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
 
 BURST = 10
 """Records of one kind within a second; what is more is counted and told with the next one."""
+WAIT = 1.0
+"""Seconds after a crash in which its supervisor is expected to say what it knows of it."""
+
+LOGGER = "holdfast"
+"""The name of the logger."""
+
+Fields = dict[str, Any]
 
 
 class LogSink:
-    """Writes what an operator wants to see; formats only what is written."""
+    """Writes what an operator wants to see; formats only what is written.
 
-    def __init__(self, system: str, clock: Callable[[], float]) -> None:
-        import structlog  # only now: it is a third of the time that importing holdfast would take
+    A crash is told by several events: the actor's, that of its process, and its supervisor's. The record waits for the
+    last of them, at most `WAIT` seconds.
 
-        self._log = structlog.get_logger("holdfast", system=system)
-        self._clock = clock  # the loop's
+    Args:
+        system: the system's name.
+        log_payloads: write what was in the message that an actor has crashed in, too.
+    """
+
+    def __init__(self, system: str, loop: asyncio.AbstractEventLoop, *, log_payloads: bool = False) -> None:
+        self._system, self._loop, self._log_payloads = system, loop, log_payloads
         self._second: dict[type, tuple[int, int]] = {}
+        self._crashes: dict[str, tuple[Event, asyncio.TimerHandle]] = {}  # by address: what waits for its supervisor
 
     def __call__(self, event: Event) -> None:
-        level = LEVELS.get(type(event))
-        if level is None or (isinstance(event, ProcessDied) and event.reason.is_clean):
-            return
-        left_out = 0 if type(event) is LogLine else self._admit(type(event))
+        match event:
+            case ActorCrashed():
+                self._hold(event)
+            case ProcessDied(reason=reason):
+                if not reason.is_clean and not self._is_told_by_crash(event):
+                    self._hold(event)
+            case ChildTerminated():
+                self._write(self._crash_at(event.address) or event, restarts=event.restarts, allowed=event.allowed)
+            case ChildStartFailed():
+                crash = self._crash_at(event.address)
+                self._write(event, **({} if crash is None else self._describe(crash)))
+            case _ if type(event) in WRITTEN:
+                self._write(event)
+            case _:
+                pass
+
+    def close(self) -> None:
+        """Write what still waits."""
+        for address in list(self._crashes):
+            self._release(address)
+
+    # -- crashes ----------------------------------------------------------------------------------------------------
+
+    def _hold(self, event: Event) -> None:
+        """Wait for the supervisor's word."""
+        self._release(event.address)
+        self._crashes[event.address] = event, self._loop.call_later(WAIT, self._release, event.address)
+
+    def _is_told_by_crash(self, died: ProcessDied) -> bool:
+        """Whether the process died of the crash that we know already."""
+        held = self._crashes.get(died.address)
+        return held is not None and isinstance(held[0], ActorCrashed) and str(held[0].reason) == str(died.reason)
+
+    def _crash_at(self, address: str) -> Event | None:
+        """The crash that waits, which need not do so any longer."""
+        event, timer = self._crashes.pop(address, (None, None))
+        if timer is not None:
+            timer.cancel()
+        return event
+
+    def _release(self, address: str) -> None:
+        """The supervisor has not said anything: there is none, or it ends itself."""
+        crash = self._crash_at(address)
+        if crash is not None:
+            self._write(crash)
+
+    # -- records ----------------------------------------------------------------------------------------------------
+
+    def _write(self, event: Event, **more: object) -> None:
+        kind = type(event)
+        left_out = 0 if kind is LogLine else self._admit(kind)
         if left_out is None:
             return
-        fields = describe(event)
+        level, name = WRITTEN[kind]
+        fields: Fields = {**self._describe(event), **more, "system": self._system}
         if left_out:
             fields["left_out"] = left_out
-        getattr(self._log, level)(NAMES[type(event)], **fields)
+        structlog = _structlog()
+        if structlog is None:
+            _write_standard(level, name, fields)
+        else:
+            structlog.get_logger(LOGGER).log(level, name, **fields)
+
+    def _describe(self, event: Event) -> Fields:
+        return describe(event, payloads=self._log_payloads)
 
     def _admit(self, kind: type) -> int | None:
         """None: this second has had its records. Else how many were left out before."""
-        second = int(self._clock())
+        second = int(self._loop.time())
         then, count = self._second.get(kind, (second, 0))
         if then != second:
             self._second[kind] = (second, 1)
@@ -78,89 +153,89 @@ class LogSink:
         return 0 if count < BURST else None
 
 
-LEVELS: dict[type, str] = {
-    ActorCrashed: "error",
-    HookFailed: "error",
-    LifeAbandoned: "error",
-    DeadLetter: "warning",
-    ChildRestarted: "warning",
-    ChildStartFailed: "error",
-    ShutdownError: "warning",
-    AutoShutdown: "info",
-    SupervisorGaveUp: "error",
-    ProcessDied: "warning",
-    Recovered: "info",
-    RecoveryFailed: "error",
-    RecoveryHookFailed: "error",
-    SafeStateEntered: "warning",
-    SafeStateMissed: "error",
-    SafeStateLeft: "info",
-    SafeStateKept: "error",
-    SafeStateOverdue: "error",
-    HeldMessages: "warning",
-    RolledBack: "error",
-    MessageQuarantined: "error",
-    SnapshotFailed: "error",
-    JournalFull: "warning",
-    JournalBlocked: "error",
-    JournalGoesOn: "info",
-    JournalStopped: "critical",
-    StoreRefused: "error",
-    LogLine: "info",
-    Moved: "info",
-    ScriptLoaded: "info",
-    TransactionCommitted: "info",
-    TransactionRolledBack: "warning",
+WRITTEN: dict[type, tuple[int, str]] = {
+    ActorCrashed: (logging.ERROR, "actor crashed"),
+    ChildTerminated: (logging.WARNING, "child ended"),
+    HookFailed: (logging.ERROR, "hook failed"),
+    LifeAbandoned: (logging.ERROR, "life abandoned"),
+    DeadLetter: (logging.WARNING, "dead letter"),
+    ChildStartFailed: (logging.ERROR, "child not started"),
+    ShutdownError: (logging.WARNING, "shutdown error"),
+    StopOverdue: (logging.ERROR, "stop overdue"),
+    TrustBreached: (logging.ERROR, "trust breached"),
+    AutoShutdown: (logging.INFO, "auto shutdown"),
+    SupervisorGaveUp: (logging.ERROR, "supervisor gave up"),
+    ProcessDied: (logging.WARNING, "process died"),
+    Recovered: (logging.INFO, "actor recovered"),
+    RecoveryFailed: (logging.ERROR, "recovery failed"),
+    RecoveryHookFailed: (logging.ERROR, "recovery hook failed"),
+    RecoveryTableUnused: (logging.WARNING, "recovery table unused"),
+    SafeStateEntered: (logging.WARNING, "safe state entered"),
+    SafeStateMissed: (logging.ERROR, "safe state missed"),
+    SafeStateLeft: (logging.INFO, "safe state left"),
+    SafeStateKept: (logging.ERROR, "safe state kept"),
+    SafeStateOverdue: (logging.ERROR, "safe state overdue"),
+    HeldMessages: (logging.WARNING, "messages held"),
+    RolledBack: (logging.ERROR, "rolled back"),
+    MessageQuarantined: (logging.ERROR, "message quarantined"),
+    SnapshotFailed: (logging.ERROR, "snapshot failed"),
+    JournalFull: (logging.WARNING, "journal full"),
+    JournalBlocked: (logging.ERROR, "journal blocked"),
+    JournalGoesOn: (logging.INFO, "journal goes on"),
+    JournalStopped: (logging.CRITICAL, "journal stopped"),
+    StoreRefused: (logging.ERROR, "store refused"),
+    LogLine: (logging.INFO, "output"),
+    Moved: (logging.INFO, "actor moved"),
+    ScriptLoaded: (logging.INFO, "code loaded"),
+    TransactionCommitted: (logging.INFO, "transaction committed"),
+    TransactionRolledBack: (logging.WARNING, "transaction rolled back"),
 }
-NAMES: dict[type, str] = {
-    ActorCrashed: "actor crashed",
-    HookFailed: "hook failed",
-    LifeAbandoned: "life abandoned",
-    DeadLetter: "dead letter",
-    ChildRestarted: "child restarted",
-    ChildStartFailed: "child not started",
-    ShutdownError: "shutdown error",
-    AutoShutdown: "auto shutdown",
-    SupervisorGaveUp: "supervisor gave up",
-    ProcessDied: "process died",
-    Recovered: "actor recovered",
-    RecoveryFailed: "recovery failed",
-    RecoveryHookFailed: "recovery hook failed",
-    SafeStateEntered: "safe state entered",
-    SafeStateMissed: "safe state missed",
-    SafeStateLeft: "safe state left",
-    SafeStateKept: "safe state kept",
-    SafeStateOverdue: "safe state overdue",
-    HeldMessages: "messages held",
-    RolledBack: "rolled back",
-    MessageQuarantined: "message quarantined",
-    SnapshotFailed: "snapshot failed",
-    JournalFull: "journal full",
-    JournalBlocked: "journal blocked",
-    JournalGoesOn: "journal goes on",
-    JournalStopped: "journal stopped",
-    StoreRefused: "store refused",
-    LogLine: "output",
-    Moved: "actor moved",
-    ScriptLoaded: "code loaded",
-    TransactionCommitted: "transaction committed",
-    TransactionRolledBack: "transaction rolled back",
-}
+"""Level and name of the record that an event becomes; others are not written."""
 
 
-def describe(event: Event) -> dict[str, object]:
-    """An event's fields as text and numbers."""
-    fields: dict[str, object] = {}
+CRASHES = (ActorCrashed, ProcessDied, HookFailed, ShutdownError)
+"""Events that tell of a crash first; what others make of it they tell without its traceback."""
+
+
+def describe(event: Event, *, payloads: bool = False) -> Fields:
+    """An event's fields as text and numbers; of messages the type, and with `payloads` also what is in them."""
+    fields: Fields = {}
     for name in event.__struct_fields__:
         value = getattr(event, name)
-        if name in ("item", "message") and not isinstance(value, str):
-            message = message_of(value)
-            fields["message"] = type_name(type(value if message is None else message))
+        if isinstance(value, (Message, Item, MessageText)):
+            fields["message"] = item_name(value)
+            if payloads:
+                message = message_of(value)
+                fields["payload"] = portable(str(value if message is None else message))
         elif isinstance(value, Crash):
             fields[name] = str(value)
-            fields["traceback"] = value.traceback
+            if isinstance(event, CRASHES):
+                fields["exception"] = value.traceback
         elif isinstance(value, (int, float, dict)):
             fields[name] = value
         else:
             fields[name] = str(value)
     return fields
+
+
+def _structlog() -> Any:
+    """structlog, if the program has set it up, or has set up no logging at all: then it writes to the terminal."""
+    if "structlog" not in sys.modules and logging.getLogger(LOGGER).hasHandlers():
+        return None
+    import structlog  # only now: it is a third of the time that importing holdfast would take
+
+    return structlog if structlog.is_configured() or not logging.getLogger(LOGGER).hasHandlers() else None
+
+
+def _write_standard(level: int, name: str, fields: Fields) -> None:
+    """A record of standard logging: the traceback stands where handlers expect it, the fields in `record.holdfast`."""
+    logger = logging.getLogger(LOGGER)
+    if not logger.isEnabledFor(level):
+        return
+    shown = " ".join(f"{key}={value!r}" for key, value in fields.items() if key != "exception")
+    text = f"{name} {shown}"
+    record = logger.makeRecord(
+        LOGGER, level, __file__, 0, text, (), None, extra={"holdfast": {"event": name, **fields}}
+    )
+    record.exc_text = str(fields.get("exception", "")).rstrip() or None
+    logger.handle(record)

@@ -58,7 +58,7 @@ class Moves:
         )
         self._tasks.add(task)
         task.add_done_callback(self._over)
-        await asyncio.shield(task)
+        await to_its_end(cell.path, task)
 
     def _over(self, task: asyncio.Task[None]) -> None:
         self._tasks.discard(task)
@@ -197,7 +197,7 @@ class Moves:
         self._tasks.add(task)
         task.add_done_callback(self._over)
         task.add_done_callback(lambda done: change.close())  # It may never have begun.
-        await asyncio.shield(task)
+        await to_its_end(cell.path, task)
 
     async def _settle_in(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
         spec = _spec_there(cell, isolation, limits)
@@ -253,6 +253,21 @@ def check_isolation(isolation: object, limits: object, timeout: object) -> None:
         raise SpecError("set_isolation", f"limits must be Limits(...), of a process, or left out, not {limits!r}")
     if not isinstance(timeout, (int, float)) or isinstance(timeout, bool) or not 0 < timeout < float("inf"):
         raise SpecError("set_isolation", f"timeout must be a number of seconds > 0, not {timeout!r}")
+
+
+async def to_its_end(actor: str, change: asyncio.Future[None]) -> None:
+    """Wait for a change of where an actor lives, which goes on if whoever waits is cancelled.
+
+    Raises:
+        CannotMove: it was cancelled, for the system ends; nobody has cancelled whoever waits.
+        CancelledError: whoever waits was.
+    """
+    try:
+        await asyncio.shield(change)
+    except asyncio.CancelledError:
+        if change.cancelled():
+            raise CannotMove(actor, "the system ends") from None
+        raise
 
 
 def _spec_of(cell: Cell) -> ChildSpec:

@@ -8,13 +8,14 @@ import sys
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
-import uvloop
-
 T = TypeVar("T")
 
 
 def run(main: Coroutine[Any, Any, T], *, debug: bool | None = None) -> T:
     """Run a coroutine on uvloop, like `asyncio.run`; SIGTERM and SIGINT cancel it, so that systems stop in order.
+
+    Where there is no uvloop it is run on asyncio's own loop. Where loops handle no signals, which is on Windows, SIGINT
+    cancels it, too, and SIGTERM ends the process at once.
 
     Raises:
         KeyboardInterrupt: it was ended by SIGINT.
@@ -30,15 +31,22 @@ def run(main: Coroutine[Any, Any, T], *, debug: bool | None = None) -> T:
             stopped_by.append(number)
             task.cancel()
 
-        for number in (signal.SIGTERM, signal.SIGINT):
-            loop.add_signal_handler(number, stop, number)
+        handled: list[signal.Signals] = []
+        try:
+            for number in (signal.SIGTERM, signal.SIGINT):
+                loop.add_signal_handler(number, stop, number)
+                handled.append(number)
+        except NotImplementedError:
+            pass  # On Windows `asyncio.Runner` cancels the coroutine on SIGINT.
         try:
             return await main
         finally:
-            for number in (signal.SIGTERM, signal.SIGINT):
+            for number in handled:
                 loop.remove_signal_handler(number)
 
-    with asyncio.Runner(debug=debug, loop_factory=uvloop.new_event_loop) as runner:
+    from ..actors.fast_loop import new_event_loop  # only now: importing holdfast does not import uvloop
+
+    with asyncio.Runner(debug=debug, loop_factory=new_event_loop) as runner:
         try:
             return runner.run(guarded())
         except asyncio.CancelledError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import inspect
@@ -9,7 +10,8 @@ import os
 import stat
 import sys
 import types
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Generator, Sequence
+from importlib.machinery import ModuleSpec
 from pathlib import Path
 from typing import Any
 
@@ -118,23 +120,85 @@ def check_folders(folder: Path, owners: set[int], *, may_share: bool = False) ->
         check_owner(str(one), info, allowed)
 
 
+def find_beside(source: Source) -> None:
+    """Let modules be found in the folder of a script too, after all others, so that it can hide none of them."""
+    folder = str(Path(source.path).parent)
+    if folder not in sys.path:
+        sys.path.append(folder)
+
+
+@contextlib.contextmanager
+def guarded_imports(tell: Callable[[str, str], None], beside: tuple[str, ...] = ()) -> Generator[None, None, None]:
+    """While the block runs, modules are imported only from files of this user, or root's, that nobody else may write.
+
+    Args:
+        tell: is told path and sha256 of each.
+        beside: folders that are not looked into, such as those of the interpreter itself.
+
+    Raises (in the import):
+        UntrustedFile: somebody else could have written it.
+    """
+    guard = _Guard(tell, beside)
+    sys.meta_path.insert(0, guard)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(guard)
+
+
+class _Guard:
+    """Stands before all other finders, and looks at what they find."""
+
+    def __init__(self, tell: Callable[[str, str], None], beside: tuple[str, ...]) -> None:
+        self._tell, self._beside = tell, beside
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: types.ModuleType | None = None
+    ) -> ModuleSpec | None:
+        """The module's spec as the others find it. Raises UntrustedFile."""
+        for finder in sys.meta_path:
+            found = None if finder is self else finder.find_spec(name, path, target)
+            if found is not None:
+                if found.has_location and found.origin is not None:
+                    self._look(found.origin)
+                return found
+        return None
+
+    def _look(self, origin: str) -> None:
+        full, owner = Path(os.path.realpath(origin)), os.geteuid()
+        if any(full.is_relative_to(one) for one in self._beside):
+            return
+        try:
+            check_owner(str(full), os.stat(full), {owner, 0})
+            check_folders(full.parent, {owner, 0})
+            self._tell(str(full), hashlib.sha256(full.read_bytes()).hexdigest())
+        except OSError as error:
+            raise UntrustedFile(origin, error.strerror or str(error)) from error
+
+
+def _tell_nobody(path: str, sha256: str) -> None:
+    """Who runs a script from the command line sees what it does."""
+
+
 def load_source(source: Source) -> types.ModuleType:
-    """Run the source as a module, once in a process.
+    """Run the source as a module, once in a process. What it imports may lie beside it.
 
     Raises:
-        SpecError: it raised.
+        SpecError: it raised. UntrustedFile: it imports a file that somebody else could have written.
     """
     known = sys.modules.get(source.module)
     if known is not None:
         return known
+    find_beside(source)
     module = types.ModuleType(source.module)
     module.__file__ = source.path
     sys.modules[source.module] = module  # Before it runs: its classes are looked up by this name.
     try:
-        exec(compile(source.data, source.path, "exec"), module.__dict__)
+        with guarded_imports(_tell_nobody, (sys.prefix, sys.base_prefix)):
+            exec(compile(source.data, source.path, "exec"), module.__dict__)
     except BaseException as error:
         del sys.modules[source.module]
-        if not isinstance(error, Exception):
+        if not isinstance(error, Exception) or isinstance(error, UntrustedFile):
             raise
         raise SpecError(source.path, f"{type_name(type(error))}: {error_text(error)}") from error
     return module

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 from collections.abc import Sequence
 from types import TracebackType
@@ -13,7 +14,7 @@ from ..actors.actor import Actor, Start
 from ..actors.cell import Cell, Host
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
-from ..actors.events import EventStream
+from ..actors.events import EventStream, RecoveryTableUnused
 from ..actors.exits import SHUTDOWN, ExitReason, pack_exit
 from ..actors.lives import LOCAL
 from ..actors.mailbox import Bounded
@@ -22,7 +23,7 @@ from ..actors.node import Node, cell_kind
 from ..actors.process.remote import ProcessHost, on_frame
 from ..actors.process.workers import Workers
 from ..actors.ref import ActorRef, current
-from ..actors.topics import NOT_TAKEN
+from ..actors.topics import publish
 from ..actors.watch import LoopWatch, check_limits
 from ..checkpoint.controller import RecordedProcessHost, TaskHost
 from ..checkpoint.file import RecoveryFile, load_recovery
@@ -34,12 +35,14 @@ from ..checkpoint.recovery.settings import RecoveryHooks
 from ..checkpoint.stores import check_durability, check_system, open_journal
 from ..checkpoint.subtree import Lived, SubtreeHome, SubtreeHost
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
+from ..supervision.patience import end_within
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
-from ..supervision.supervisor import Supervisor
+from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
 from .logs import LogSink
 from .moving import Moves
+from .portal import ThreadPortal
 from .protection import Protection, check_no_part
 from .recorded import Recorded
 from .recovery import RecoveryTree
@@ -54,11 +57,13 @@ BASE = (f"{__package__}.guest_main",)
 
 REPLICA = f"{__name__.rpartition('.')[0].rpartition('.')[0]}.ftm.replica"
 """What the processes of replicas import beforehand."""
+PATIENCE = 10.0
+"""Seconds after which a table of the recovery file should have found somebody whom it is for."""
 ADMIN_TIMEOUT = 60.0
-"""Seconds an admin call of the system may take: starting a child can mean restoring a large state."""
+"""Seconds an admin call of the system may take that starts and stops nobody."""
 
-STOP_TIMEOUT = 365 * 86_400.0
-"""Seconds `stop` waits: no limit of its own, the child specs say how long an end may take."""
+LONG = 365 * 86_400.0
+"""Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""
 
 
 class ActorSystem(Recorded, Controls):
@@ -73,7 +78,9 @@ class ActorSystem(Recorded, Controls):
             Each child may say otherwise: `hybrid(durability=...)`.
         intensity, period: how many restarts of its direct children the root allows before the tree fails.
         preload: modules the fork server imports beforehand, besides those of the actors it starts.
-        log: write events to structlog (crashes, restarts, dead letters, output of processes).
+        log: write crashes, dead letters, output of processes and the like to structlog or standard logging, whichever
+            the program has set up (docs/operating.md).
+        log_payloads: write what was in the message that an actor has crashed in; else only its type is written.
         seed: for `ctx.random` of actors without a journal; random if left out.
         watch_lag: tell (LoopLagged) when this process's event loop comes later than this many seconds.
         watch_turns: tell (TurnSlow) of turns in this process that occupy the loop for longer than this many seconds.
@@ -96,6 +103,7 @@ class ActorSystem(Recorded, Controls):
         period: float = 5.0,
         preload: Sequence[str] = (),
         log: bool = True,
+        log_payloads: bool = False,
         seed: int | None = None,
         takeover: bool = False,
         watch_lag: float | None = None,
@@ -111,7 +119,8 @@ class ActorSystem(Recorded, Controls):
         self._durability: Durability | None = check_durability(store, durability)
         self._takeover = takeover
         self._preload = tuple(preload)
-        self._log = log
+        self._log, self._log_payloads = log, log_payloads
+        self._sink: LogSink | None = None
         self._seed = seed
         if recovery_hooks is not None and not isinstance(recovery_hooks, RecoveryHooks):
             raise SpecError(
@@ -127,6 +136,7 @@ class ActorSystem(Recorded, Controls):
         self._failure: TreeFailed | None = None
         self._stopping: set[asyncio.Task[None]] = set()
         self._transactions = Transactions()
+        self._patience: asyncio.TimerHandle | None = None
 
     # -- life -------------------------------------------------------------------------------------------------------
 
@@ -141,15 +151,17 @@ class ActorSystem(Recorded, Controls):
         engine = open_journal(self._store, takeover=self._takeover)
         try:
             check_system(engine, self.name)
+            self._homes = Homes(node, engine, durability=self._durability)
         except HoldfastError:
-            engine.close()
+            with contextlib.suppress(HoldfastError):  # What it says now is only what follows from that.
+                engine.close()
             raise
-        self._homes = Homes(node, engine, durability=self._durability)
         self._homes.recoveries.hooks = self._recovery_hooks
         self._recovery = RecoveryTree(node, self._homes)
         self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
         if file is not None:
             self._homes.file, node.complete = file, file.complete
+            self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
         node.host_for = self._host_for
         self._moves = Moves(node, self._workers)
         node.respec = respec
@@ -159,10 +171,11 @@ class ActorSystem(Recorded, Controls):
         node.outside = self.moved_addresses.find
         node.keeper = self._homes
         if self._log:
-            node.events.add_sink(LogSink(self.name, node.loop.time))
-        self.protection = Protection(self._homes)
-        if self.protection.is_needed:
-            node.complete = self.protection.completing(node.complete)
+            self._sink = LogSink(self.name, node.loop, log_payloads=self._log_payloads)
+            node.events.add_sink(self._sink)
+        self.mechanism_notes = Protection(self._homes)
+        if self.mechanism_notes.is_needed:
+            node.complete = self.mechanism_notes.completing(node.complete)
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
         up = lives.begin(root, Start(Supervisor, (self._flags, ())))
@@ -198,12 +211,18 @@ class ActorSystem(Recorded, Controls):
                 await asyncio.shield(self._closing)
             except asyncio.CancelledError as error:
                 cancelled = error
+                kill_starting(root)  # But those that are not even there yet are not waited for.
         self._closing.result()
         if cancelled is not None:
             raise cancelled
 
     async def _close(self, root: Cell, node: Node) -> None:
-        await stopping.stop_and_wait(root)
+        gone = stopping.stop_and_wait(root)
+        end_within(root, gone)
+        await gone
+        if self._patience is not None:
+            self._patience.cancel()
+            self._tell_unused()
         await self._moves.close()
         if node.remains:
             await asyncio.wait(set(node.remains))
@@ -211,9 +230,13 @@ class ActorSystem(Recorded, Controls):
         await self._workers.close()
         await node.close()
         await self._homes.settled()
-        self._homes.close()
-        node.deadlines.close()
-        node.events.close()
+        try:
+            self._homes.close()
+        finally:
+            node.deadlines.close()
+            node.events.close()
+            if self._sink is not None:
+                self._sink.close()
 
     def _host_for(self, spec: ChildSpec) -> Host:
         """Where a child's lives are lived."""
@@ -265,6 +288,12 @@ class ActorSystem(Recorded, Controls):
             self._workers.want(name)
         return group
 
+    def _tell_unused(self) -> None:
+        """Tell of tables of the recovery file that are for nobody so far: perhaps their names are misspelt."""
+        file = self._homes.file
+        for table, where in file.take_unmet() if file is not None else ():
+            self.node.emit(RecoveryTableUnused(f"/{self.name}", table, where))
+
     def _root_ended(self, done: asyncio.Future[ExitReason]) -> None:
         """The root supervisor is gone: if nobody asked for that, the body must hear of it."""
         if self._body is None or done.cancelled():
@@ -286,7 +315,11 @@ class ActorSystem(Recorded, Controls):
             raise HoldfastError(f"system {self.name!r} is not running: use it in `async with`")
         return self._node
 
-    async def start(self, spec: ChildSpec, *, fresh: bool = False) -> ActorRef[Any]:
+    def from_thread(self) -> ThreadPortal:
+        """A handle for other threads, such as those in which a web framework runs its plain `def` endpoints."""
+        return ThreadPortal(self.node)
+
+    async def start(self, spec: ChildSpec[A], *, fresh: bool = False) -> ActorRef[A]:
         """Start a child of the root, and wait until it is up; None instead of a ref if it raised `Ignore`.
 
         With `fresh` nothing comes back that was recorded at its address, or below it, before.
@@ -297,7 +330,7 @@ class ActorSystem(Recorded, Controls):
         if not isinstance(spec, ChildSpec):
             raise SpecError("start", f"takes child(...) or supervisor(...), not {spec!r}")
         root = self._root_ref()
-        return cast("ActorRef[Any]", await root.ask(StartChild(spec, fresh=fresh), ADMIN_TIMEOUT))
+        return cast("ActorRef[A]", await root.ask(StartChild(spec, fresh=fresh), LONG))
 
     def spawn(self, start: Start[A], name: str | None = None, *, mailbox: Bounded | None = None) -> ActorRef[A]:
         """Start an actor that nobody restarts, in this process, at once (its `on_start` is its first turn).
@@ -347,7 +380,7 @@ class ActorSystem(Recorded, Controls):
         if parent is not None and is_supervised(cell, parent):
             supervisor = ActorRef[Supervisor](parent)
             try:
-                await supervisor.ask(TerminateChild(cell.name, pack_exit(reason)), STOP_TIMEOUT)
+                await supervisor.ask(TerminateChild(cell.name, pack_exit(reason)), LONG)
                 await supervisor.ask(DeleteChild(cell.name, erase=False), ADMIN_TIMEOUT)
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
@@ -426,12 +459,8 @@ class ActorSystem(Recorded, Controls):
         return cell.ref
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
-        """Send to every subscriber of a topic; waits for room at bounded ones."""
-        for cell in self.node.topics.subscribers(topic):
-            try:
-                await cell.ref.send(message)
-            except NOT_TAKEN as error:
-                self.node.not_taken(cell, message, error)
+        """Send to every subscriber of a topic, and return when each has accepted; it waits for room at bounded ones."""
+        await publish(self.node, topic, message, lambda cell: cell.ref.send(message))
 
     def bind(self, ref: ActorRef[Any], port: str, target: ActorRef[Any]) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on. Raises SpecError."""

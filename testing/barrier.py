@@ -8,19 +8,26 @@ and each actor process has handled what it was sent and said what it had to say.
 from __future__ import annotations
 
 import asyncio
+import contextlib
+from collections.abc import AsyncGenerator, Iterable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
 
 from ..actors.errors import HoldfastError
+from ..actors.loop import RunLoop
+from ..actors.message import message_of
 from ..actors.process import frames
 from ..actors.process.remote import Outlet
 from ..actors.process.workers import Worker
+from ..actors.timers import Timer
 from ..checkpoint.outputs import switch_of
 from ..checkpoint.records import STASHED
 from ..checkpoint.switch import Switch
+from .clock import VirtualClockLoop
 
 if TYPE_CHECKING:
+    from ..actors.cell import Cell
     from ..actors.node import Node
     from ..system.system import ActorSystem
 
@@ -29,19 +36,50 @@ TIMEOUT = 10.0
 QUIET = 3
 """Ticks of the loop in a row in which nothing moves: a callback that is due now may still wake somebody."""
 NIL = msgspec.Raw(msgspec.msgpack.encode(None))
+SHOWN = 8
+"""Of those who move, so many are named."""
 PING = "holdfast.testing:Ping"
 """A message name that nobody has: the refusal comes back behind everything that was said before."""
 
 
 class NotIdle(HoldfastError, TimeoutError):
-    """The system did not come to rest; `busy` says what still moved."""
+    """What was waited for did not come to rest: `after` so much of something; `busy` says what still moved."""
 
-    def __init__(self, timeout: float, busy: tuple[str, ...]) -> None:
-        super().__init__(timeout, busy)
-        self.timeout, self.busy = timeout, busy
+    def __init__(self, after: str, busy: tuple[str, ...]) -> None:
+        super().__init__(after, busy)
+        self.after, self.busy = after, busy
 
     def __str__(self) -> str:
-        return f"not idle after {self.timeout:g} s: {'; '.join(self.busy) or 'something came up each time'}"
+        return f"not idle after {self.after}: {'; '.join(self.busy) or 'something came up each time'}"
+
+
+@contextlib.asynccontextmanager
+async def patience(timeout: float | None, node: Node | None = None) -> AsyncGenerator[None]:
+    """`asyncio.timeout` that ends also when virtual time does not go on: a clock that stands still times nothing out.
+
+    Raises:
+        TimeoutError: the seconds are over. NotIdle: virtual time stood still.
+    """
+    loop, own = asyncio.get_running_loop(), asyncio.current_task()
+    stood_still: list[NotIdle] = []
+    try:
+        async with asyncio.timeout(timeout) as limit:
+            if not isinstance(loop, VirtualClockLoop):
+                yield
+                return
+
+            def expire(why: str) -> None:
+                error = loop.restless(why)
+                if not stood_still and not limit.expired():
+                    stood_still.append(NotIdle(why, tuple(_busy(node, own)) or error.busy))
+                    limit.reschedule(loop.time())
+
+            with loop.hears_of_standstill(expire):
+                yield
+    except TimeoutError:
+        if stood_still:
+            raise stood_still[0] from None
+        raise
 
 
 async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
@@ -54,17 +92,20 @@ async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
             but those in other processes are: nobody sees from here what they wait for.
 
     Raises:
-        NotIdle: it went on all that time; one task at a time may wait for this.
+        NotIdle: it went on all that time, or without end at one moment of virtual time; one task at a time may wait
+            for this.
     """
     node = system.node
     try:
-        async with asyncio.timeout(timeout):
+        async with patience(timeout, node):
             while True:
                 await quiet(node)
                 if not await _hear(system):
                     return
+    except NotIdle:
+        raise
     except TimeoutError:
-        raise NotIdle(timeout, tuple(_busy(node) + _waiting(system))) from None
+        raise NotIdle(f"{timeout:g} s", tuple(_busy(node) + _waiting(system))) from None
 
 
 async def quiet(node: Node | None = None) -> None:
@@ -75,14 +116,39 @@ async def quiet(node: Node | None = None) -> None:
         calm = 0 if _busy(node) else calm + 1
 
 
-def _busy(node: Node | None) -> list[str]:
-    """What could go on now."""
-    own = asyncio.current_task()
-    found = [cell.path for cell in node.ready] if node is not None else []
+def _busy(node: Node | None, own: asyncio.Task[Any] | None = None) -> list[str]:
+    """What could go on now, apart from the task that wants to know."""
+    own = own or asyncio.current_task()
+    found = [_told(cell) for cell in node.ready] if node is not None else []
     if node is not None and node.awake and not found:
         found.append("the run queue")
     found += [task.get_name() for task in asyncio.all_tasks() if task is not own and _could_go_on(task)]
     return found
+
+
+def _told(cell: Cell) -> str:
+    """An actor, and the message that it handles next."""
+    message = message_of(cell.queue[0]) if cell.queue else None
+    return cell.path if message is None else f"{cell.path} ({type(message).__name__})"
+
+
+def movers(handles: Iterable[asyncio.Handle]) -> list[str]:
+    """Who is behind the callbacks of a loop: actors with their messages, tasks by name, functions; each once."""
+    found: dict[str, None] = {}
+    for handle in handles:
+        callback = getattr(handle, "_callback", None)  # None: it was cancelled.
+        match owner := getattr(callback, "__self__", None):
+            case RunLoop():
+                found.update(dict.fromkeys(map(_told, owner.ready)))
+            case Timer(message=message):
+                found[f"{owner._cell.path} (timer of {type(message).__name__})"] = None
+            case asyncio.Task():
+                found[owner.get_name()] = None
+            case None if callback is None:
+                pass
+            case _:
+                found[getattr(callback, "__qualname__", repr(callback))] = None
+    return list(found)[:SHOWN]
 
 
 def _could_go_on(task: asyncio.Task[Any]) -> bool:

@@ -7,19 +7,37 @@ takes no time in reality takes none here either, so two runs of a test see the s
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import math
+import os
 import selectors
-from collections.abc import Callable
+import time
+from collections import deque
+from collections.abc import Callable, Generator
 from concurrent.futures import Executor
-from typing import Any, TypeVar, TypeVarTuple
+from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple
 
 from ..actors.errors import HoldfastError
+from .threads import Threads
+
+if TYPE_CHECKING:
+    from .barrier import NotIdle
 
 T = TypeVar("T")
 Ts = TypeVarTuple("Ts")
 
 WAKE_UP_SOCKETS = 1  # the loop's own, through which threads and signals wake it
 PATIENCE = 1.0
-"""Real seconds given to threads that the loop does not know of, before it is sure that nothing can happen any more."""
+"""Real seconds given to threads that cannot be seen at work, before it is sure that nothing can happen any more."""
+LONGEST_WORK = 60.0
+"""Real seconds that virtual time stands still for threads at work."""
+LOOK_AGAIN = 0.002
+"""Real seconds between two looks at the threads at work."""
+TICKS = 10_000
+"""Ticks of the loop at one moment of virtual time; a run queue that is never empty makes them in about 5 s."""
+JUMPS = 500_000
+"""Jumps of the clock in one run of the loop."""
+PIDFD = "anon_inode:[pidfd]"
 
 
 class NothingToWaitFor(RuntimeError):
@@ -50,23 +68,64 @@ class RealTimeNeeded(HoldfastError):
         )
 
 
+class ThreadAtWork(RuntimeError):
+    """Virtual time has stood still for long, because a thread that may wake the loop does not end its work."""
+
+    def __init__(self, names: tuple[str, ...], seconds: float) -> None:
+        super().__init__(names, seconds)
+        self.names, self.seconds = names, seconds
+
+    def __str__(self) -> str:
+        return (
+            f"the virtual clock has stood still for {self.seconds:g} real seconds, because a thread is at work: "
+            f"{', '.join(self.names)}. A thread that does not come to an end needs a real loop"
+        )
+
+
 class _JumpingSelector(selectors.DefaultSelector):
     """Looks at real files without waiting; time passes by jumping to the next timer."""
 
-    def __init__(self, start: float) -> None:
+    def __init__(self, loop: VirtualClockLoop, start: float, ticks: int, jumps: int) -> None:
         super().__init__()
         self.now = start
-        self.jobs = 0  # threads at work whose results will wake the loop
+        self.jobs = 0  # work of executors whose results will wake the loop
+        self.ticks, self.jumps = 0, 0
+        self._most_ticks, self._most_jumps = ticks, jumps
+        self._loop = loop
+        self._threads = Threads()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         ready = super().select(0)
         if ready or (timeout is not None and timeout <= 0):
+            self.ticks += 1
+            if self.ticks > self._most_ticks:
+                self.ticks = 0
+                self._loop.stands_still(f"{self._most_ticks} ticks of the loop at virtual time {self.now:g} s")
             return ready
-        if self.jobs:
-            return super().select(None)
-        if timeout is not None:
-            self.now += timeout
-            return ready
+        self.ticks = 0
+        return self._select_after_threads() or self._jump()
+
+    def _select_after_threads(self) -> list[tuple[selectors.SelectorKey, int]]:
+        """What is ready once no thread is at work, or as soon as one of them wakes the loop."""
+        began = time.monotonic()
+        while names := self._threads.at_work() or ["an executor"] * bool(self.jobs):
+            ready = super().select(LOOK_AGAIN)
+            if ready:
+                return ready
+            if time.monotonic() - began > LONGEST_WORK:
+                raise ThreadAtWork(tuple(names), LONGEST_WORK)
+        return super().select(0)  # What the last of them did came before this.
+
+    def _jump(self) -> list[tuple[selectors.SelectorKey, int]]:
+        """Go to the next timer; without one, wait for files."""
+        when = self._loop.next_timer()
+        if when < math.inf:
+            self.now = max(self.now, when)
+            self.jumps += 1
+            if self.jumps > self._most_jumps:
+                self.jumps = 0
+                raise self._loop.restless(f"{self._most_jumps} jumps of the clock, at virtual time {self.now:g} s")
+            return []
         if len(self.get_map()) > WAKE_UP_SOCKETS:
             return super().select(None)
         ready = super().select(PATIENCE)
@@ -78,28 +137,75 @@ class _JumpingSelector(selectors.DefaultSelector):
 class VirtualClockLoop(asyncio.SelectorEventLoop):
     """An event loop with a clock of its own, which stands still while anything runs and jumps when all wait.
 
-    `time()` begins at `start` and moves only to the times of timers: `asyncio.sleep(3600)` returns at once, 3600 s
-    later. Everything on the loop's clock follows (`call_later`, `asyncio.timeout`, deadlines, back-off, restart
+    `time()` begins at `start` and moves only to the times of timers, exactly: `asyncio.sleep(3600)` returns at once,
+    3600 s later. Everything on the loop's clock follows (`call_later`, `asyncio.timeout`, deadlines, back-off, restart
     windows); `time.monotonic()` and `time.time()` do not.
 
-    - Work in `run_in_executor` takes no virtual time: the loop really waits for it before it jumps.
+    - Work in threads takes no virtual time: the loop really waits for it before it jumps, however the thread was
+      started (`run_in_executor`, pools, anyio, `threading`), and raises `ThreadAtWork` when one does not come to
+      an end. A thread that waits for a lock is not at work, nor is one that ran before the loop was made.
     - Files and sockets are looked at, but the clock does not wait for them while a timer is set.
     - Another process has no virtual clock: actors in processes of their own, and subprocesses, are refused
       (`RealTimeNeeded`); test them on a real loop.
     - When nothing can happen any more it raises `NothingToWaitFor` instead of hanging.
+    - When it does not come to rest it raises `NotIdle`, which names who moves: after `ticks` ticks of the loop at one
+      moment of virtual time, or `jumps` jumps of the clock in one run.
 
     >>> with asyncio.Runner(loop_factory=VirtualClockLoop) as runner:
     ...     runner.run(asyncio.sleep(3600, "an hour later")), runner.get_loop().time()
     ('an hour later', 3600.0)
     """
 
-    def __init__(self, start: float = 0.0) -> None:
-        self._virtual = _JumpingSelector(start)
+    _ready: deque[asyncio.Handle]  # asyncio's own
+    _scheduled: list[asyncio.TimerHandle]
+
+    def __init__(self, start: float = 0.0, *, ticks: int = TICKS, jumps: int = JUMPS) -> None:
+        self._virtual = _JumpingSelector(self, start, ticks, jumps)
+        self._patient: list[Callable[[str], None]] = []
         super().__init__(self._virtual)
+        self._clock_resolution = math.ulp(start)
 
     def time(self) -> float:
         """Seconds on the virtual clock."""
         return self._virtual.now
+
+    def next_timer(self) -> float:
+        """When the next timer is due, in seconds on this clock; inf: none is set."""
+        when = self._scheduled[0].when() if self._scheduled else math.inf
+        # asyncio runs what is due up to one resolution from now. This much is what is due now, and no later timer.
+        self._clock_resolution = math.ulp(max(self._virtual.now, when)) if when < math.inf else self._clock_resolution
+        return when
+
+    def run_forever(self) -> None:
+        """As every loop; each run may take so many ticks and jumps."""
+        self._virtual.ticks = self._virtual.jumps = 0
+        super().run_forever()
+
+    @contextlib.contextmanager
+    def hears_of_standstill(self, expire: Callable[[str], None]) -> Generator[None]:
+        """Call `expire` with the reason when virtual time does not go on, instead of ending the run."""
+        self._patient.append(expire)
+        try:
+            yield
+        finally:
+            self._patient.remove(expire)
+
+    def stands_still(self, why: str) -> None:
+        """Too much happens at one moment: tell who waits for its end.
+
+        Raises:
+            NotIdle: nobody does.
+        """
+        if not self._patient:
+            raise self.restless(why)
+        for expire in self._patient:
+            expire(why)
+
+    def restless(self, why: str) -> NotIdle:
+        """The NotIdle that names what is to run now and what the next timers are."""
+        from .barrier import NotIdle, movers
+
+        return NotIdle(why, tuple(movers([*self._ready, *sorted(self._scheduled)])))
 
     def run_in_executor(self, executor: Executor | None, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
         """Run in a thread; the clock stands still until it is done."""
@@ -110,6 +216,12 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     def _job_done(self, _: object) -> None:
         self._virtual.jobs -= 1
+
+    def add_reader(self, fd: Any, callback: Callable[[*Ts], Any], *args: *Ts) -> None:
+        """As every loop; but the end of another process is not waited for here."""
+        if isinstance(fd, int) and _is_pidfd(fd):
+            raise RealTimeNeeded("what runs in another process")
+        super().add_reader(fd, callback, *args)
 
     async def connect_accepted_socket(self, *args: Any, **options: Any) -> Any:
         """Refused: what is connected here speaks for another process."""
@@ -132,6 +244,13 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
             self._virtual.jobs -= 1
 
 
+def _is_pidfd(fd: int) -> bool:
+    try:
+        return os.readlink(f"/proc/self/fd/{fd}") == PIDFD
+    except OSError:
+        return False
+
+
 def virtual() -> VirtualClockLoop:
     """A new loop whose clock begins at 0: for `asyncio.Runner(loop_factory=...)` and pytest-asyncio's factories."""
     return VirtualClockLoop()
@@ -143,14 +262,16 @@ async def advance(seconds: float) -> None:
     Returns when no task could go on any more without more time. Timers fire in order, each at its own time.
 
     Raises:
-        HoldfastError: the running loop has no virtual clock. ValueError: `seconds` is negative.
+        HoldfastError: the running loop has no virtual clock. ValueError: `seconds` is negative or infinite.
+        NotIdle: something goes on at one moment without end.
     """
-    from .barrier import quiet
+    from .barrier import patience, quiet
 
     loop = asyncio.get_running_loop()
     if not isinstance(loop, VirtualClockLoop):
         raise HoldfastError("advance() needs the virtual clock: run this under holdfast.testing.virtual")
-    if not seconds >= 0:
-        raise ValueError(f"the clock goes forward: seconds must be >= 0, not {seconds!r}")
-    await asyncio.sleep(seconds)
-    await quiet()
+    if not 0 <= seconds < math.inf:
+        raise ValueError(f"the clock goes forward: seconds must be >= 0 and finite, not {seconds!r}")
+    async with patience(None):
+        await asyncio.sleep(seconds)
+        await quiet()

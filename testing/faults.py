@@ -136,6 +136,7 @@ class Strikes:
     ) -> None:
         self.at, self.path, self.seconds, self.seed = point.name, path, seconds, faults.seed
         self.chances = 0
+        self.is_over = False
         self.struck: list[Strike] = []
         self.draw = random.Random(f"{faults.seed}|{path}|{point.name}|{len(faults.installed)}")
         self._faults, self._odds, self._after, self._times = faults, odds, after, times
@@ -143,6 +144,8 @@ class Strikes:
 
     def next(self, what: object) -> Kind | None:
         """One chance: the fault that strikes now, if any. `what` passes the point."""
+        if self.is_over:  # Other faults, which strike longer, still lead here.
+            return None
         self.chances += 1
         drawn = self.draw.random()  # At each chance, so that the next ones do not depend on what this one does.
         if self.chances <= self._after or (self._times is not None and len(self.struck) >= self._times):
@@ -166,6 +169,7 @@ class Strikes:
 
     def end(self) -> None:
         """No more faults: what was exchanged is put back, what was held goes on. A second call changes nothing."""
+        self.is_over = True
         while self._undo:
             self._undo.pop()()
 

@@ -184,8 +184,6 @@ class Guard:
                 problems.append(f"system {system.name!r}: {error}")
             problems += system.problems()
         if self._leaks is not None:
-            problems += [f"a task was left running: {text}" for text in await self._leaks.tasks()]
-            problems += [f"a process was left running: {text}" for text in self._leaks.processes()]
-            problems += [f"a descriptor was left open: {text}" for text in self._leaks.files()]
+            problems += [*await self._leaks.told(), *self._leaks.outside()]
         if problems:
             raise UnexpectedEnd(tuple(problems))

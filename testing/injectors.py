@@ -14,7 +14,7 @@ from ..actors import mailbox
 from ..actors.cell import GONE, Cell
 from ..actors.errors import HoldfastError, ProcessUnavailable, SpecError
 from ..actors.mail import Ask, Envelope, Handler
-from ..actors.node import message_of
+from ..actors.message import message_of
 from ..actors.process import frames
 from ..actors.process.workers import Worker
 from ..actors.ref import ActorRef
@@ -43,21 +43,45 @@ def _cell(strikes: Strikes, target: Target) -> Cell:
 
 def _exchange_admit(strikes: Strikes, cell: Cell, made: Callable[[Any], Any]) -> None:
     """Put another admit function before the one that stands there; a recorded actor's is put there at each life."""
-    original = cell.admit
-    admit = made(original)
+    admit = made(cell.admit)
     switch = switch_of(cell)
     swaps = Swaps()
     if switch is not None:
         swaps.put(switch, "admit", admit)
-    cell.admit = admit
+    swaps.put(cell, "admit", admit)
 
     def undo() -> None:
         swaps.undo()
-        if cell.admit is admit:
-            is_first = original is mailbox.admit_first and cell.queue is not None
-            cell.admit = mailbox.admit_queue if is_first else original
+        if cell.admit is mailbox.admit_first and cell.queue is not None:
+            cell.admit = mailbox.admit_queue
 
     strikes.at_end(undo)
+
+
+class Late:
+    """What faults hold back: it comes when its time is over, or when they end."""
+
+    def __init__(self, strikes: Strikes) -> None:
+        self._seconds = strikes.seconds
+        self._waiting: dict[asyncio.TimerHandle, Callable[[], None]] = {}
+        strikes.at_end(self.come)
+
+    def hold(self, loop: asyncio.AbstractEventLoop, go: Callable[[], None]) -> None:
+        """Call `go` later."""
+
+        def come() -> None:
+            del self._waiting[handle]
+            go()
+
+        handle = loop.call_later(self._seconds, come)
+        self._waiting[handle] = go
+
+    def come(self) -> None:
+        """Let all of it go on now."""
+        waiting, self._waiting = self._waiting, {}
+        for handle, go in waiting.items():
+            handle.cancel()
+            go()
 
 
 class Admission:
@@ -66,8 +90,8 @@ class Admission:
     def __init__(self, strikes: Strikes, original: Any) -> None:
         self._strikes, self._original = strikes, original
         self._held: deque[tuple[Cell, Any]] = deque()  # by a reordering: they come after the next message
-        self._late: dict[int, tuple[Cell, Any]] = {}
-        self._last = 0
+        self._late = Late(strikes)
+        strikes.at_end(self._come)
 
     def admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`."""
@@ -77,7 +101,7 @@ class Admission:
             case "drop":
                 return
             case "delay":
-                self._delay(cell, item)
+                self._late.hold(cell.node.loop, lambda: self._admit_late(cell, item))
                 return
             case "reorder":
                 self._held.append((cell, item))
@@ -89,18 +113,11 @@ class Admission:
             case _:
                 pass
         self._original(cell, item)
+        self._come()
+
+    def _come(self) -> None:
         while self._held:
             self._admit_late(*self._held.popleft())
-
-    def _delay(self, cell: Cell, item: Any) -> None:
-        self._last += 1
-        self._late[self._last] = cell, item
-        cell.node.loop.call_later(self._strikes.seconds, self._come, self._last)
-
-    def _come(self, key: int) -> None:
-        waiting = self._late.pop(key, None)  # None: the faults have ended meanwhile.
-        if waiting is not None:
-            self._admit_late(*waiting)
 
     def _corrupt(self, item: Any) -> Any:
         message = damaged(message_of(item), self._strikes.draw)
@@ -119,34 +136,19 @@ class Admission:
             else:
                 cell.node.dead_letter(cell, item, str(error))
 
-    def end(self) -> None:
-        """What is still on its way arrives now."""
-        late, self._late = self._late, {}
-        for waiting in late.values():
-            self._admit_late(*waiting)
-        while self._held:
-            self._admit_late(*self._held.popleft())
-
 
 def admit(strikes: Strikes, target: Target) -> None:
     """Install at "admit"."""
-    cell = _cell(strikes, target)
-
-    def made(original: Any) -> Any:
-        admission = Admission(strikes, original)
-        strikes.at_end(admission.end)
-        return admission.admit
-
-    _exchange_admit(strikes, cell, made)
+    _exchange_admit(strikes, _cell(strikes, target), lambda original: Admission(strikes, original).admit)
 
 
 class FaultyReply:
     """Stands for the future of an ask: the reply passes here on its way to the asker."""
 
-    __slots__ = ("_ask", "_real", "_strikes")
+    __slots__ = ("_ask", "_late", "_real", "_strikes")
 
-    def __init__(self, strikes: Strikes, ask: Ask) -> None:
-        self._strikes, self._ask, self._real = strikes, ask, ask.future
+    def __init__(self, strikes: Strikes, late: Late, ask: Ask) -> None:
+        self._strikes, self._late, self._ask, self._real = strikes, late, ask, ask.future
 
     def done(self) -> bool:
         """Whether the asker has its outcome."""
@@ -164,7 +166,7 @@ class FaultyReply:
                 return
             case "delay":
                 ask.future = self._real  # The next time it is the reply itself.
-                ask.to.node.loop.call_later(self._strikes.seconds, ask.answer, reply)
+                self._late.hold(ask.to.node.loop, lambda: ask.answer(reply))
                 return
             case "corrupt":
                 reply = damaged(reply, self._strikes.draw)
@@ -178,10 +180,12 @@ class FaultyReply:
 def reply(strikes: Strikes, target: Target) -> None:
     """Install at "reply"."""
 
+    late = Late(strikes)
+
     def made(original: Any) -> Any:
         def admit(cell: Cell, item: Any) -> None:
-            if type(item) is Ask and isinstance(item.future, asyncio.Future):
-                item.future = FaultyReply(strikes, item)
+            if type(item) is Ask and isinstance(item.future, asyncio.Future | FaultyReply):
+                item.future = FaultyReply(strikes, late, item)
             original(cell, item)
 
         return admit
@@ -424,19 +428,19 @@ def process(strikes: Strikes, target: Target) -> None:
     workers = target._workers
     take = workers.take
 
-    async def take_faulty() -> Worker:
+    async def take_faulty(*, again: bool = False) -> Worker:
         match strikes.next("a process"):
             case "fail":
                 raise ProcessUnavailable(f"injected fault at 'process start' (seed {strikes.seed})")
             case "delay":
                 await asyncio.sleep(strikes.seconds)
             case "crash":
-                worker = await take()
+                worker = await take(again=again)
                 worker.forked.kill(signal.SIGKILL)
                 return worker
             case _:
                 pass
-        return await take()
+        return await take(again=again)
 
     swaps = Swaps()
     swaps.put(workers, "take", take_faulty)

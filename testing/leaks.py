@@ -20,10 +20,10 @@ FD_SLACK = 4
 OPEN_FILES = Path("/proc/self/fd")
 
 
-class Leaks:
-    """What there was at the beginning, so that what is more at the end is a leak.
+class TaskLeaks:
+    """The tasks that there were at the beginning, so that what is more at the end is a leak.
 
-    Made before the code under test begins, in the same loop if tasks shall be looked for.
+    Made before the code under test begins, in the same loop.
     """
 
     def __init__(self) -> None:
@@ -31,8 +31,10 @@ class Leaks:
             self._tasks = asyncio.all_tasks()
         except RuntimeError:  # No loop runs: tasks are looked for by whoever runs in one.
             self._tasks = set[asyncio.Task[object]]()
-        self._children = set(children())
-        self._files = open_files()
+
+    async def told(self) -> list[str]:
+        """What is left in this loop, as problems."""
+        return [f"a task was left running: {text}" for text in await self.tasks()]
 
     async def tasks(self) -> list[str]:
         """Tasks that are not ours and still run after a few turns of the loop."""
@@ -44,6 +46,22 @@ class Leaks:
 
     def _new_tasks(self) -> set[asyncio.Task[object]]:
         return asyncio.all_tasks() - self._tasks - {asyncio.current_task()}
+
+
+class Leaks(TaskLeaks):
+    """As TaskLeaks, with child processes and open descriptors."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._children = set(children())
+        self._files = open_files()
+
+    def outside(self) -> list[str]:
+        """What is left outside of the loop, as problems."""
+        return [
+            *(f"a process was left running: {text}" for text in self.processes()),
+            *(f"a descriptor was left open: {text}" for text in self.files()),
+        ]
 
     def processes(self) -> list[str]:
         """Child processes that did not end in time; they are killed."""

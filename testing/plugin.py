@@ -9,41 +9,38 @@ from __future__ import annotations
 
 import asyncio
 import importlib
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+import types
+from collections.abc import AsyncIterator, Awaitable, Callable, Generator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
 if TYPE_CHECKING:
     from .guarded import Guard, GuardedSystem
     from .probes import Probe
+    from .wanted import Wanted
 
     ActorSystems = Callable[..., Awaitable[GuardedSystem]]
 
-Function = TypeVar("Function", bound=Callable[..., Any])
 
-
-def async_fixture(function: Function) -> Function:
+def async_fixture(function: Callable[..., Any], *, name: str, loop_scope: str) -> Any:
     """A fixture by pytest-asyncio. The plugin is loaded wherever holdfast is installed; only its fixtures need that."""
+    # Each a function of its own: pytest-asyncio keeps the scope at the function.
+    own = types.FunctionType(function.__code__, function.__globals__, name, None, function.__closure__)
     try:
-        made = importlib.import_module("pytest_asyncio").fixture
+        return importlib.import_module("pytest_asyncio").fixture(own, name=name, loop_scope=loop_scope)
     except ImportError:
-        made = _missing
-    return cast("Function", made(function))
+        return pytest.fixture(_missing, name=name)
 
 
-def _missing(function: Callable[..., Any]) -> Any:
+def _missing() -> None:
     """In place of an async fixture, where there is no pytest-asyncio."""
-
-    @pytest.fixture(name=function.__name__)
-    def missing() -> None:
-        pytest.fail("the fixtures of holdfast need pytest-asyncio: pip install 'holdfast[testing]'", pytrace=False)
-
-    return missing
+    pytest.fail("the fixtures of holdfast need pytest-asyncio: pip install 'holdfast[testing]'", pytrace=False)
 
 
-LOOPS = ("uvloop", "asyncio")
 EXPECTABLE = ("dead_letters", "crashes", "leaks", "sends")
+LOOP_SCOPES = ("function", "class", "module", "package", "session")
+LOOPS = ("uvloop", "asyncio")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -109,39 +106,74 @@ def _loop_factory(name: str) -> Callable[[], asyncio.AbstractEventLoop]:
     return asyncio.new_event_loop
 
 
-class Wanted:
-    """What a test's markers and the configuration say."""
+def _wanted(item: pytest.Item) -> Wanted:
+    from .wanted import Wanted
 
-    def __init__(self, request: pytest.FixtureRequest) -> None:
-        expected: dict[str, Any] = dict.fromkeys(request.config.getini("holdfast_expect"), True)
-        options: dict[str, Any] = {}
-        for marker in reversed(list(request.node.iter_markers("holdfast"))):  # The closest one has the last word.
-            for name, value in marker.kwargs.items():
-                (expected if name in EXPECTABLE else options)[name] = value
-        self.options = options
-        self.leaks = bool(expected.get("leaks"))
-        self._expected = expected
-
-    def tell(self, system: GuardedSystem) -> None:
-        """Let a system know what it may see."""
-        for name, expect in (("dead_letters", system.expect_dead_letters), ("crashes", system.expect_crashes)):
-            value = self._expected.get(name, False)
-            if value is True:
-                expect(None)
-            elif value:
-                expect(int(value))
-        if self._expected.get("sends"):
-            system.expect_sends()
+    return Wanted(item, EXPECTABLE)
 
 
-@async_fixture
-async def actor_guard(request: pytest.FixtureRequest) -> AsyncIterator[Guard]:
-    """The systems of one test, and the look at what they leave."""
+@pytest.hookimpl(wrapper=True)
+def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]:
+    """Let `@simulate` know what the test expects."""
+    from .wanted import running
+
+    token = running.set(_wanted(pyfuncitem))
+    try:
+        return (yield)
+    finally:
+        running.reset(token)
+
+
+async def guard_of_the_test(request: pytest.FixtureRequest) -> AsyncIterator[Guard]:
+    """The systems of one test, and the look at what they leave, in the loop of the test."""
     from .guarded import Guard
 
-    guard = Guard(leaks=not Wanted(request).leaks)
+    guard = Guard(leaks=not _wanted(request.node).leaks)
     yield guard
     await guard.close()
+
+
+async def system_of_the_test(actor_systems: ActorSystems) -> GuardedSystem:
+    """A system in the loop of the test."""
+    return await actor_systems()
+
+
+# A fixture of pytest-asyncio runs in the loop of one scope, and a test says by its marker which one it runs in.
+for _scope in LOOP_SCOPES:
+    globals()[f"holdfast_guard_{_scope}"] = async_fixture(
+        guard_of_the_test, name=f"holdfast_guard_{_scope}", loop_scope=_scope
+    )
+    globals()[f"holdfast_system_{_scope}"] = async_fixture(
+        system_of_the_test, name=f"holdfast_system_{_scope}", loop_scope=_scope
+    )
+
+
+def _in_loop_of_test(request: pytest.FixtureRequest, fixture: str) -> Any:
+    """The value of the fixture that runs in the same loop as the test.
+
+    Raises:
+        pytest.fail.Exception: the test does not run in a loop of pytest-asyncio.
+    """
+    if "anyio_backend" in request.fixturenames or request.node.get_closest_marker("anyio") is not None:
+        pytest.fail(
+            "the fixtures of holdfast run in the loop of pytest-asyncio, and anyio's plugin runs this test in another "
+            "one: mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio",
+            pytrace=False,
+        )
+    scope = None
+    marker = request.node.get_closest_marker("asyncio")
+    if marker is not None:
+        scope = marker.kwargs.get("loop_scope") or marker.kwargs.get("scope")
+    if scope is None and request.config.pluginmanager.has_plugin("asyncio"):
+        scope = request.config.getini("asyncio_default_test_loop_scope")
+    return request.getfixturevalue(f"{fixture}_{scope or 'function'}")
+
+
+@pytest.fixture
+def actor_guard(request: pytest.FixtureRequest) -> Guard:
+    """The systems of one test, and the look at what they leave."""
+    guard: Guard = _in_loop_of_test(request, "holdfast_guard")
+    return guard
 
 
 @pytest.fixture
@@ -149,7 +181,7 @@ def actor_systems(actor_guard: Guard, request: pytest.FixtureRequest) -> ActorSy
     """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
     from .guarded import GuardedSystem
 
-    wanted = Wanted(request)
+    wanted = _wanted(request.node)
 
     async def start(name: str = "app", **options: Any) -> GuardedSystem:
         system = await actor_guard.start(GuardedSystem(name, **{**wanted.options, **options}))
@@ -159,10 +191,11 @@ def actor_systems(actor_guard: Guard, request: pytest.FixtureRequest) -> ActorSy
     return start
 
 
-@async_fixture
-async def actor_system(actor_systems: ActorSystems) -> GuardedSystem:
+@pytest.fixture
+def actor_system(request: pytest.FixtureRequest) -> GuardedSystem:
     """A running system of the test's own, on the test's loop; it ends with the test."""
-    return await actor_systems()
+    system: GuardedSystem = _in_loop_of_test(request, "holdfast_system")
+    return system
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ from ..actors.mail import Ask, Handler, Item, ReplyHandle, Table
 from ..actors.message import Message, Refusal
 from ..actors.ref import DEFAULT_TIMEOUT, ActorRef, current
 from ..system.system import ActorSystem
-from .barrier import idle
+from .barrier import NotIdle, idle, patience
 
 M = TypeVar("M", bound=Message[Any])
 R = TypeVar("R")
@@ -164,7 +164,7 @@ class Probe:
             The message; `reply` answers it.
 
         Raises:
-            Unexpected: something else came, or nothing within `timeout` seconds.
+            Unexpected: something else came, or nothing within `timeout` seconds. NotIdle: virtual time stood still.
         """
         heard = await self._next(_name(what), timeout)
         if not isinstance(heard, Received) or not _matches(heard.message, what):
@@ -176,7 +176,7 @@ class Probe:
         """The first message that is of this type, or for which the predicate is true; others before it are dropped.
 
         Raises:
-            Unexpected: none came within `timeout` seconds.
+            Unexpected: none came within `timeout` seconds. NotIdle: virtual time stood still.
         """
         name = _name(wanted) if isinstance(wanted, type) else "a message that the predicate takes"
         deadline = asyncio.get_running_loop().time() + timeout
@@ -199,8 +199,10 @@ class Probe:
         elif not self._inbox:
             self._wake.clear()
             try:
-                async with asyncio.timeout(within):
+                async with patience(within, self._system.node):
                     await self._wake.wait()
+            except NotIdle:
+                raise
             except TimeoutError:
                 pass
         if self._inbox:
@@ -212,7 +214,7 @@ class Probe:
         """The next thing to come is the DOWN of this ref (after `monitor` or `watch`), for this reason if one is given.
 
         Raises:
-            Unexpected: something else came, or nothing within `timeout` seconds.
+            Unexpected: something else came, or nothing within `timeout` seconds. NotIdle: virtual time stood still.
         """
         return await self._signal(Down, "DOWN", ref, reason, timeout)
 
@@ -222,7 +224,7 @@ class Probe:
         """The next thing to come is the EXIT of this ref (after `link`), for this reason if one is given.
 
         Raises:
-            Unexpected: something else came, or nothing within `timeout` seconds.
+            Unexpected: something else came, or nothing within `timeout` seconds. NotIdle: virtual time stood still.
         """
         return await self._signal(Exit, "EXIT", ref, reason, timeout)
 
@@ -235,10 +237,12 @@ class Probe:
 
     async def _next(self, name: str, timeout: float, shown: float | None = None) -> Heard:
         try:
-            async with asyncio.timeout(max(timeout, 0.0)):
+            async with patience(max(timeout, 0.0), self._system.node):
                 while not self._inbox:
                     self._wake.clear()
                     await self._wake.wait()
+        except NotIdle:
+            raise
         except TimeoutError:
             raise self._unexpected(name, None, timeout if shown is None else shown) from None
         heard = self._inbox.popleft()

@@ -14,8 +14,8 @@ import msgspec
 from ..actors.cell import Cell
 from ..actors.context import ActorContext
 from ..actors.errors import BadMessage, type_name
-from ..actors.message import Message
-from ..actors.node import Node, message_of
+from ..actors.message import Message, message_of
+from ..actors.node import Node
 from ..actors.ref import ActorRef, current
 from .swaps import Swaps
 from .turns import TurnWatcher, watch_turns

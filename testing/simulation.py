@@ -19,13 +19,15 @@ from typing import Any
 
 from ..actors import loop as run_loop
 from ..actors.cell import NEXT_URGENT, Cell
-from ..actors.node import message_of
+from ..actors.message import message_of
 from ..checkpoint.turns import Fed
 from .clock import virtual
 from .faults import Faults
-from .guarded import GuardedSystem
+from .guarded import GuardedSystem, UnexpectedEnd
+from .leaks import Leaks, TaskLeaks
 from .swaps import Swaps
 from .turns import TurnWatcher, watch_turns
+from .wanted import running
 
 SEED = "HOLDFAST_SEED"
 """The environment variable that picks one seed for every simulated test of a run."""
@@ -112,7 +114,8 @@ def simulate(
     """Run an async test under many seeds, each on a virtual clock with a system of its own.
 
     The test takes `system` (a running GuardedSystem) and, if it names them, `faults` (the seed's `Faults`) and
-    `simulation`. Whatever else it takes are fixtures; they are made once, for all seeds, and must not be async.
+    `simulation`. Whatever else it takes are fixtures; they are made once, for all seeds, and must not be async. What
+    the marker `holdfast` says holds for each seed. `@given` may stand above: each example runs under all seeds.
 
     Args:
         test: the test; `@simulate` alone takes the defaults.
@@ -132,13 +135,19 @@ def simulate(
     wanted = inspect.signature(test).parameters
     own = {name for name in ("system", "faults", "simulation") if name in wanted}
 
+    signature = inspect.Signature([parameter for name, parameter in wanted.items() if name not in own])
+
     @functools.wraps(test)
     def run(*args: Any, **fixtures: Any) -> None:
+        given = signature.bind(*args, **fixtures).arguments  # By name: ours may stand in front of them.
+        leaks = None if running.get().leaks else Leaks()
         for chosen in _seeds(seeds, seed):
-            run_seed(functools.partial(test, *args, **fixtures), chosen, own, options)
+            run_seed(functools.partial(test, **given), chosen, own, options)
+        left = [] if leaks is None else leaks.outside()
+        if left:
+            raise UnexpectedEnd(tuple(left))
 
-    fixtures = [parameter for name, parameter in wanted.items() if name not in own]
-    run.__signature__ = inspect.Signature(fixtures)  # type: ignore[attr-defined]  # what pytest looks for fixtures in
+    run.__signature__ = signature  # type: ignore[attr-defined]  # what pytest looks for fixtures in
     del run.__wrapped__  # else pytest-asyncio and checkers see the async function
     return run
 
@@ -171,10 +180,12 @@ def run_seed(
 
 
 async def _run(test: Any, simulation: Simulation, faults: Faults, own: set[str], options: dict[str, Any]) -> None:
-    options = {"seed": simulation.seed, **options}
+    wanted, leaks = running.get(), TaskLeaks()
+    options = {"seed": simulation.seed, **wanted.options, **options}
     system = GuardedSystem(**options)
     try:
         async with system:
+            wanted.tell(system)
             simulation.install(system)
             given = {"system": system, "faults": faults, "simulation": simulation}
             try:
@@ -183,7 +194,9 @@ async def _run(test: Any, simulation: Simulation, faults: Faults, own: set[str],
                 faults.end()
     finally:
         simulation.remove()  # The end of the actors is still the seed's.
-    system.verify()
+    problems = [*system.problems(), *([] if wanted.leaks else await leaks.told())]
+    if problems:
+        raise UnexpectedEnd(tuple(problems))
 
 
 def _note(simulation: Simulation, faults: Faults) -> str:

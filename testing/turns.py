@@ -41,7 +41,7 @@ class Watched:
         self._over = node.turn_over
         self.swaps.put(node, "turn_over", self._turn_over)
 
-    def run(self, original: Callable[[Cell, int], bool], cell: Cell, most: int) -> bool:
+    def run(self, original: Callable[[Cell, int], int], cell: Cell, most: int) -> int:
         """As `run_turns`, one turn at a time."""
         queue = cell.queue
         if not queue:
@@ -49,10 +49,10 @@ class Watched:
         for _ in range(min(len(queue), most)):
             item = queue[0] if queue else None
             if not self._run_one(original, cell, item):
-                return False
-        return True
+                return 0
+        return 1
 
-    def _run_one(self, original: Callable[[Cell, int], bool], cell: Cell, item: Any) -> bool:
+    def _run_one(self, original: Callable[[Cell, int], int], cell: Cell, item: Any) -> int:
         made = [made for watcher in self.watchers if (made := watcher.begins(cell, item)) is not None]
         if made:
             with Swaps() as swaps:
@@ -104,12 +104,12 @@ class Turns:
     """Stands in for `run_turns` while any node of this process is watched."""
 
     def __init__(self) -> None:
-        self._original: Callable[[Cell, int], bool] = run_loop.run_turns
+        self._original: Callable[[Cell, int], int] = run_loop.run_turns
         self._nodes: dict[RunLoop, Watched] = {}
         self._swaps = Swaps()
         self._swaps.put(run_loop, "run_turns", self.run_turns)
 
-    def run_turns(self, cell: Cell, most: int) -> bool:
+    def run_turns(self, cell: Cell, most: int) -> int:
         """Run turns of a cell as its node wants it."""
         watched = self._nodes.get(cell.node)
         return self._original(cell, most) if watched is None else watched.run(self._original, cell, most)

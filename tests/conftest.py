@@ -6,10 +6,14 @@ not run under one of the loops says so with `@pytest.mark.asyncio(loop_factories
 under both with `loop_factories=["uvloop", "asyncio"]`, and one that is about time, where nothing waits, with
 `loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops are named in pyproject.toml (`holdfast_loops`) and
 made by our own plugin.
+
+What Hypothesis draws depends on the test alone, so a run today finds what it found yesterday, on every machine;
+`HOLDFAST_RANDOM=1` draws anew, and `HOLDFAST_RANDOM=N` repeats the run that printed this number.
 """
 
 import asyncio
 import os
+import random
 import sys
 import time
 import zlib
@@ -23,12 +27,14 @@ import psutil
 import pytest
 import pytest_asyncio
 
+from holdfast.actors.loop import RunLoop
 from holdfast.testing.leaks import Leaks, end_processes, is_of_test
+from tests.waits import Waits
 
 # Installed, the plugin comes by its entry point; in a checkout whose metadata is older it is named here. Not both:
 # pytest refuses to register it under two names.
 IS_INSTALLED = bool(entry_points(group="pytest11", name="holdfast"))
-pytest_plugins = ["pytester", *([] if IS_INSTALLED else ["holdfast.testing.plugin"])]
+pytest_plugins = ["pytester", "holdfast.testing.hanging", *([] if IS_INSTALLED else ["holdfast.testing.plugin"])]
 
 # The tests start thousands of processes that import holdfast. Where the environment forbids byte code, each of them
 # would compile all of it, which takes longer than most tests do.
@@ -36,14 +42,41 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 # A whole actor system may start and stop within one example, on a machine that is busy with other things.
-hypothesis.settings.register_profile("holdfast", deadline=None, print_blob=True)
-hypothesis.settings.load_profile("holdfast")
+REPEATABLE = hypothesis.settings(deadline=None, print_blob=True, derandomize=True, database=None)
+hypothesis.settings.register_profile("repeatable", REPEATABLE)
+hypothesis.settings.register_profile("random", REPEATABLE, derandomize=False)
+RANDOM = os.environ.get("HOLDFAST_RANDOM", "")
+hypothesis.settings.load_profile("random" if RANDOM else "repeatable")
 
 LOOP = "_asyncio_loop_factory"  # the parameter that pytest-asyncio adds
 UNDER_BOTH = Path(__file__).parent / "actors"
 
 # Inherited by every process that a test starts, so that orphans are found: they are nobody's children any more.
 MARK = "HOLDFAST_TEST_RUN"
+
+
+@pytest.hookimpl(tryfirst=True)  # Before Hypothesis looks at its option.
+def pytest_configure(config: pytest.Config) -> None:
+    """Choose the seed of a random run; the other processes of the run inherit it."""
+    if RANDOM == "1":
+        os.environ["HOLDFAST_RANDOM"] = str(random.SystemRandom().randrange(2, 2**32))
+    if RANDOM and config.getoption("hypothesis_seed") is None:
+        config.option.hypothesis_seed = os.environ["HOLDFAST_RANDOM"]
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say how long each folder of tests took, and how to repeat what was drawn."""
+    seconds: defaultdict[str, float] = defaultdict(float)
+    for reports in terminalreporter.stats.values():
+        for report in reports:
+            if isinstance(report, pytest.TestReport):
+                seconds[report.nodeid.rpartition("::")[0].split("/")[1]] += report.duration
+    if len(seconds) > 1:
+        terminalreporter.section("seconds per room")
+        longest_first = sorted(seconds, key=seconds.__getitem__, reverse=True)
+        terminalreporter.line(", ".join(f"{room} {seconds[room]:.0f}" for room in longest_first))
+    if RANDOM:
+        terminalreporter.line(f"Hypothesis drew at random: HOLDFAST_RANDOM={os.environ['HOLDFAST_RANDOM']} repeats it")
 
 
 @pytest.hookimpl(trylast=True)  # Behind -k and -m: what these have left of a test is run.
@@ -108,6 +141,15 @@ def nothing_left(no_orphan_left: None) -> Iterator[None]:
     assert not left, f"the test left child processes: {left}"
     grown = leaks.files()
     assert not grown, f"the test left files open: {grown}"
+
+
+@pytest.fixture(autouse=True)
+def no_supervisor_waits(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Fail a test in which a supervisor has waited in a turn of its own, say for a child that starts or stops."""
+    waits = Waits()
+    monkeypatch.setattr(RunLoop, "hold", lambda *args: waits.hold(*args))
+    yield
+    assert not waits.seen, "a supervisor has waited in its own turn:\n" + "\n".join(waits.seen)
 
 
 @pytest.fixture(autouse=True)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-OWN_TESTS = {"rescue_robot"}
-"""What it prints are times."""
+OWN_TESTS = {"rescue_robot", "fastapi_service"}
+"""The first prints times, the second serves until it is told to end."""
 EXAMPLES = [
     path for path in sorted((Path(__file__).parent.parent / "examples").glob("*.py")) if path.stem not in OWN_TESTS
 ]

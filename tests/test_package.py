@@ -14,6 +14,7 @@ import pytest
 import holdfast
 
 ROOT = Path(__file__).resolve().parents[1]
+IN_EXTRAS = {"CertificationAuthority"}  # public, and not what a star imports
 BESIDE = {"tests", "benchmarks", "examples", "docs", "build", "dist"}
 SOURCES = sorted(
     path.relative_to(ROOT)
@@ -58,10 +59,29 @@ def test_all_is_sorted_and_complete() -> None:
     public = [
         name for name, value in vars(holdfast).items() if not name.startswith("_") and not isinstance(value, ModuleType)
     ]
-    public = sorted({*public, *holdfast._LAZY} - {"TYPE_CHECKING"})
+    public = sorted({*public, *holdfast._LAZY} - {"TYPE_CHECKING", *IN_EXTRAS})
     # `__version__` is public by convention although it begins with an underscore.
     assert [name for name in holdfast.__all__ if name != "__version__"] == public
     assert list(holdfast.__all__) == sorted(holdfast.__all__)
+
+
+def test_the_version_is_that_of_the_distribution() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    assert holdfast.__version__ == project["version"]
+
+
+def test_a_bare_install_has_all_public_names() -> None:
+    modules = {"clingo", "cryptography", "numpy", "pddl", "PIL", "pytest", "rich", "typer", "yaml", "zstandard"}
+    program = f"import sys; sys.modules.update(dict.fromkeys({sorted(modules)})); from holdfast import *; TR, SEC, AD"
+    done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_needs_an_extra_says_which_one() -> None:
+    for name in IN_EXTRAS:
+        program = f"import sys; sys.modules['cryptography'] = None; import holdfast; holdfast.{name}"
+        done = subprocess.run([sys.executable, "-c", program], check=False, capture_output=True, text=True, timeout=60)
+        assert "pip install 'holdfast[sec]'" in done.stderr
 
 
 def test_no_module_imports_pickle() -> None:

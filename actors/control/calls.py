@@ -34,7 +34,7 @@ class OrderAsk(Ask, eq=False):
     def answer(self, reply: object) -> None:
         """The reply came from another process."""
         try:
-            value = decode_value(reply)  # type: ignore[arg-type]  # bytes: it is the reply of `Ordered`
+            value = decode_value(reply, imports=False)  # type: ignore[arg-type]  # bytes: it is the reply of `Ordered`
         except HoldfastError as error:
             self.fail(error)
         else:

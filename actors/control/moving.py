@@ -150,6 +150,12 @@ class Transit:
     def push(self, cell: Cell, item: Item) -> None:
         self.waiting.append(lambda host: host.push(cell, item))
 
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
+
+    def progress(self, cell: Cell) -> object:
+        return None
+
     def recovers(self, reason: ExitReason) -> bool:
         return self.old.recovers(reason)
 
@@ -165,6 +171,9 @@ class Transit:
 
     def backlog(self, cell: Cell) -> int:
         return sum(map(mailbox.counts, cell.queue or ()))
+
+    def load(self, cell: Cell) -> int:
+        return len(cell.queue or ())
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         self.waiting.append(lambda host: host.told(cell, verb, data))
@@ -249,6 +258,8 @@ def part(cell: Cell) -> Cell:
 def farewell(old: Cell, stop: Item) -> None:
     """Have the life at a twin end; nobody is told but the actor itself."""
     old.queue = None
+    if old.ctx is not None:
+        old.ctx.hand_on_promises()
     mailbox.queue_of(old).append(stop)
     lives.up(old)
 

@@ -137,9 +137,10 @@ def main() -> None:
     signal.pthread_sigmask(signal.SIG_SETMASK, ())  # the parent's mask outlives exec; without SIGCHLD we reap nothing
     control = socket.socket(fileno=int(sys.argv[1]))
     control.set_inheritable(False)
-    packet = control.recv(1 << 20)
-    if packet:  # otherwise the parent ended at once
-        hand_over(control, Config(**json.loads(packet[HEADER.size :])))
+    with control:
+        packet = control.recv(1 << 20)
+        if packet:  # otherwise the parent ended at once
+            hand_over(control, Config(**json.loads(packet[HEADER.size :])))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import signal
 from collections.abc import Collection, Iterator
 
 
@@ -11,6 +12,20 @@ def send_signal(pid: int, signum: int) -> None:
     """Signal a child of ours. Not reaped yet, so its pid is still its own; it may be a zombie, which is no error."""
     with contextlib.suppress(ProcessLookupError):
         os.kill(pid, signum)
+
+
+def signal_by(pidfd: int, signum: int) -> bool:
+    """Signal the very process that a pidfd means; it may be dead. Returns whether that could be done.
+
+    A system can refuse it (a security module, another user's process): nobody ends for that.
+    """
+    try:
+        signal.pidfd_send_signal(pidfd, signum)
+    except ProcessLookupError:
+        return True
+    except OSError:
+        return False
+    return True
 
 
 def parent_of(pid: int) -> int:

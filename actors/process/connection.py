@@ -15,7 +15,25 @@ import msgspec
 
 from ..codec import ARRAY, MAX_BYTES, array_head, encode_special, too_large, unencodable
 from ..errors import BadMessage, HoldfastError, type_name
-from .frames import AnyFrame, Frame, Name, Run, Tell, tagged
+from ..values.budget import MOST_CONTAINERS, check_containers
+from .frames import (
+    AnyFrame,
+    Ask,
+    Command,
+    Failure,
+    Forget,
+    Frame,
+    Launch,
+    Name,
+    Offer,
+    Piece,
+    Publish,
+    Record,
+    Reply,
+    Run,
+    Tell,
+    tagged,
+)
 
 LENGTH = struct.Struct("<I")
 MAX_FRAME = MAX_BYTES + 64 * 1024
@@ -30,7 +48,16 @@ RUN_BYTES = 32 * 1024
 """Payload after which a run of messages is closed; a single one larger than an eighth of this is no part of a run."""
 LARGE_ARRAY = 64 * 1024
 """Arrays from this size on are written from where they are instead of being copied into the frame."""
-_RUN = tagged(Run)
+_RUN, _FORGET = tagged(Run), tagged(Forget)
+MOST_NAMES = 4096
+"""Names after which a sender forgets all that it has given: whoever was written to once is not remembered for ever."""
+SMALL_BYTES = 1024 * 1024
+"""The largest frame of a kind that carries no payload: what is in it may be anything, and takes many times the room."""
+_CARRIERS: frozenset[type[Frame]] = frozenset((Tell, Ask, Reply, Failure, Offer, Publish, Record, Piece))
+_FROM_ROOT: frozenset[type[Frame]] = _CARRIERS | {Launch, Run, Command}
+_CARRIER_TAGS, _FROM_ROOT_TAGS = (frozenset(tagged(kind)[1] for kind in kinds) for kinds in (_CARRIERS, _FROM_ROOT))
+FRAMES_PER_TICK = 128
+"""Frames of one guarded peer, each 4 KiB counting as one more, after which others come first."""
 
 _DECODER: msgspec.msgpack.Decoder[AnyFrame] = msgspec.msgpack.Decoder(AnyFrame)
 
@@ -49,7 +76,9 @@ class BadFrame(HoldfastError):
 class Connection(asyncio.BufferedProtocol):
     """One end. `on_frame` gets each frame in the order it was sent; `on_lost` is called once, at the end.
 
-    A frame's `body` lies in the buffer: it is decoded or copied before `on_frame` returns.
+    A frame's `body` lies in the buffer: it is decoded or copied before `on_frame` returns. Whatever a handler raises
+    means that the peer said what cannot be: the connection ends. Of a `guarded` peer only so much is taken in at a
+    time, nothing while it does not read itself, and no large frame of a kind that only we may send.
     """
 
     def __init__(
@@ -57,6 +86,8 @@ class Connection(asyncio.BufferedProtocol):
         on_frame: Callable[[AnyFrame], None],
         on_lost: Callable[[Exception | None], None],
         on_batch: Callable[[], None] | None = None,
+        *,
+        guarded: bool = False,
     ) -> None:
         self._on_frame, self._on_lost, self._on_batch = on_frame, on_lost, on_batch
         self.takers: dict[type[Frame], Callable[[Any], None]] = {}  # frames of these types do not go to `on_frame`
@@ -74,7 +105,12 @@ class Connection(asyncio.BufferedProtocol):
         self._paused = False
         self._waiters: list[asyncio.Future[None]] = []
         self._names_out: dict[str, int] = {}
+        self._is_full = False  # so many names that they are forgotten behind the next frame
+        self.kinds_out: dict[type, int] = {}  # the numbers of message types' names
         self._names_in: list[str] = []
+        self._guarded, self._is_resting = guarded, False
+        self._large_in = _CARRIER_TAGS if guarded else _FROM_ROOT_TAGS
+        self._large_out = _FROM_ROOT if guarded else _CARRIERS
         self._buffer = bytearray(READ_BYTES)
         self._view = memoryview(self._buffer)
         self._begin = self._end = 0
@@ -86,9 +122,22 @@ class Connection(asyncio.BufferedProtocol):
         """A name as the peer will understand it; text the first time."""
         number = self._names_out.get(text)
         if number is None:
-            self._names_out[text] = len(self._names_out)
+            number = self._names_out[text] = len(self._names_out)
+            self._is_full = number >= MOST_NAMES
             return text
         return number
+
+    def _forget(self) -> None:
+        """Give all names anew from the next frame on."""
+        self._names_out.clear()
+        self.kinds_out.clear()
+        self._is_full = False
+        self._out += (len(_FORGET).to_bytes(4, "little"), _FORGET)
+        self._out_bytes += len(_FORGET)
+
+    def forget_in(self) -> None:
+        """The peer gives all its names anew."""
+        self._names_in.clear()
 
     def name_in(self, name: Name) -> str:
         """A name the peer sent.
@@ -132,13 +181,15 @@ class Connection(asyncio.BufferedProtocol):
         if self._large:
             parts = self._spliced(data)
             size = sum(map(len, parts))
-        if size > MAX_FRAME:
+        if size > SMALL_BYTES and (size > MAX_FRAME or type(frame) not in self._large_out):
             payload = getattr(frame, "body", None)
             self._forget_names(frame)
             raise BadMessage(actor, type_name(type(payload)), too_large(payload, size))
         self._out.append(size.to_bytes(4, "little"))
         self._out += parts
         self._out_bytes += size
+        if self._is_full:
+            self._forget()
         if not self._flushing:
             self._flushing = True
             self._loop.call_soon(self.flush)
@@ -231,10 +282,17 @@ class Connection(asyncio.BufferedProtocol):
             transport.write(b"".join(out))
         else:
             transport.writelines(out)  # Large frames are not copied together.
+            # The stock loop of early releases of CPython 3.12 and 3.13 forgets there to pause us; here it looks.
+            transport.set_write_buffer_limits(HIGH_BYTES)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the peer keeps up."""
+        return not self._paused and self._out_bytes + self._run_bytes < HIGH_BYTES
 
     def room(self) -> asyncio.Future[None] | None:
         """None while the peer keeps up; else a future that ends when it does again."""
-        if not self._paused and self._out_bytes + self._run_bytes < HIGH_BYTES:
+        if self.has_room:
             return None
         future: asyncio.Future[None] = self._loop.create_future()
         self._waiters.append(future)
@@ -261,6 +319,8 @@ class Connection(asyncio.BufferedProtocol):
         for future in waiters:
             if not future.done():
                 future.set_result(None)
+        if self._is_resting:
+            self._loop.call_soon(self._go_on)
 
     def get_buffer(self, sizehint: int) -> memoryview:
         if self._end == len(self._buffer):
@@ -284,25 +344,40 @@ class Connection(asyncio.BufferedProtocol):
 
     def buffer_updated(self, nbytes: int) -> None:
         self._end += nbytes
-        try:
-            self._take_frames()
-        except (BadFrame, msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            self.close(error if isinstance(error, BadFrame) else BadFrame(str(error)))
-            return
-        if self._on_batch is not None:
-            self._on_batch()
+        self._take_in(FRAMES_PER_TICK if self._guarded else sys.maxsize)
 
-    def _take_frames(self) -> None:
+    def _take_in(self, most: int) -> None:
+        """Take in frames; `most`: how many small ones at once."""
+        try:
+            self._take_frames(most)
+        except BadFrame as error:
+            self.close(error)
+        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+            self.close(BadFrame(str(error)))
+        except Exception as error:  # What a handler was told cannot be: else it would not raise.
+            self.close(BadFrame(f"{type_name(type(error))}: {error}"))
+        else:
+            if self._on_batch is not None:
+                self._on_batch()
+
+    def _take_frames(self, left: int) -> None:
         begin, end, view, buffer = self._begin, self._end, self._view, self._buffer
         unpack, decode, on_frame, taker = LENGTH.unpack_from, _DECODER.decode, self._on_frame, self.takers.get
         while end - begin >= 4:
             (size,) = unpack(buffer, begin)
-            if size > MAX_FRAME:
-                raise BadFrame(f"{size} bytes are announced, the limit is {MAX_FRAME}")
+            if size > SMALL_BYTES:
+                self._check_large(begin + 4, end, size)
             if end - begin - 4 < size:
                 break
+            if left < 0:
+                self._begin = begin
+                self._rest()
+                return
             start = begin + 4
             begin = start + size
+            left -= 1 + (size >> 12)
+            if size > MOST_CONTAINERS and self._guarded:
+                check_containers(view[start:begin])
             frame = decode(view[start:begin])
             taker(type(frame), on_frame)(frame)
             if not self.is_open:
@@ -313,11 +388,41 @@ class Connection(asyncio.BufferedProtocol):
                 self._buffer = bytearray(READ_BYTES)
                 self._view = memoryview(self._buffer)
         self._begin, self._end = begin, end
+        if self._guarded and self._paused:
+            self._rest()
+
+    def _check_large(self, start: int, end: int, size: int) -> None:
+        """See whether a frame may be so large, before there is memory for it."""
+        if size > MAX_FRAME:
+            raise BadFrame(f"{size} bytes are announced, the limit is {MAX_FRAME}")
+        if end - start < 2:
+            return  # Its kind has not come yet.
+        head, tag = self._buffer[start], self._buffer[start + 1]
+        if head & 0xF0 != 0x90 or tag not in self._large_in:
+            raise BadFrame(f"{size} bytes are announced for a frame without a payload, the limit is {SMALL_BYTES}")
+
+    def _rest(self) -> None:
+        """Take in nothing more until others had their turn, and the peer has read what it was sent."""
+        if not self._is_resting and self._transport is not None:
+            self._is_resting = True
+            self._transport.pause_reading()
+        if not self._paused:
+            self._loop.call_soon(self._go_on)
+
+    def _go_on(self) -> None:
+        """Take in what was left."""
+        if not self._is_resting or self._paused or not self.is_open or self._transport is None:
+            return
+        self._is_resting = False
+        self._transport.resume_reading()
+        self._take_in(FRAMES_PER_TICK)
 
     def eof_received(self) -> bool:
         return False
 
     def connection_lost(self, exc: Exception | None) -> None:
+        if self._is_resting and self.is_open:
+            self._take_in(sys.maxsize)  # It may have said in the end why it has ended.
         self._lose(exc)
 
     def close(self, error: Exception | None = None) -> None:

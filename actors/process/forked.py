@@ -11,7 +11,9 @@ import signal
 import socket
 from dataclasses import dataclass
 
+from ..memory import keep_size, unnamed
 from .boot import HEADER, PAGE_BYTES, Kind
+from .children import signal_by
 
 SOCKET_BYTES = 2 * 1024 * 1024
 
@@ -34,11 +36,12 @@ class Forked:
     stderr_fd: int
     page: mmap.mmap
 
-    def kill(self, signum: int = signal.SIGKILL) -> None:
-        """Send a signal to this very process; nothing happens if it is dead already."""
-        if self.pidfd >= 0:
-            with contextlib.suppress(ProcessLookupError):
-                signal.pidfd_send_signal(self.pidfd, signum)
+    def kill(self, signum: int | None = None) -> bool:
+        """Send a signal, SIGKILL if left out, to this very process; nothing happens if it is dead already.
+
+        Returns whether that could be.
+        """
+        return self.pidfd < 0 or signal_by(self.pidfd, signal.SIGKILL if signum is None else signum)
 
     def close(self) -> None:
         """Give everything back; may be called twice. The process sees the end of its socket."""
@@ -74,9 +77,10 @@ class ForkRequest:
             self._set_up(self.sock, theirs)
             self.stdout_fd, stdout = self._pipe(undo)
             self.stderr_fd, stderr = self._pipe(undo)
-            page_fd = os.memfd_create("holdfast-page", os.MFD_CLOEXEC)
+            page_fd = unnamed("holdfast-page")
             undo.callback(os.close, page_fd)
             os.ftruncate(page_fd, PAGE_BYTES)
+            keep_size(page_fd)
             self.page = mmap.mmap(page_fd, PAGE_BYTES)
             undo.pop_all()
         self._child_fds = [theirs.detach(), stdout, stderr, page_fd]

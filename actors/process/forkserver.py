@@ -9,7 +9,6 @@ Source: the fork server of `multiprocessing`; the zygote of Android.
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import os
 import signal
@@ -20,6 +19,7 @@ from collections.abc import Callable, Sequence
 
 from ..errors import ProcessUnavailable
 from .boot import HEADER, Kind, receive
+from .children import signal_by
 from .forked import SOCKET_BYTES, Forked, ForkRequest, has_ended
 from .launch import check_can_start, inherited, server_command, server_config, server_environment
 
@@ -127,11 +127,14 @@ class ForkServer:
             )
         try:
             self._pidfd = os.pidfd_open(self._process.pid)
-        except OSError:
+            self._loop.add_reader(self._pidfd, self._on_death)
+        except BaseException:
             self._process.kill()  # not reaped yet, so the pid is still its own
             self._process.wait()
+            if self._pidfd >= 0:  # The loop refuses it: a virtual clock waits for no process.
+                os.close(self._pidfd)
+                self._pidfd = -1
             raise
-        self._loop.add_reader(self._pidfd, self._on_death)
         self._loop.add_reader(ours.fileno(), self._on_readable)
 
     async def stop(self, timeout: float = 2.0) -> None:
@@ -150,8 +153,7 @@ class ForkServer:
                 await self._ended.wait()
         except TimeoutError:
             if self._pidfd >= 0:  # it may have ended in the very tick the time was up
-                with contextlib.suppress(ProcessLookupError):
-                    signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
+                signal_by(self._pidfd, signal.SIGKILL)
             await self._ended.wait()
 
     def _on_death(self) -> None:
@@ -327,8 +329,7 @@ class ForkServer:
         request = self._requests.pop(number, None)
         if request is None or request.outcome.done():  # given up meanwhile
             for fd in fds:
-                with contextlib.suppress(ProcessLookupError):
-                    signal.pidfd_send_signal(fd, signal.SIGKILL)
+                signal_by(fd, signal.SIGKILL)
                 os.close(fd)
         elif not fds:  # no descriptor was free here; the child ends with its socket
             request.outcome.set_exception(ProcessUnavailable("no process can be started: out of file descriptors"))

@@ -1,19 +1,25 @@
 """Frames: what travels between the root and an actor process, both ways.
 
 A frame is a 4-byte length and a MessagePack array `[kind, ...]`. Addresses and type names are sent as text once, and as
-a number from then on. `body` is a payload that whoever routes the frame does not decode.
+a number from then on, until the sender says that it forgets them (`Forget`). `body` is a payload that whoever routes
+the frame does not decode.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 
 Raw = msgspec.Raw
 Name = int | str
 """An address or type name: text the first time, its number in order of first use from then on."""
+
+
+LONGEST_CHAIN = 4096
+"""Turns that wait for each other, in the chain of an ask."""
+Chain = Annotated[tuple[tuple[str, int], ...], msgspec.Meta(max_length=LONGEST_CHAIN)]
 
 
 class Frame(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
@@ -40,7 +46,7 @@ class Ask(Frame, tag=2):
     until: float
     number: int = 0
     sender: Name | None = None
-    chain: tuple[tuple[str, int], ...] = ()
+    chain: Chain = ()
 
 
 class Reply(Frame, tag=3):
@@ -148,6 +154,20 @@ class Moved(Frame, tag=14):
     """The page has changed: told to a bounded mailbox only, at most once per loop tick."""
 
 
+class Forget(Frame, tag=16):
+    """All names that the sender has given so far are forgotten; their numbers begin again."""
+
+
+class Piece(Frame, tag=17):
+    """A piece of what an actor takes along when it is moved."""
+
+    to: Name
+    attempt: int
+    step: str
+    part: bytes
+    is_last: bool
+
+
 def tagged(kind: type[Frame]) -> bytes:
     """How a frame of this kind begins: an array, and its tag."""
     tag = kind.__struct_config__.tag
@@ -171,4 +191,6 @@ AnyFrame = (
     | Offer
     | Moved
     | Run
+    | Forget
+    | Piece
 )

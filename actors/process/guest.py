@@ -7,26 +7,30 @@ import mmap
 import os
 import socket
 import sys
-from collections.abc import Callable
+import weakref
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import msgspec
-import uvloop
 
 from .. import exits, lives
 from ..cell import RUNNING, Cell
 from ..control.calls import obey_order
-from ..errors import HoldfastError, StartFailed, StartIgnored
+from ..errors import HoldfastError, NotGranted, StartFailed, StartIgnored
 from ..events import ActorStarted, Event, event_data
 from ..exits import ExitReason, pack_exit
-from ..message import message_name
+from ..fast_loop import new_event_loop
+from ..mail import AnyTable
+from ..message import Order, message_name
 from ..node import Node
+from ..ref import current
 from ..topics import Topics
 from . import frames
 from .connection import BadFrame, Connection
-from .moves import GuestMoves
+from .gate import is_at_or_below, is_granted
+from .moves import GuestMoves, word_of
 from .recipe import unpack_recipe
-from .relay import Arrived, OutsideHost, Peer, RelayedAsk, named, obey, text
+from .relay import Arrived, OutsideHost, Peer, RelayedAsk, named, obey
 
 ENDED_WITHIN = 1.0
 """Seconds that an ended process waits for the root to read why it has ended."""
@@ -41,14 +45,14 @@ def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callabl
     """Serve the root until its socket ends. Returns the exit code."""
     page = memoryview(mmap.mmap(page_fd, 0)).cast("Q")
     os.close(page_fd)
-    with asyncio.Runner(loop_factory=uvloop.new_event_loop) as runner:
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
         return runner.run(_serve(sock, page, launcher, prepare))
 
 
 async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
     guest = Guest(asyncio.get_running_loop(), page, launcher)
     prepare(guest)
-    guest.connection = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
+    guest.join(Connection(guest.on_frame, guest.on_lost, guest.on_batch))
     guest.connection.takers = guest.takers
     await guest.connection.open(sock)
     code = await guest.ended
@@ -97,6 +101,30 @@ class GuestTopics(Topics):
         self._guest.command(cell, "unsubscribe", {"topic": topic})
 
 
+class OutsideTable(AnyTable):
+    """The table of an actor that is not in this process: whether an order may be given there is looked at each time."""
+
+    def __contains__(self, kind: object) -> bool:
+        return not issubclass(kind, Order)  # type: ignore[arg-type]  # a message's type
+
+
+OUTSIDE = OutsideTable()
+
+
+class GuestOutsideHost(OutsideHost):
+    """The host of stand-ins for actors outside of this process: orders go only to whom it may give some."""
+
+    peer: Guest
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.peer.require_granted(cell.path, "stop")
+        super().stop(cell, reason)
+
+    def kill(self, cell: Cell) -> None:
+        self.peer.require_granted(cell.path, "kill")
+        super().kill(cell)
+
+
 class NudgingPage:
     """The page of an actor with a bounded mailbox: the home is told, once per loop tick, when it has changed."""
 
@@ -130,7 +158,7 @@ class Guest(Peer):
         self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}
-        self._host = OutsideHost(self)
+        self._host = GuestOutsideHost(self)
         self.node.outside = self.outside
         self.node.uplink = self
         self.node.here = InnerHost(self)
@@ -146,6 +174,8 @@ class Guest(Peer):
             frames.Launch: self._launch,
             frames.Command: lambda frame: self._command(self._target(frame.to), frame),
             frames.Record: self.on_record,
+            frames.Piece: lambda frame: self.moves.obey(self._target(frame.to), word_of(frame)),
+            frames.Forget: self.on_forget,
         }
 
     # -- the world outside ------------------------------------------------------------------------------------------
@@ -159,8 +189,21 @@ class Guest(Peer):
         if cell is None:
             cell = self._outside[path] = Cell(self.node, None, path, self._host)
             cell.state = RUNNING
-            cell.admit = self._host.admit
+            cell.admit, cell.table = self._host.admit, OUTSIDE
         return cell
+
+    def require_granted(self, path: str, order: str) -> None:
+        """See whether an actor here may give this order; the root would end the process for one that may not.
+
+        Raises:
+            NotGranted: it may not.
+        """
+        root = self.node.root
+        if root is None or is_at_or_below(path, root.path):
+            return
+        if not is_granted(path, every_cell(root)):
+            sender = current.get(None)
+            raise NotGranted(path, order, root.path if sender is None else sender.path)
 
     def publish(self, topic: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
         """Publish through the root; the future ends when every subscriber has accepted."""
@@ -179,7 +222,7 @@ class Guest(Peer):
         """An address of this process is free."""
         root = self.node.root
         reason = cell.more.reason if cell.more is not None else exits.SHUTDOWN
-        with_parent = cell.parent is not None and cell.parent.state is not RUNNING
+        with_parent = lives.parent_ended(cell)
         if root is not None:
             data = {"path": cell.path, "reason": pack_exit(reason), "with_parent": with_parent}
             self.command(root, "gone", data)
@@ -200,6 +243,14 @@ class Guest(Peer):
                 return  # The root tells of this one when it is up.
             self._tell_born(event.address)
         self.connection.send(frames.Note(type(event).__name__, event_data(event)))
+
+    def on_forget(self, frame: frames.Forget) -> None:
+        """The root gives all its names anew: a good time to forget who was written to and is known to nobody here."""
+        super().on_forget(frame)
+        self._targets.clear()
+        still = weakref.WeakValueDictionary(self._outside)
+        self._outside.clear()
+        self._outside.update(still)
 
     # -- frames from the root ---------------------------------------------------------------------------------------
 
@@ -326,7 +377,7 @@ class Guest(Peer):
 
     def _command(self, cell: Cell, frame: frames.Command) -> None:
         if frame.verb == "bind":
-            cell.extra().bindings[text(frame, "port")] = named(self.node, frame, "target")
+            cell.extra().bindings[str(frame.data["port"])] = named(self.node, frame, "target")
         elif frame.verb == "control":
             obey_order(self, cell, frame)
         elif frame.verb == "move":
@@ -358,6 +409,13 @@ class Guest(Peer):
         if self.connection.is_open:
             self.connection.send(frames.Beat())
             self.node.loop.call_later(interval, self._beat, interval)
+
+
+def every_cell(top: Cell) -> Iterator[Cell]:
+    """An actor, and all below it."""
+    yield top
+    for cell in (top.children or {}).values():
+        yield from every_cell(cell)
 
 
 def _apply(limits: dict[str, Any]) -> None:

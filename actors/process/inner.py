@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import TYPE_CHECKING, Any
 
 from .. import links, lives
@@ -24,6 +25,10 @@ class Inner:
         self._node = node
         self._host = OutsideHost(peer)
         self._cells: dict[str, Cell] = {}
+
+    def cells(self) -> Collection[Cell]:
+        """All of them that are there."""
+        return self._cells.values()
 
     def born(self, home: Cell, path: str, kind: str, life: int) -> None:
         """A life has begun at `path` below `home`.

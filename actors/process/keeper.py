@@ -8,6 +8,8 @@ What it promises
     * The end of the program is told when nothing of it is left: who starts it anew finds its port free.
     * If the keeper itself is killed, the kernel kills the program (PDEATHSIG; the keeper has one thread, so the signal
       cannot come too early), and the owner the rest of its process group.
+    * A program that has become another user may be out of its reach. Then it says so, stays, and tells of the end that
+      the program finds by itself, or by somebody who may.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ else:
     import _signal as signal
 
 STARTED, FAILED, ENDED = b"S", b"F", b"E"  # to the owner: pid; why not; wait status
+DENIED = b"D"  # to the owner: why SIGKILL is refused; the keeper goes on
 TO_PROGRAM, TO_GROUP = b"P", b"G"  # to the keeper: a signal's number; the end of the socket means SIGKILL for all
 
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
@@ -151,15 +154,15 @@ class Keeper:
         """Do as the owner says; False: it wants an end of all."""
         try:
             packet = os.read(self._control, 64)
-        except ConnectionError:
+        except OSError:
             return False
         if not packet:
             return False
         signal_it: Callable[[int, int], None] = os.killpg if packet[:1] == TO_GROUP else os.kill
         try:
             signal_it(self._pid, int(packet[1:]))  # It has not been reaped: the number is its own.
-        except ProcessLookupError:
-            pass
+        except OSError:
+            pass  # It is gone, or another user's: what follows in the end is SIGKILL, and that is told of.
         return True
 
     # -- deaths -----------------------------------------------------------------------------------------------------
@@ -182,13 +185,31 @@ class Keeper:
 
     def _end_all(self) -> None:
         """Kill and reap until nothing is left; the children of what is reaped come to us, which is another round."""
+        is_told = False
         try:
             while True:
-                for pid in children():
-                    os.kill(pid, signal.SIGKILL)
+                why = kill_all(children())
+                if why and not is_told:
+                    is_told = True
+                    if self._status is None:  # Those in its group who are no children of ours may be within reach.
+                        kill_all([-self._pid])
+                    self._tell(DENIED + why)
                 self._note(*os.waitpid(-1, 0))
         except ChildProcessError:
             pass
+
+
+def kill_all(pids: list[int]) -> bytes:
+    """SIGKILL for each; returns why one cannot be killed, nothing if all can."""
+    why = b""
+    for pid in pids:
+        try:
+            os.kill(pid, signal.SIGKILL)
+        except ProcessLookupError:
+            pass
+        except OSError as error:
+            why = f"process {pid}: {error.strerror}".encode()
+    return why
 
 
 def children() -> list[int]:
@@ -197,7 +218,7 @@ def children() -> list[int]:
     try:
         with open(f"/proc/self/task/{me}/children", "rb") as file:
             return [int(pid) for pid in file.read().split()]
-    except FileNotFoundError:  # A kernel without CONFIG_PROC_CHILDREN.
+    except OSError:  # A kernel without CONFIG_PROC_CHILDREN.
         return [int(name) for name in os.listdir("/proc") if name.isdecimal() and parent_of(name) == me]
 
 

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
-from ..errors import HoldfastError, ProcessUnavailable
+from ..errors import ActorStopped, HoldfastError, ProcessUnavailable
 from ..exits import NORMAL, Exited, ExitReason, Hung, OutOfMemory, Signal
 from . import keeper
 from .input import InputWriter
@@ -43,6 +43,7 @@ class Kept:
     Attributes:
         started: the program's pid; fails with ProgramFailed.
         ended: why it ended; set when nothing of it is left, neither processes nor descriptors.
+        denied: why it cannot be ended, once that was tried in vain: it runs as another user. It is still watched.
     """
 
     def __init__(
@@ -54,7 +55,7 @@ class Kept:
         cwd: str | None,
         limits: Limits | None,
         on_line: Callable[[str, str], None],
-        on_part: Callable[[str, str], None] | None = None,
+        on_part: Callable[[str, str, str], None] | None = None,
         stdin: bool = False,
     ) -> None:
         """Begin the start.
@@ -62,7 +63,7 @@ class Kept:
         Args:
             env: the whole environment.
             on_line: called with "stdout" or "stderr" and each line.
-            on_part: called with that and what has come of a line that has no end yet.
+            on_part: called with that, what has come of a line that has no end yet, and that with the piece before it.
             stdin: whether it gets something to read (`input`); else its standard input is at its end.
 
         Raises:
@@ -74,9 +75,11 @@ class Kept:
         self.node, self.pid, self._name = node, -1, command[0]
         self.started: asyncio.Future[int] = loop.create_future()
         self.ended: asyncio.Future[ExitReason] = loop.create_future()
+        self.denied: asyncio.Future[str] = loop.create_future()
         self._limits = limits
         self._killed_for: ExitReason | None = None
         self._status: int | None = None
+        self._open = 0  # outputs that have not been handed on to their ends
         self._oom_before = oom_kills()
         self._watch: Watch | None = None
         self.input: InputWriter | None = None
@@ -90,7 +93,7 @@ class Kept:
         self,
         order: bytes,
         on_line: Callable[[str, str], None],
-        on_part: Callable[[str, str], None] | None,
+        on_part: Callable[[str, str, str], None] | None,
         stdin: bool,
     ) -> None:
         with contextlib.ExitStack() as theirs, contextlib.ExitStack() as undo:
@@ -116,6 +119,8 @@ class Kept:
             undo.callback(self._keeper.wait)
             undo.callback(self._keeper.kill)
             self._pidfd = os.pidfd_open(self._keeper.pid)
+            undo.callback(os.close, self._pidfd)
+            self._loop.add_reader(self._pidfd, self._bury)  # A virtual clock refuses.
             undo.pop_all()
         loop = self._loop
         self._outputs = [
@@ -130,7 +135,6 @@ class Kept:
         if into >= 0:
             self.input = InputWriter(loop, into)
         loop.add_reader(self._control, self._read)
-        loop.add_reader(self._pidfd, self._bury)
 
     # -- what is asked of it ----------------------------------------------------------------------------------------
 
@@ -138,6 +142,9 @@ class Kept:
         """Send a signal to the program, or to its whole process group; nothing happens if it has ended."""
         if self.pid > 0:
             self._say((keeper.TO_GROUP if group else keeper.TO_PROGRAM) + b"%d" % number)
+
+    def given_up(self, error: ActorStopped) -> None:
+        """The address is gone for good: nobody waits for a program by its address."""
 
     def kill(self, reason: ExitReason | None = None) -> None:
         """SIGKILL for the program and all that descends from it; `reason` is then why it ended."""
@@ -154,6 +161,10 @@ class Kept:
     async def wait(self) -> ExitReason:
         """Wait until nothing of it is left."""
         return await asyncio.shield(self.ended)
+
+    async def wait_killed(self) -> None:
+        """Wait until nothing of it is left, or it is known that it cannot be ended."""
+        await asyncio.wait((self.ended, self.denied), return_when=asyncio.FIRST_COMPLETED)
 
     # -- what it tells ----------------------------------------------------------------------------------------------
 
@@ -173,6 +184,9 @@ class Kept:
                 self._fail(text.decode("utf-8", "replace"))
             case keeper.ENDED:
                 self._status = int(text)
+            case keeper.DENIED:
+                if not self.denied.done():
+                    self.denied.set_result(text.decode("utf-8", "replace"))
             case _:
                 self._loop.remove_reader(self._control)
                 return False
@@ -207,14 +221,19 @@ class Kept:
         if self._status is None and self.pid > 0:  # It was killed, and the program with it; not what that had started.
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(self.pid, signal.SIGKILL)
-        for output in self._outputs:
-            output.close()
         if self._watch is not None:
             self._watch.close()
         if self.input is not None:
             self.input.close()
         self._fail(f"its keeper ended with code {code}")
-        if not self.ended.done():
+        self._open = len(self._outputs)
+        for output in self._outputs:
+            output.close(functools.partial(self._all_said, reason))
+
+    def _all_said(self, reason: ExitReason) -> None:
+        """One of its outputs has nothing more."""
+        self._open -= 1
+        if not self._open and not self.ended.done():
             self.ended.set_result(reason)
 
     def _reason(self) -> ExitReason:

@@ -103,15 +103,30 @@ def server_config(entry: str, preload: list[str]) -> Config:
 def _program() -> tuple[str, bool]:
     """What `__main__` is: a module's name, or a path (then True), or "" if it cannot be imported a second time."""
     module = sys.modules["__main__"]
-    if hasattr(sys, "ps1") or hasattr(builtins, "__IPYTHON__"):
+    if why_not_importable():
         return "", False
+    if module.__spec__ is not None:
+        return module.__spec__.name, False
+    assert module.__file__ is not None
+    return os.path.abspath(module.__file__), True
+
+
+def why_not_importable() -> str:
+    """Why other processes cannot import `__main__`, and what to do about it; nothing if they can."""
+    module = sys.modules["__main__"]
+    if hasattr(sys, "ps1") or hasattr(builtins, "__IPYTHON__"):
+        return "it is a notebook or a prompt; write the class into a .py file, and import it from there"
     if module.__spec__ is not None:  # python -m name; a package's __main__.py seldom has a guard
         name = module.__spec__.name
-        return ("", False) if name.rpartition(".")[2] == "__main__" else (name, False)
+        if name == "__main__":
+            return "it is the __main__.py of an archive or a folder; move the class to another module in there"
+        package, _, last = name.rpartition(".")
+        if last == "__main__":
+            return f"it is the __main__.py of the package {package}; move the class to another module of the package"
+        return ""
     file = getattr(module, "__file__", None)
-    if file is None:  # python -c
-        return "", False
-    path = os.path.abspath(file)
-    if os.path.dirname(path) in {os.path.dirname(sys.executable), sysconfig.get_path("scripts")}:
-        return "", False  # a console script, such as pytest, defines no actors
-    return path, True
+    if file is None or not os.path.isfile(file):
+        return "it was given with `python -c`, or through a pipe; write it into a .py file"
+    if os.path.dirname(os.path.abspath(file)) in {os.path.dirname(sys.executable), sysconfig.get_path("scripts")}:
+        return "it is a console script, such as pytest; move the class to a module"
+    return ""

@@ -7,13 +7,18 @@ handled nothing, when it becomes the one; until then the old one is only at rest
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..cell import Cell, Host
-from ..control.moving import Transit
+from ..control.moving import ATTEMPTS, Transit
 from ..errors import CannotMove, StartFailed
 from ..exits import ExitReason, Shutdown
+from .moves import send_step
+
+if TYPE_CHECKING:
+    from .workers import Worker
 
 T = TypeVar("T")
 
@@ -25,6 +30,7 @@ class Move:
 
     def __init__(self, cell: Cell, host: Host, timeout: float) -> None:
         self.cell, self.host, self.timeout = cell, host, timeout
+        self.attempt = next(ATTEMPTS)
         self.node = cell.node
         self.given_up: asyncio.Future[str] = self.node.loop.create_future()
         self.transit: Transit | None = None
@@ -33,6 +39,7 @@ class Move:
         self.is_late = False  # its life has ended before it was at rest
         self.moved: Callable[[], None] = lambda: None  # called at once when the new life is the one
         self._start = cell.extra().start
+        self._hearing = contextlib.ExitStack()
 
     async def run(self) -> None:
         """Move the actor.
@@ -53,6 +60,7 @@ class Move:
                 raise CannotMove(self.cell.path, f"its new life could not begin ({error.reason})") from error
             raise
         finally:
+            self._hearing.close()
             enders = self.cell.extra().enders
             if enders is not None and ended in enders:
                 enders.remove(ended)
@@ -99,6 +107,18 @@ class Move:
         if self.given_up.done():
             raise CannotMove(self.cell.path, self.given_up.result())
         raise CannotMove(self.cell.path, f"{why()} within {seconds:g} s")
+
+    def say(self, worker: Worker, step: str, **told: Any) -> None:
+        """Tell the process at the other end of the move, which begins or gives up the life."""
+        send_step(worker.connection, self.cell.path, self.attempt, step, **told)
+
+    def hear(self, worker: Worker) -> None:
+        """Have what the process says of this attempt told to `heard`, until the move is over."""
+        worker.movers[self.attempt] = self.heard
+        self._hearing.callback(worker.movers.pop, self.attempt, None)
+
+    def heard(self, data: dict[str, Any]) -> None:
+        """A word of the process."""
 
     def at_rest(self) -> None:
         """The old life handles nothing any more."""

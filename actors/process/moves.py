@@ -31,18 +31,30 @@ PIECE = 4 * 1024 * 1024
 """Bytes of luggage per frame: it may be larger than a frame can be."""
 
 
-def send_luggage(connection: Connection, path: str, step: str, luggage: dict[str, Any]) -> None:
+def send_step(connection: Connection, path: str, attempt: int, step: str, **told: Any) -> None:
+    """Send one word of a move. It carries the number of its attempt, both ways: words of an earlier one are void."""
+    data = {"step": step, "attempt": attempt, **told}
+    connection.send(frames.Command(connection.name_out(path), "move", data), path)
+
+
+def send_luggage(connection: Connection, path: str, attempt: int, step: str, luggage: dict[str, Any]) -> None:
     """Send what an actor takes along, in pieces."""
     data = encode_value(luggage, where=path)
     for at in range(0, len(data), PIECE):
-        part = {"step": step, "part": data[at : at + PIECE], "is_last": at + PIECE >= len(data)}
-        connection.send(frames.Command(connection.name_out(path), "move", part), path)
+        is_last = at + PIECE >= len(data)
+        connection.send(frames.Piece(connection.name_out(path), attempt, step, data[at : at + PIECE], is_last), path)
+
+
+def word_of(piece: frames.Piece) -> dict[str, Any]:
+    """A piece as a word of its move."""
+    return {"step": piece.step, "attempt": piece.attempt, "part": piece.part, "is_last": piece.is_last}
 
 
 class Luggage:
-    """What comes in pieces."""
+    """What comes in pieces; `imports`: from the root, which may have modules imported."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, imports: bool) -> None:
+        self._imports = imports
         self._parts: list[bytes] = []
 
     def take(self, data: dict[str, Any]) -> dict[str, Any] | None:
@@ -52,59 +64,33 @@ class Luggage:
             return None
         whole = b"".join(self._parts)
         self._parts.clear()
-        return cast("dict[str, Any]", decode_value(whole))
+        return cast("dict[str, Any]", decode_value(whole, imports=self._imports))
 
 
 class GuestMoves:
-    """The moves of a process's own actor."""
+    """The moves of the actors of a process: its own, or those below its supervisor; one attempt at a time for each."""
 
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
-        self._incoming = Luggage()
-        self._luggage: dict[str, Any] | None = None
-        self._take: Take | None = None
-        self._state = b""
-        self._stash: list[Any] = []
-        self._admit: Admit | None = None
-
-    def _say(self, step: str, **data: Any) -> None:
-        connection = self._guest.connection
-        root = self._guest.node.root
-        assert root is not None
-        connection.send(frames.Command(connection.name_out(root.path), "move", {"step": step, **data}))
+        self._attempts: dict[str, GuestMove] = {}  # by address: the actor that arrives has no cell yet
 
     def obey(self, cell: Cell, data: dict[str, Any]) -> None:
-        """Do the next step of a move.
+        """Do the next step of a move. The words of the root come in order: a new number ends an earlier attempt.
 
         Raises:
             BadFrame: there is no such step.
         """
-        match data.get("step"):
-            case "luggage":
-                self._luggage = self._incoming.take(data)
-            case "stash":
-                self._admit, cell.admit = cell.admit, self._put_aside
-            case "go":
-                self._go(cell, suspended=bool(data["suspended"]))
-            case "take":
-                take = self._take = self._taking(data["attempt"])
-                if cell.state is RUNNING:
-                    lives.urge(cell, take)
-            case "pack":
-                self._pack(cell)
-            case "back":
-                self._back(cell)
-            case "leave":
-                self._leave(cell, data)
-            case step:
-                raise BadFrame(f"a move has no step {step!r}")
-
-    def _put_aside(self, cell: Cell, item: Any) -> None:
-        if isinstance(item, Item):
-            item.stashed()  # It has no place in the order of arrival.
-        self._stash.append(item)
-
-    # -- arriving ---------------------------------------------------------------------------------------------------
+        step, number = data.get("step"), data.get("attempt")
+        if step == "leave":  # It follows no attempt: the actor lives elsewhere, for good.
+            self._attempts.pop(cell.path, None)
+            _leave(cell, data)
+            return
+        if not isinstance(number, int):
+            raise BadFrame(f"step {step!r} of a move has no attempt")
+        attempt = self._attempts.get(cell.path)
+        if attempt is None or attempt.number != number:
+            attempt = self._attempts[cell.path] = GuestMove(self._guest, number)
+        attempt.obey(cell, data)
 
     @staticmethod
     def prepare(recipe: bytes) -> None:
@@ -117,6 +103,67 @@ class GuestMoves:
 
     def begin(self, cell: Cell, start: Start[Any]) -> asyncio.Future[None]:
         """Begin the life of an actor that is moved here; the future ends when it is up. It handles nothing yet.
+
+        Raises:
+            HoldfastError, or what `set_state` raises.
+        """
+        attempt = self._attempts.get(cell.path)
+        if attempt is None:
+            raise BadFrame("an actor came without its state")
+        return attempt.begin(cell, start)
+
+
+class GuestMove:
+    """One attempt to move one actor into this process or out of it."""
+
+    def __init__(self, guest: Guest, number: int) -> None:
+        self._guest = guest
+        self.number = number
+        self._incoming = Luggage(imports=True)
+        self._luggage: dict[str, Any] | None = None
+        self._take: Take | None = None
+        self._state = b""
+        self._stash: list[Any] = []
+        self._admit: Admit | None = None
+
+    def _say(self, step: str, **told: Any) -> None:
+        root = self._guest.node.root
+        assert root is not None
+        send_step(self._guest.connection, root.path, self.number, step, **told)
+
+    def obey(self, cell: Cell, data: dict[str, Any]) -> None:
+        """Do the next step.
+
+        Raises:
+            BadFrame: there is no such step.
+        """
+        match data.get("step"):
+            case "luggage":
+                self._luggage = self._incoming.take(data)
+            case "stash":
+                self._admit, cell.admit = cell.admit, self._put_aside
+            case "go":
+                self._go(cell, suspended=bool(data["suspended"]))
+            case "take":
+                self._take = Take(_number, self._taken, lambda why: self._say("refused", why=why))
+                if cell.state is RUNNING:
+                    lives.urge(cell, self._take)
+            case "pack":
+                self._pack(cell)
+            case "back":
+                self._back(cell)
+            case step:
+                raise BadFrame(f"a move has no step {step!r}")
+
+    def _put_aside(self, cell: Cell, item: Any) -> None:
+        if isinstance(item, Item):
+            item.stashed()  # It has no place in the order of arrival.
+        self._stash.append(item)
+
+    # -- arriving ---------------------------------------------------------------------------------------------------
+
+    def begin(self, cell: Cell, start: Start[Any]) -> asyncio.Future[None]:
+        """Begin the life that arrives.
 
         Raises:
             HoldfastError, or what `set_state` raises.
@@ -161,14 +208,10 @@ class GuestMoves:
 
     # -- leaving ----------------------------------------------------------------------------------------------------
 
-    def _taking(self, attempt: int) -> Take:
-        def taken(actor: Actor, state: bytes) -> None:
-            self._state = state
-            more = actor.ctx.cell.extra()
-            rest = {"trap_exits": more.trap_exits, "suspended": more.suspended}
-            self._say("taken", attempt=attempt, at=now(), **rest)
-
-        return Take(_number, taken, lambda why: self._say("refused", attempt=attempt, why=why))
+    def _taken(self, actor: Actor, state: bytes) -> None:
+        self._state = state
+        more = actor.ctx.cell.extra()
+        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=more.suspended)
 
     def _pack(self, cell: Cell) -> None:
         """Nothing comes any more: send what there is."""
@@ -189,9 +232,10 @@ class GuestMoves:
                 "stash": pack_items(cell, cell.extra().stash or (), entry),
                 "queue": pack_items(cell, cell.queue or (), entry),
             }
-            send_luggage(self._guest.connection, cell.path, "packed", luggage)
+            send_luggage(self._guest.connection, cell.path, self.number, "packed", luggage)
         except Exception as error:  # Whatever a message of the actor's own raises while it is encoded.
-            self._say("refused", why=str(error) if isinstance(error, HoldfastError) else error_text(error))
+            why = str(error) if isinstance(error, HoldfastError) else error_text(error)
+            self._say("refused", why=why)
 
     def _back(self, cell: Cell) -> None:
         """The actor stays after all, or is not to be taken any more."""
@@ -202,16 +246,19 @@ class GuestMoves:
         if take.is_done and cell.state is RUNNING:
             resume(cell)
 
-    def _leave(self, cell: Cell, data: dict[str, Any]) -> None:
-        """The actor lives elsewhere: what is left here ends, and tells nobody."""
-        more = cell.extra()
-        for kept in (more.links, more.topics, more.monitors):
-            kept.clear()
-        if cell.queue is not None:
-            cell.queue.clear()
-        more.urgent = more.stash = None
-        cell.request_stop(unpack_exit(data["reason"]))
-        lives.up(cell)
+
+def _leave(cell: Cell, data: dict[str, Any]) -> None:
+    """The actor lives elsewhere: what is left here ends, and tells nobody."""
+    more = cell.extra()
+    for kept in (more.links, more.topics, more.monitors):
+        kept.clear()
+    if cell.queue is not None:
+        cell.queue.clear()
+    more.urgent = more.stash = None
+    if cell.ctx is not None:
+        cell.ctx.hand_on_promises()
+    cell.request_stop(unpack_exit(data["reason"]))
+    lives.up(cell)
 
 
 def await_up(cell: Cell, start: Start[Any]) -> asyncio.Future[None]:

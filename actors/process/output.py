@@ -4,26 +4,42 @@ from __future__ import annotations
 
 import asyncio
 import os
+import time
+from collections import deque
 from collections.abc import Callable
 
 LONGEST = 16 * 1024
 """Bytes after which a line without an end is passed on in pieces."""
+SLICE_SECONDS = 0.002
+"""How long lines are handed on before everybody else has a turn."""
 LAST_READS = 16
 """How often a pipe is read at the end: a descendant that writes without end must not hold us up."""
 
 
 class OutputReader:
-    """Reads a pipe and hands on each line, and to `on_part`, if given, what is there of one that has no end yet."""
+    """Reads a pipe and hands on each line, a slice at a time: whoever prints without end does not hold up the others.
+
+    While lines wait nothing more is read, so the writer waits.
+
+    Args:
+        on_line: called with each line, or piece of a very long one.
+        on_part: called with what is there of a line that has no end yet, and with that and the piece before it.
+    """
 
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
         fd: int,
         on_line: Callable[[str], None],
-        on_part: Callable[[str], None] | None = None,
+        on_part: Callable[[str, str], None] | None = None,
     ) -> None:
         self._loop, self._fd, self._on_line, self._on_part = loop, fd, on_line, on_part
         self._rest = b""
+        self._before = b""  # the last piece, if it was not the end of its line
+        self._lines: deque[tuple[bytes, bytes]] = deque()  # with what came before of the same line
+        self._is_closed = self._is_paused = False
+        self._then: Callable[[], None] | None = None
+        self._slice: asyncio.Handle | None = None
         loop.add_reader(fd, self._read)
 
     def _read(self) -> None:
@@ -36,32 +52,73 @@ class OutputReader:
         if not data:
             self.close()
             return
+        self._cut(data)
+        self._hand_on()
+
+    def _cut(self, data: bytes) -> None:
+        """Put what has come in line, in lines."""
         *lines, self._rest = (self._rest + data).split(b"\n")
+        for line in lines:
+            self._lines.append((line, self._before))
+            self._before = b""
         if len(self._rest) > LONGEST:
             end = _whole_characters(self._rest)
-            lines.append(self._rest[:end])
-            self._rest = self._rest[end:]
-        for line in lines:
-            self._on_line(line.decode("utf-8", "replace"))
-        if self._on_part is not None:
-            self._on_part(self._rest.decode("utf-8", "replace"))
+            self._lines.append((self._rest[:end], self._before))
+            self._before, self._rest = self._rest[max(0, end - LONGEST) : end], self._rest[end:]
 
-    def close(self) -> None:
-        """Take what is still in the pipe, then let go of it; a second call changes nothing."""
-        if self._fd < 0:
-            return
-        fd, self._fd = self._fd, -1
-        self._loop.remove_reader(fd)
-        try:
-            for _ in range(LAST_READS):
-                self._rest += os.read(fd, 64 * 1024)
-        except OSError:
-            pass  # Nothing more is there, or a descendant holds the other end open.
-        os.close(fd)
-        for line in self._rest.split(b"\n"):
-            if line:
-                self._on_line(line.decode("utf-8", "replace"))
-        self._rest = b""
+    def _hand_on(self) -> None:
+        """Hand on as many lines as the others can wait for, then let them have their turn."""
+        self._slice = None
+        until = time.perf_counter() + SLICE_SECONDS
+        while self._lines:
+            line, before = self._lines.popleft()
+            if before and self._on_part is not None:  # Nobody has seen the two together.
+                self._on_part(_text(line), _text(before + line))
+            self._on_line(_text(line))
+            if time.perf_counter() >= until and self._lines:
+                self._pause()
+                self._slice = self._loop.call_soon(self._hand_on)
+                return
+        if self._on_part is not None and not self._is_closed:
+            self._on_part(_text(self._rest), _text(self._before + self._rest))
+        if self._is_closed:
+            then, self._then = self._then, None
+            if then is not None:
+                then()
+        elif self._is_paused:
+            self._is_paused = False
+            self._loop.add_reader(self._fd, self._read)
+
+    def _pause(self) -> None:
+        """Read no more for now."""
+        if not self._is_closed and not self._is_paused:
+            self._is_paused = True
+            self._loop.remove_reader(self._fd)
+
+    def close(self, then: Callable[[], None] | None = None) -> None:
+        """Take what is still in the pipe and let go of it; `then` is called when all of it has been handed on."""
+        if then is not None:
+            self._then = then
+        if not self._is_closed:
+            self._pause()
+            self._is_closed = True
+            data = b""
+            try:
+                for _ in range(LAST_READS):
+                    data += os.read(self._fd, 64 * 1024)
+            except OSError:
+                pass  # Nothing more is there, or a descendant holds the other end open.
+            os.close(self._fd)
+            self._cut(data)
+            if self._rest:
+                self._lines.append((self._rest, self._before))
+                self._rest = self._before = b""
+        if self._slice is None:
+            self._hand_on()
+
+
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "replace")
 
 
 def _whole_characters(data: bytes) -> int:

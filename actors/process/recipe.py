@@ -68,13 +68,13 @@ def unpack_data(data: bytes) -> Any:
     return _raise_up(decode_value(data))
 
 
-def unpack_recipe(data: bytes) -> Start[Any]:
-    """The recipe again. Imports the module that defines the class.
+def unpack_recipe(data: bytes, *, imports: bool = True) -> Start[Any]:
+    """The recipe again. Imports the module that defines the class, if `imports`: not for what others name.
 
     Raises:
         SpecError: the class cannot be found, or is no actor.
     """
-    start = _raise_up(decode_value(data))
+    start = _raise_up(decode_value(data, imports=imports), imports=imports)
     if not isinstance(start, Start):
         raise SpecError("recipe", "the data is no actor recipe")
     return start
@@ -103,17 +103,24 @@ def _lower(value: Any, where: str) -> Any:
     return value
 
 
-def _raise_up(value: Any) -> Any:
+def _raise_up(value: Any, *, imports: bool = True) -> Any:
+    def up(inner: Any) -> Any:
+        return _raise_up(inner, imports=imports)
+
     if isinstance(value, _Packed):
-        return Start(_find(value.kind, Actor), _raise_up(value.args), _raise_up(value.kwargs))
+        if not imports and loaded(value.kind, Actor) is None:
+            raise SpecError("recipe", f"{value.kind} is no actor class that is loaded here")
+        return Start(_find(value.kind, Actor), up(value.args), up(value.kwargs))
+    if not imports and isinstance(value, (_PackedData, _Described)):
+        raise SpecError("recipe", "another process names what is to be made of its words: nothing is")
     if isinstance(value, _PackedData):
-        return _find(value.kind, object)(**_raise_up(value.fields))
+        return _find(value.kind, object)(**up(value.fields))
     if isinstance(value, _Described):
         return _named(value.by)(value.description)
     if type(value) in (list, tuple):
-        return type(value)(_raise_up(inner) for inner in value)
+        return type(value)(up(inner) for inner in value)
     if type(value) is dict:
-        return {key: _raise_up(inner) for key, inner in value.items()}
+        return {key: up(inner) for key, inner in value.items()}
     return value
 
 

@@ -34,14 +34,15 @@ Route = tuple["Cell", Callable[[Any], Any], Callable[[Any], Any]]
 class Peer:
     """One end of a connection, with the asks that wait for the other end."""
 
-    def __init__(self, node: Node, connection: Connection | None = None) -> None:
+    def __init__(self, node: Node) -> None:
         self.node = node
-        self.connection = cast("Connection", connection)
+        self.connection = cast("Connection", None)
         self.codec: Codec = node.codec
         self.pending: dict[int, Ask] = {}
         self._last_id = 0
+        self._is_monotonic = abs(monotonic() - node.loop.time()) < SAME_CLOCK
         self.routes: dict[tuple[frames.Name, frames.Name], Route] = {}
-        self.kinds_out: dict[type, int] = {}
+        self.kinds_out: dict[type, int] = {}  # the connection's, once there is one
         self.record_taker: Callable[[str], frames.TakeRecord] = no_records  # the recovery method's, by address
         self._record_takers: dict[frames.Name, frames.TakeRecord] = {}
 
@@ -69,14 +70,14 @@ class Peer:
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
         self._last_id = key = self._last_id + 1
-        until = monotonic() + ask.deadline - self.node.loop.time()
+        until = ask.deadline if self._is_monotonic else monotonic() + ask.deadline - self.node.loop.time()
         to = connection.name_out(path)
         name, body = self._payload(ask.message)
         sender = None if ask.sender is None else connection.name_out(ask.sender.path)
         frame = frames.Ask(key, to, name, body, until, number, sender, ask.chain)
         connection.send(frame, path)
         self.pending[key] = ask
-        ask.started = True  # From here on we cannot know.
+        ask.started = number or True  # From here on only the page of its process knows, if that counts it.
         if len(self.pending) > 4096 and key % 1024 == 0:
             self._forget_done()
 
@@ -121,6 +122,16 @@ class Peer:
     def _forget_done(self) -> None:
         """Drop asks that expired: their replies, if any come, are late."""
         self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
+
+    def join(self, connection: Connection) -> None:
+        """Speak over this connection."""
+        self.connection, self.kinds_out = connection, connection.kinds_out
+
+    def on_forget(self, frame: frames.Forget) -> None:
+        """The other side gives all its names anew."""
+        self.connection.forget_in()
+        self.routes.clear()
+        self._record_takers.clear()
 
     def fail_pending(self, error: HoldfastError) -> None:
         """The other side is gone."""
@@ -193,14 +204,13 @@ class Peer:
             except HoldfastError as error:
                 self.node.dead_letter(cell, message, str(error))
 
-    def on_offer(self, cells: Iterable[Cell], frame: frames.Offer | frames.Publish) -> None:
-        """Take in a message whose sender waits until every one of `cells` has accepted it."""
+    def on_offer(self, cells: Iterable[Cell], frame: frames.Offer | frames.Publish, topic: str | None = None) -> None:
+        """Take in a message whose sender waits until every one of `cells` has accepted it, or left the topic."""
         connection = self.connection
         name = connection.name_in(frame.name)
         sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
         parcel = Parcel(name, bytes(frame.body))
-        offered = Offered(self, frame.id, list(cells), parcel, sender, is_published=isinstance(frame, frames.Publish))
-        offered.go_on()
+        Offered(self, frame.id, parcel, sender, topic).begin(cells)
 
     def on_ask(self, cell: Cell, frame: frames.Ask, page: memoryview | None) -> None:
         """Take in an ask; its outcome goes back over this connection."""
@@ -223,6 +233,10 @@ class Peer:
 def no_records(path: str) -> frames.TakeRecord:
     """Nobody is recovered over this connection."""
     raise BadFrame(f"a record for {path}, which is not recovered")
+
+
+SAME_CLOCK = 60.0
+"""Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""
 
 
 class Accepted(Message[None]):
@@ -268,13 +282,17 @@ class RelayedAsk(Ask, eq=False):
     number: int = 0
     page: Any = None
     is_over: bool = False
+    until: float = 0.0  # the deadline on the monotonic clock, which both sides read
 
     @classmethod
     def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
         """The ask that a frame carries; its message is decoded behind it."""
         left = frame.until - monotonic()
         deadline = peer.node.loop.time() + left
-        return cls(None, None, frame.chain, left, deadline, None, cell, False, peer, frame.id, frame.number, page)
+        number, until = frame.number, frame.until
+        return cls(
+            None, None, frame.chain, left, deadline, None, cell, False, peer, frame.id, number, page, False, until
+        )  # fmt: skip
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -282,6 +300,10 @@ class RelayedAsk(Ask, eq=False):
         if page is None:
             return Ask.run(actor, item)
         page[0] = item.number
+        if item.until <= monotonic():  # In this order: if the page did not say so at the deadline, it is not run.
+            item.expire()
+            page[1] = item.number
+            return None
         result = Ask.run(actor, item)
         if type(result) is Coroutine_:
             return _until_done(result, item)
@@ -354,8 +376,14 @@ class OutsideHost:
     def retired(self, cell: Cell) -> None:
         pass
 
+    def progress(self, cell: Cell) -> object:
+        return None
+
     def recovers(self, reason: ExitReason) -> bool:
         return False
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
 
     def push(self, cell: Cell, item: Item) -> None:
         send_signal(self.peer, cell.path, item)
@@ -374,6 +402,9 @@ class OutsideHost:
         return True  # As far as is known on this side.
 
     def backlog(self, cell: Cell) -> int:
+        return 0
+
+    def load(self, cell: Cell) -> int:
         return 0
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
@@ -437,12 +468,4 @@ def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
 
 def named(node: Node, frame: frames.Command, key: str) -> Cell:
     """The cell whose address a command gives."""
-    return node.cell_at(text(frame, key))
-
-
-def text(frame: frames.Command, key: str) -> str:
-    """A text that a command gives."""
-    value = frame.data.get(key)
-    if not isinstance(value, str):
-        raise BadFrame(f"command {frame.verb!r} has {key} {value!r}")
-    return value
+    return node.cell_at(str(frame.data[key]))

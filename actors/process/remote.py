@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Awaitable, Coroutine
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from .. import links, lives, mailbox
@@ -22,8 +23,9 @@ from ..mail import Ask, Envelope, Item
 from . import frames
 from .connection import BadFrame
 from .limits import Limits
+from .moves import word_of
 from .recipe import pack_recipe
-from .relay import obey, send_signal, text
+from .relay import obey, send_signal
 from .workers import Worker, Workers
 
 if TYPE_CHECKING:
@@ -67,15 +69,23 @@ class Outlet:
         flight = self.flight
         flight.append((number, item))
         done = worker.page[1]
-        while flight[0][0] <= done:  # What has been handled is let go soon: a large message is large memory.
-            flight.popleft()
+        try:
+            while flight[0][0] <= done:  # What has been handled is let go soon: a large message is large memory.
+                flight.popleft()
+        except IndexError:  # Not even this one is left, and it has not gone out yet.
+            worker.breach(f"its page says that message {done} is done, and {number} were sent")
 
     def trim(self) -> None:
         """Forget what has been handled."""
         worker, flight = self.worker, self.flight
-        done = worker.page[1] if worker is not None else 0
+        done = worker.number(1, self.sent) if worker is not None else 0
         while flight and flight[0][0] <= done:
             flight.popleft()
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the process keeps up."""
+        return self.worker is None or self.worker.connection.has_room
 
     def room(self) -> asyncio.Future[None] | None:
         """None when the process keeps up."""
@@ -84,10 +94,14 @@ class Outlet:
     def close(self) -> tuple[list[Any], list[Any]]:
         """The process is gone. Returns what was being handled and what was not begun, in order."""
         worker, self.worker = self.worker, None
-        running, done = (worker.page[0], worker.page[1]) if worker is not None else (0, 0)
+        numbers = (0, 0) if worker is None else (worker.number(0, self.sent), worker.number(1, self.sent))
+        running, done = numbers
         flight, self.flight, self.sent, self.begun = self.flight, deque(), 0, 0
         begun = [item for number, item in flight if number == running > done]
         queued = [item for number, item in flight if number > max(running, done)]
+        for item in queued:
+            if isinstance(item, Ask):
+                item.started = False
         return begun, queued
 
 
@@ -96,6 +110,7 @@ def admit_remote(cell: Cell, item: Any) -> None:
     if type(item) not in cell.table and type(item) is not Parcel:
         _require(cell, item)
     outlet: Outlet = cell.more.outlet  # type: ignore[union-attr]  # made before this function stands there
+    cell.node.check_thread(outlet.path)
     if outlet.worker is None:
         _check_codable(cell, item)
         mailbox.queue_of(cell).append(item)
@@ -108,6 +123,7 @@ def admit_remote_bounded(cell: Cell, item: Any) -> None:
     if type(item) not in cell.table and type(item) is not Parcel:
         _require(cell, item)
     more = cell.extra()
+    cell.node.check_thread(cell.path)
     _check_codable(cell, item)
     assert more.bound is not None
     more.bound.admit(cell, item)
@@ -130,10 +146,10 @@ class RemoteBound(mailbox.Bound):
             self.moved(cell)  # The page may be ahead of what we were told.
         super().admit(cell, item)
 
-    def room(self, cell: Cell) -> asyncio.Future[None] | None:
+    def has_room(self, cell: Cell) -> bool:
         if self.count >= self.capacity:
             self.moved(cell)
-        return super().room(cell)
+        return super().has_room(cell)
 
     def put(self, cell: Cell, item: Any) -> None:
         self.count += 1
@@ -160,7 +176,7 @@ class RemoteBound(mailbox.Bound):
         outlet: Outlet = cell.extra().outlet
         if outlet.worker is None:
             return
-        begun = max(outlet.begun, outlet.worker.page[0])
+        begun = max(outlet.begun, outlet.worker.number(0, outlet.sent))
         freed, outlet.begun = begun - outlet.begun, begun
         for _ in range(freed):
             self.taken(cell)
@@ -196,8 +212,19 @@ class ProcessHost:
 
     takes_parcels = True
 
+    def progress(self, cell: Cell) -> object:
+        return None
+
     def recovers(self, reason: Any) -> bool:
         return False
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        """The process puts a turn's number on its page first, and only then looks whether its deadline is over."""
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None:
+            return True
+        page = outlet.worker.page
+        return ask.started <= max(page[0], page[1]) or monotonic() < ask.deadline
 
     def __init__(self, workers: Workers, limits: Limits | None, options: dict[str, Any] | None = None) -> None:
         self._workers = workers
@@ -239,7 +266,7 @@ class ProcessHost:
         assert start is not None
         try:
             recipe = pack_recipe(start, cell.path)
-            worker = await self._workers.take()
+            worker = await self._workers.take(again=cell.life > 0)
         except HoldfastError as error:
             raise StartFailed(cell.path, str(error)) from error
         if cell.state is not DOWN:
@@ -292,10 +319,13 @@ class ProcessHost:
         """Ask the actor to end in good order; while it starts, when it is up."""
         worker = self._workers.of(cell)
         outlet: Outlet | None = cell.extra().outlet
-        if worker is None or outlet is None or outlet.worker is None:
+        start = cell.extra().start
+        if worker is not None and start is not None and getattr(start.kind, "_supervises", False):
+            self.send_stop(worker, cell, reason)  # A supervisor can end while it starts.
+        elif worker is None or outlet is None or outlet.worker is None:
             self._stop_wanted = reason
-            return
-        self.send_stop(worker, cell, reason)
+        else:
+            self.send_stop(worker, cell, reason)
 
     def send_stop(self, worker: Worker, cell: Cell, reason: ExitReason) -> None:
         """Tell the process that its actor shall end."""
@@ -337,6 +367,8 @@ class ProcessHost:
         worker = self._workers.of(cell)
         if worker is not None:
             worker.kill(KILLED)
+        elif self._starting is not None and not self._starting.done():
+            self._starting.cancel()  # It waits for a process that is not wanted any more.
 
     def push(self, cell: Cell, item: Item) -> None:
         outlet: Outlet | None = cell.extra().outlet
@@ -370,6 +402,13 @@ class ProcessHost:
         begun = max(outlet.worker.page[0], outlet.worker.page[1])
         return queued + sum(number > begun for number, _ in outlet.flight)
 
+    def load(self, cell: Cell) -> int:
+        queued = len(cell.queue or ())
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None:
+            return queued
+        return queued + int(outlet.sent - outlet.worker.page[1])
+
     def worker_of(self, cell: Cell) -> Worker | None:
         """The actor's process, if it has one now."""
         return self._workers.of(cell)
@@ -387,22 +426,22 @@ def _seen(start: asyncio.Task[None]) -> None:
 
 
 def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
-    """What comes from an actor process: messages for others, and replies."""
+    """What comes from an actor process, and has passed its gate: messages for others, and replies."""
     match frame:
         case frames.Reply():
             worker.on_reply(frame)
         case frames.Tell():
-            worker.on_tell(_target(node, worker, frame.to), frame, None)
+            worker.on_tell(worker.gate.target(frame.to), frame, None)
         case frames.Ask():
-            worker.on_ask(_target(node, worker, frame.to), frame, None)
+            worker.on_ask(worker.gate.target(frame.to), frame, None)
         case frames.Failure():
             worker.on_failure(frame)
         case frames.Moved():
             worker.on_moved()
         case frames.Offer():
-            worker.on_offer([_target(node, worker, frame.to)], frame)
+            worker.on_offer([worker.gate.target(frame.to)], frame)
         case frames.Publish():
-            worker.on_offer(node.topics.subscribers(frame.topic), frame)
+            worker.on_offer(node.topics.subscribers(frame.topic), frame, frame.topic)
         case frames.Command():
             _command(node, worker, frame)
         case frames.Launched():
@@ -415,17 +454,12 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_note(frame)
         case frames.Record():
             worker.on_record(frame)
+        case frames.Piece():
+            worker.on_move(word_of(frame))
+        case frames.Forget():
+            worker.on_forget(frame)
         case frames.Launch() | frames.Run():
-            raise BadFrame(f"an actor process cannot send a {type(frame).__name__} here")
-
-
-def _target(node: Node, worker: Worker, to: frames.Name) -> Cell:
-    if type(to) is int and (cell := worker.targets.get(to)) is not None and cell.state is not GONE:
-        return cell
-    path = worker.connection.name_in(to)
-    cell = node.cell_at(path)
-    worker.targets[worker.connection.number_in(to)] = cell
-    return cell
+            raise AssertionError(f"{type(frame).__name__} has no way in")
 
 
 def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
@@ -435,31 +469,29 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "move":
             worker.on_move(frame.data)
         case "subscribe":
-            node.topics.subscribe(text(frame, "topic"), cell)
+            node.topics.subscribe(frame.data["topic"], cell)
         case "unsubscribe":
-            node.topics.unsubscribe(text(frame, "topic"), cell)
+            node.topics.unsubscribe(frame.data["topic"], cell)
         case "born":
-            worker.inner.born(cell, text(frame, "path"), text(frame, "kind"), int(frame.data.get("life", 0)))
+            worker.inner.born(cell, frame.data["path"], frame.data["kind"], frame.data["life"])
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
-            worker.inner.gone(text(frame, "path"), reason, with_parent=with_parent)
+            worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
         case "keep":
-            keep(node, worker, frame)
+            keep(node, frame)
         case _:
             obey(node, cell, frame)
 
 
-def keep(node: Node, worker: Worker, frame: frames.Command) -> None:
+def keep(node: Node, frame: frames.Command) -> None:
     """What the supervisors in an actor process say to the keeper, of addresses below their process's own.
 
     Raises:
-        BadFrame: it is of another address.
+        BadFrame: there is nothing like it to be done.
     """
-    home, path, keeper = worker.cell, text(frame, "path"), node.keeper
-    if home is None or not f"{path}/".startswith(f"{home.path}/"):
-        raise BadFrame(f"an actor process cannot speak of {path}")
+    path, keeper = frame.data["path"], node.keeper
     try:
-        match text(frame, "what"):
+        match frame.data["what"]:
             case "erase":
                 keeper.erase(path, below=bool(frame.data.get("below")))
             case "blame":
@@ -471,7 +503,7 @@ def keep(node: Node, worker: Worker, frame: frames.Command) -> None:
                 keeper.note(child_key(above, name), frame.data.get("value"))
             case what:
                 raise BadFrame(f"an actor process cannot have {what!r} done")
+    except BadFrame:
+        raise
     except HoldfastError as error:  # The process goes on: it was not its fault, and it has gone on already.
-        if isinstance(error, BadFrame):
-            raise
         node.emit(StoreRefused(path, str(error)))

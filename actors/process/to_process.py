@@ -14,7 +14,6 @@ from ..control.moving import Take, Transit, farewell, now, obey_commands, part, 
 from ..errors import BadMessage, CannotMove
 from ..links import Monitor
 from ..lives import Stop
-from . import frames
 from .mover import Move
 from .moves import send_luggage
 from .recipe import pack_recipe
@@ -57,10 +56,10 @@ class ToProcess(Move):
         worker.reserve(
             self.cell, self.limits, lambda cell, reason: self.give_up(f"the new process has died ({reason})")
         )
-        worker.on_move = self._said
+        self.hear(worker)
         await self.within(worker.prepare(self.cell, self.recipe), READY_WITHIN, lambda: "the new process was not ready")
 
-    def _said(self, data: dict[str, Any]) -> None:
+    def heard(self, data: dict[str, Any]) -> None:
         if data.get("step") == "began" and not self._began.done():
             self._began.set_result(float(data["at"]))
 
@@ -78,6 +77,7 @@ class ToProcess(Move):
         if self.cell.extra().start is not self._start:
             raise CannotMove(self.cell.path, "its code was replaced meanwhile; try again")
         self.rest_at = now()
+        self.remember()
         self.pack(actor, state)
         self.at_rest()
         self._taken.set_result(None)
@@ -90,8 +90,7 @@ class ToProcess(Move):
     async def carry(self) -> None:
         cell, worker, more = self.cell, self.worker, self.cell.extra()
         assert worker is not None
-        self.remember()
-        send_luggage(worker.connection, cell.path, "luggage", self._luggage)
+        send_luggage(worker.connection, cell.path, self.attempt, "luggage", self._luggage)
         launched = worker.launch(cell, self.recipe, {"bounded": more.bound is not None, "moved": True})
         await self.within(launched, self.timeout, lambda: "its new life was not up")
         if not worker.is_alive():
@@ -129,7 +128,7 @@ class ToProcess(Move):
             more.bound = RemoteBound(more.bound).inherit(more.bound)
             cell.admit = admit_remote_bounded
         worker.adopt(cell, None, host.died)
-        _unpack_there(cell, worker, stash, suspended=suspended)
+        self._unpack_there(worker, stash, suspended=suspended)
         outlet.worker = worker
         calls = [item for item in items if isinstance(item, Call)]
         cell.queue = deque(item for item in items if not isinstance(item, Call))
@@ -141,6 +140,15 @@ class ToProcess(Move):
         obey_commands(cell, [*commands, *calls])
         farewell(old, Stop(self.reason()))
         self.moved()
+
+    def _unpack_there(self, worker: Worker, stash: list[Any], *, suspended: bool) -> None:
+        """Have the life in the process take up its stash, and go on."""
+        cell = self.cell
+        if stash:
+            self.say(worker, "stash")
+            for item in stash:
+                worker.send_item(cell, cell.path, item, 0)
+        self.say(worker, "go", suspended=suspended)
 
     def undo(self) -> None:
         cell, worker = self.cell, self.worker
@@ -165,20 +173,6 @@ class ToProcess(Move):
         """The old life goes on."""
         transit.over(self.cell, transit.old)
         resume(self.cell)
-
-
-def _unpack_there(cell: Cell, worker: Worker, stash: list[Any], *, suspended: bool) -> None:
-    """Have the life in the process take up its stash, and go on."""
-    connection = worker.connection
-
-    def step(**data: Any) -> None:
-        connection.send(frames.Command(connection.name_out(cell.path), "move", data))
-
-    if stash:
-        step(step="stash")
-        for item in stash:
-            worker.send_item(cell, cell.path, item, 0)
-    step(step="go", suspended=suspended)
 
 
 def send_queue(cell: Cell) -> None:

@@ -11,13 +11,12 @@ from ..cell import RUNNING, Cell, Host
 from ..context import ActorContext
 from ..control.calls import OrderAsk
 from ..control.luggage import unpack, unpack_items
-from ..control.moving import ATTEMPTS, decoded, now, obey_commands, settle, sorted_out, twin
+from ..control.moving import decoded, now, obey_commands, settle, sorted_out, twin
 from ..errors import AskFailed, StartFailed, error_text
 from ..exits import KILLED, ExitReason
 from ..links import Monitor
 from ..mail import Ask
 from ..stopping import PATIENCE
-from . import frames
 from .mover import Move
 from .moves import Luggage, await_up
 from .remote import Outlet, ProcessHost
@@ -34,28 +33,24 @@ class FromProcess(Move):
 
     def __init__(self, cell: Cell, host: Host, timeout: float, worker: Worker) -> None:
         super().__init__(cell, host, timeout)
-        self.worker, self.attempt = worker, next(ATTEMPTS)
+        self.worker = worker
         self.taken: asyncio.Future[None] = self.node.loop.create_future()
         self.dead: ExitReason | None = None  # the old process has died meanwhile
         self.trap_exits = self.suspended = False
 
     async def take(self) -> None:
-        self.worker.on_move = self._said
-        self.say("take")
+        self.hear(self.worker)
+        self.tell_old("take")
         await self.within(
             self.taken, self.timeout, lambda: "it did not come to rest: a turn or background work goes on"
         )
 
-    def say(self, step: str) -> None:
-        """Tell the old process."""
-        connection = self.worker.connection
-        data = {"step": step, "attempt": self.attempt}
-        connection.send(frames.Command(connection.name_out(self.cell.path), "move", data))
-        connection.flush()
+    def tell_old(self, step: str) -> None:
+        """Tell the old process, at once."""
+        self.say(self.worker, step)
+        self.worker.connection.flush()
 
-    def _said(self, data: dict[str, Any]) -> None:
-        if data.get("attempt", self.attempt) != self.attempt:
-            return
+    def heard(self, data: dict[str, Any]) -> None:
         match data.get("step"):
             case "refused":
                 self.give_up(str(data["why"]))
@@ -109,7 +104,7 @@ class ToTask(FromProcess):
 
     def __init__(self, cell: Cell, host: Host, timeout: float, worker: Worker) -> None:
         super().__init__(cell, host, timeout, worker)
-        self._incoming = Luggage()
+        self._incoming = Luggage(imports=False)
         self._luggage: dict[str, Any] = {}
         self._queued: list[Any] = []
         self._stash: list[Any] = []
@@ -120,7 +115,7 @@ class ToTask(FromProcess):
     def left(self) -> None:
         outlet: Outlet = self.cell.extra().outlet
         outlet.worker = None  # Messages wait here from now on.
-        self.say("pack")  # Behind everything that was sent: all that is there is packed.
+        self.tell_old("pack")  # Behind everything that was sent: all that is there is packed.
 
     def packed(self, data: dict[str, Any]) -> None:
         try:
@@ -224,14 +219,12 @@ class ToTask(FromProcess):
         if self._twin is not None:
             dispose(self._twin)
         if transit is None:
-            worker.on_move = lambda data: None
-            self.say("back")
+            self.tell_old("back")
             return
         host, outlet = transit.old, cell.extra().outlet
         assert isinstance(host, ProcessHost)
         if self.dead is None:
-            worker.on_move = lambda data: None
-            self.say("back")
+            self.tell_old("back")
             worker.on_death(host.died)
             outlet.worker = worker
             send_queue(cell)

@@ -8,10 +8,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 from ..exits import ExitReason, OutOfMemory, Signal
+from ..own_clock import OwnClock
 from .limits import Limits
 
 if TYPE_CHECKING:
     from ..node import Node
+
+
+LOOKS = 4
+"""How often within `hung_after` the watch looks; so often the process beats, too."""
 
 
 class Watched(Protocol):
@@ -35,27 +40,30 @@ class Watch:
         self._worker = worker
         self._ended = psutil.Error
         self._loop = worker.node.loop
-        self._last_beat = self._loop.time()
+        now = self._loop.time()
         self._process = psutil.Process(worker.pid)
         self._timers: list[asyncio.TimerHandle] = []
         if limits.memory_bytes is not None or limits.cpu_share is not None:
-            self._cpu_before = self._cpu()
+            self._cpu_before, self._looked_at = self._cpu(), now
             self._timers.append(self._loop.call_later(limits.watch_interval, self._look))
         if limits.hung_after is not None:
-            self._timers.append(self._loop.call_later(limits.hung_after, self._listen))
+            self._period = limits.hung_after / LOOKS
+            self._clock, self._last_beat = OwnClock(now, self._period), 0.0
+            self._timers.append(self._loop.call_later(self._period, self._listen))
 
     def beat(self) -> None:
         """The loop in the process turns."""
-        self._last_beat = self._loop.time()
+        if self.limits.hung_after is not None:
+            self._last_beat = self._clock.at(self._loop.time())
 
     def _listen(self) -> None:
         hung_after = self.limits.hung_after
         assert hung_after is not None
-        silent = self._loop.time() - self._last_beat
+        silent = self._clock.tick(self._loop.time()) - self._last_beat
         if silent >= hung_after:
             self._worker.hung(silent)
             return
-        self._timers.append(self._loop.call_later(hung_after - silent, self._listen))
+        self._timers.append(self._loop.call_later(self._period, self._listen))
         del self._timers[:-2]
 
     def _cpu(self) -> float:
@@ -69,8 +77,9 @@ class Watch:
             cpu = self._cpu()
         except self._ended:
             return  # It has ended: its socket tells.
-        share = (cpu - self._cpu_before) / limits.watch_interval
-        self._cpu_before = cpu
+        now = self._loop.time()
+        share = (cpu - self._cpu_before) / max(now - self._looked_at, limits.watch_interval)  # We may be late.
+        self._cpu_before, self._looked_at = cpu, now
         if limits.memory_bytes is not None and resident > limits.memory_bytes:
             self._worker.kill(OutOfMemory(f"{resident} bytes resident, the limit is {limits.memory_bytes}"))
         elif limits.cpu_share is not None and share > limits.cpu_share:

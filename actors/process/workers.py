@@ -14,26 +14,29 @@ from typing import TYPE_CHECKING, Any
 from ..cell import Cell
 from ..control.calls import order, send_call
 from ..control.orders import Look
-from ..errors import AskFailed, HoldfastError, ProcessUnavailable, StartFailed, StartIgnored
-from ..events import TRACED, LogLine, ProcessDied, ProcessStarted
+from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
+from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
 from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, pack_exit, unpack_exit
 from ..mail import Ask
 from . import frames
-from .connection import Connection
+from .connection import BadFrame, Connection
 from .forked import Forked, has_ended
 from .forkserver import ForkServer
+from .gate import Gate
 from .inner import Inner
-from .launch import keep_large_memory
+from .launch import keep_large_memory, why_not_importable
 from .limits import Limits
 from .output import OutputReader
 from .relay import Peer
-from .watch import Watch, oom_kills
+from .watch import LOOKS, Watch, oom_kills
 
 if TYPE_CHECKING:
     from ..node import Node
 
 REAPED_WITHIN = 2.0
 """Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
+AGAIN_AFTER = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
+"""Seconds between attempts to fork a process for an actor that is restarted."""
 ORDER_TIMEOUT = 60.0
 """Seconds until it does not matter any more whether a new process counts for whoever wanted to know."""
 
@@ -46,7 +49,7 @@ class Worker(Peer):
         self.forked, self.server = forked, server
         self.pid = forked.pid
         self.page = memoryview(forked.page).cast("Q")
-        self.targets: dict[int, Cell] = {}
+        self.gate = Gate(self)
         self.inner = Inner(self.node, self)
         self.cell: Cell | None = None
         self._workers = workers
@@ -63,18 +66,18 @@ class Worker(Peer):
         self._oom_before = oom_kills()
         self._watch: Watch | None = None
         self._outputs: list[OutputReader] = []
-        self.on_move: Callable[[dict[str, Any]], None] = _nothing  # hears what the process says of a move
+        self.movers: dict[int, Callable[[dict[str, Any]], None]] = {}  # who hears of which attempt to move an actor
 
     # -- its life ---------------------------------------------------------------------------------------------------
 
     async def connect(self) -> None:
         """Take over the socket and the output pipes."""
         loop, forked = self.node.loop, self.forked
-        self.connection = Connection(self._on_frame, self._on_lost)
+        self.join(Connection(self._on_frame, self._on_lost, guarded=True))
         self.connection.takers = {
             frames.Reply: self.on_reply,
             frames.Failure: self.on_failure,
-            frames.Record: self.on_record,
+            frames.Forget: self.on_forget,
         }
         await self.connection.open(forked.sock)
         for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
@@ -103,7 +106,22 @@ class Worker(Peer):
         bindings = {port: target.path for port, target in cell.extra().bindings.items()}
         await self._ask_launch(cell, recipe, dict(options, limits=_limit_options(limits), bindings=bindings))
 
+    def _check_program(self, cell: Cell, recipe: bytes) -> None:
+        """A class of `__main__` is known in the process only if that could be imported there.
+
+        Raises:
+            StartFailed: it could not, and what to do.
+        """
+        if b"__main__:" not in recipe:
+            return
+        problem = why_not_importable() or self.server.preload_errors.get("__main__")
+        if problem:
+            raise StartFailed(
+                cell.path, f"its class is defined in the program itself, which its process cannot import: {problem}"
+            )
+
     async def _ask_launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
+        self._check_program(cell, recipe)
         self._last_id = key = self._last_id + 1
         if self._buried:
             raise StartFailed(cell.path, "its process has ended")
@@ -169,7 +187,7 @@ class Worker(Peer):
         if self._watch is not None:
             self._watch.close()
             self._watch = None
-        self.on_move = _nothing
+        self.movers.clear()
         self.record_taker, self._record_takers = _no_record, {}
         if self._buried:
             return
@@ -184,11 +202,13 @@ class Worker(Peer):
         """SIGKILL, by pidfd; its end is then called `why`."""
         if self._killed_for is None:
             self._killed_for = why
-        self.forked.kill(signal.SIGKILL)
+        if not self.forked.kill(signal.SIGKILL):
+            self.connection.close()  # It ends when it sees that, unless it hangs.
 
     def hung(self, seconds: float) -> None:
         """The watch has seen no beat."""
-        self.kill(Hung(seconds))
+        if not has_ended(self.forked.pidfd):  # Else it was something else that ended it, and we shall hear of that.
+            self.kill(Hung(seconds))
 
     def beat(self) -> None:
         """Its loop turns."""
@@ -203,7 +223,25 @@ class Worker(Peer):
     # -- what it says -----------------------------------------------------------------------------------------------
 
     def _on_frame(self, frame: frames.AnyFrame) -> None:
+        self.gate.check(frame)
         self._workers.on_frame(self.node, self, frame)
+
+    def on_forget(self, frame: frames.Forget) -> None:
+        """The process gives all its names anew."""
+        super().on_forget(frame)
+        self.gate.forget()
+
+    def number(self, place: int, most: int) -> int:
+        """A number on the page, which the process may have written anything to; `most` can stand there."""
+        number = self.page[place]
+        if number <= most:
+            return number
+        self.breach(f"its page says {number} where {most} is the most that can be")
+        return most
+
+    def breach(self, problem: str) -> None:
+        """It has said what it may not, or what cannot be: it ends, soon, since whoever noticed is at something else."""
+        self.node.loop.call_soon(self.connection.close, BadFrame(problem))
 
     def on_launched(self, frame: frames.Launched) -> None:
         """A launch has come to its end."""
@@ -229,6 +267,12 @@ class Worker(Peer):
         if cell is not None and bound is not None:
             bound.moved(cell)
 
+    def on_move(self, data: dict[str, Any]) -> None:
+        """A word of an attempt to move an actor; if that one is over, it is void."""
+        heard = self.movers.get(data.get("attempt", 0))
+        if heard is not None:
+            heard(data)
+
     def on_note(self, frame: frames.Note) -> None:
         """An event of the process."""
         self._workers.on_note(self, frame)
@@ -247,14 +291,21 @@ class Worker(Peer):
     def _on_lost(self, error: Exception | None) -> None:
         self._lost = True
         self._noticed()
-        if isinstance(error, HoldfastError):
-            self.kill(Exited(70))  # It spoke nonsense: EX_SOFTWARE.
+        if isinstance(error, BadFrame):
+            self._breached(error)
         if self._status is not None or self._is_orphaned:
             self.forked.kill(signal.SIGKILL)
             self._bury()
         else:
             self.forked.kill(signal.SIGKILL)  # Whoever closes its socket has to end.
             self.node.loop.call_later(REAPED_WITHIN, self._bury)
+
+    def _breached(self, error: BadFrame) -> None:
+        """It spoke nonsense, or of what is not its own."""
+        if self._killed_for is None and self._status is None:
+            path = self.cell.path if self.cell is not None else f"process {self.pid}"
+            self.node.emit(TrustBreached(path, self.pid, error.problem))
+        self.kill(Exited(70))  # EX_SOFTWARE
 
     def on_exit(self, status: int) -> None:
         """The fork server has reaped it."""
@@ -322,10 +373,6 @@ class Worker(Peer):
         return Exited(os.waitstatus_to_exitcode(status))
 
 
-def _nothing(data: dict[str, Any]) -> None:
-    """No move is under way."""
-
-
 def _no_record(path: str) -> frames.TakeRecord:
     """What a life says that has been moved away is not kept."""
     return lambda frame: None
@@ -345,7 +392,7 @@ def _limit_options(limits: Limits | None) -> dict[str, Any]:
         "address_space_bytes": limits.address_space_bytes,
         "open_files": limits.open_files,
         "niceness": limits.niceness,
-        "beat": None if limits.hung_after is None else limits.hung_after / 4,
+        "beat": None if limits.hung_after is None else limits.hung_after / LOOKS,
     }
 
 
@@ -384,8 +431,12 @@ class Workers:
         if self._server is not None:
             self._server.preload(module)
 
-    async def take(self) -> Worker:
+    async def take(self, *, again: bool = False) -> Worker:
         """A process that waits for an actor.
+
+        Args:
+            again: for an actor that has lived before: that there is no process, memory or descriptor left may pass, and
+                says nothing of the actor. So it is tried for a while, and not each failure counts as a restart.
 
         Raises:
             ProcessUnavailable: none could be forked.
@@ -395,9 +446,19 @@ class Workers:
             if worker.is_alive():
                 self._refill()
                 return worker
-        worker = await self._fork()
+        worker = await self._fork_again() if again else await self._fork()
         self._refill()
         return worker
+
+    async def _fork_again(self) -> Worker:
+        for pause in AGAIN_AFTER:
+            try:
+                return await self._fork()
+            except ProcessUnavailable:
+                if self._closed:
+                    raise
+            await asyncio.sleep(pause)
+        return await self._fork()
 
     async def _fork(self) -> Worker:
         is_second = False
@@ -493,5 +554,7 @@ class Workers:
         graves = [worker.gone() for worker in list(self._alive.values())]
         if graves:
             await asyncio.wait(graves, timeout=REAPED_WITHIN * 2)
-        if self._server is not None:
-            await self._server.stop()
+        async with self._opening:  # Whoever is in the middle of starting one has given up, or has it now.
+            server, self._server = self._server, None
+        if server is not None:
+            await server.stop()

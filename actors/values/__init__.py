@@ -16,8 +16,9 @@ from __future__ import annotations
 import hashlib
 
 from ..errors import DamagedValue, UnsavableValue
+from .budget import LargeInts, TooMany, check_containers
 from .forms import FORMAT, HEAD
-from .reading import Decoder, make_int, unpack
+from .reading import Decoder, unpack
 from .writing import pieces, walked_pieces
 
 __all__ = ["DamagedValue", "UnsavableValue", "decode_value", "encode_value", "state_digest", "walked_pieces"]
@@ -66,11 +67,16 @@ def state_digest(value: object) -> bytes:
     return digest.digest()
 
 
-def decode_value(data: bytes | memoryview) -> object:
+def decode_value(data: bytes | memoryview, *, imports: bool = True) -> object:
     """Read what `encode_value` wrote. Arrays are writable and own their memory.
 
     Classes are found by importing their module, and must be of the kind that was saved. No `__init__` is called; only
     a Struct has to be made by its constructor, after which its fields are set to what they were.
+
+    Args:
+        data: the bytes. Whoever made them: keys that clash, lengths that lie and units that do not exist are refused.
+        imports: False for bytes that another process made: it has nothing imported here, and no more lists and dicts
+            made than `MOST_CONTAINERS`.
 
     Raises:
         DamagedValue: whatever is wrong with the bytes.
@@ -87,10 +93,16 @@ def decode_value(data: bytes | memoryview) -> object:
     if view[0] != FORMAT or view[1] > 1:
         raise DamagedValue(f"it has format {view[0]}.{view[1]}, and only format {FORMAT} is known")
     try:
-        if view[1] == 0:
-            return unpack(view[2:], ext_hook=make_int)
-        tree_bytes = HEAD.unpack_from(view)[2]
-        return Decoder(view[HEAD.size + tree_bytes :]).value(view[HEAD.size : HEAD.size + tree_bytes])
+        is_plain = view[1] == 0
+        begin, end = (2, len(view)) if is_plain else (HEAD.size, HEAD.size + HEAD.unpack_from(view)[2])
+        tree = view[begin:end]
+        if not imports:
+            check_containers(tree)
+        if is_plain:
+            return unpack(tree, ext_hook=LargeInts().make)
+        return Decoder(view[end:], imports=imports).value(tree)
+    except TooMany as error:
+        raise DamagedValue(str(error)) from error
     except (DamagedValue, MemoryError):  # Out of memory is no damage: the bytes may be good.
         raise
     except Exception as error:

@@ -123,6 +123,26 @@ def _named_dtype(name: str) -> Any:
     return _numpy().dtype(name)
 
 
+def described_dtype(description: Any) -> Any:
+    """The dtype that numpy's `str` or `descr` describes: of numbers, text, bytes and times, or of fields of these.
+
+    Raises:
+        DamagedValue: it is another, or none.
+    """
+    if isinstance(description, str):
+        return _named_dtype(description)
+    if not isinstance(description, (list, tuple)) or len(description) > 1024:
+        raise DamagedValue(f"it has an array of dtype {description!r}")
+    fields = [_described_field(field) for field in cast("list[Any]", description)]
+    return _numpy().dtype(fields)
+
+
+def _described_field(field: Any) -> tuple[Any, ...]:
+    name, form, *shape = field
+    name = tuple(name) if isinstance(name, list) else name  # title and name
+    return (name, described_dtype(form), *(tuple(one) if isinstance(one, list) else one for one in shape))
+
+
 def _make_dtype(parts: Any) -> Any:
     if isinstance(parts, str):
         return _named_dtype(parts)

@@ -17,9 +17,16 @@ from ..errors import DamagedValue, UnsavableValue, type_name
 from .forms import DATACLASS, ENUM, KNOWN, NAMED, SCALARS, STRUCT, flat
 
 
-def find_class(name: str) -> type:
-    """Find the class "module:qualname". Nothing is called for it, except what importing the module does."""
+def find_class(name: str, *, imports: bool = True) -> type:
+    """Find the class "module:qualname". Nothing is called for it, except what importing the module does.
+
+    Args:
+        name: of the class.
+        imports: whether its module is imported if it is not loaded; False for what others name.
+    """
     module, _, qualname = name.partition(":")
+    if not imports and module not in sys.modules:
+        raise DamagedValue(f"class {name} is not loaded here, and another process may not have it loaded: import it")
     try:
         found: object = sys.modules.get(module) or import_module(module)
         for part in qualname.split("."):

@@ -13,7 +13,7 @@ from itertools import chain
 from operator import index
 from pathlib import PosixPath, PurePosixPath, PureWindowsPath
 from random import Random
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, TypeAlias, cast
 from uuid import UUID, SafeUUID
 from zoneinfo import ZoneInfo
 
@@ -67,6 +67,19 @@ def _make_random(parts: list[Any]) -> Random:
     return made
 
 
+def _make_fraction(parts: list[Any]) -> Fraction:
+    """As it was, in lowest terms: to see whether it is takes a time that grows with the square of its length."""
+    numerator, denominator = map(index, parts)
+    if denominator <= 0:
+        raise DamagedValue("it has a Fraction that is none")
+    if max(numerator.bit_length(), denominator.bit_length()) <= _SHORT_BITS:
+        return Fraction(numerator, denominator)
+    made: Any = object.__new__(Fraction)
+    made._numerator, made._denominator = numerator, denominator
+    return cast(Fraction, made)
+
+
+_SHORT_BITS: Final = 4096
 Make: TypeAlias = Callable[[list[Any]], Any]
 # Code in the data; type; its parts, which may be anything that can be saved; how the parts make it again.
 TYPES: Final[tuple[tuple[int, Any, Callable[[Any], Iterable[Any]], Make], ...]] = (
@@ -81,7 +94,7 @@ TYPES: Final[tuple[tuple[int, Any, Callable[[Any], Iterable[Any]], Make], ...]] 
     (9, complex, lambda x: (x.real, x.imag), lambda parts: complex(*parts)),
     (10, range, lambda x: (x.start, x.stop, x.step), lambda parts: range(*parts)),
     (11, Decimal, lambda x: (str(x),), lambda parts: Decimal(*parts)),
-    (12, Fraction, lambda x: (x.numerator, x.denominator), lambda parts: Fraction(*map(index, parts))),
+    (12, Fraction, lambda x: (x.numerator, x.denominator), _make_fraction),
     (13, UUID, lambda x: (x.bytes, x.is_safe.value), lambda parts: UUID(bytes=parts[0], is_safe=SafeUUID(parts[1]))),
     (14, date, lambda x: (x.year, x.month, x.day), lambda parts: date(*parts)),
     (15, time, lambda x: (x.fold, x.hour, x.minute, x.second, x.microsecond, x.tzinfo),

@@ -13,6 +13,7 @@ from msgpack import ExtType
 
 from ..errors import DamagedValue
 from .arrays import MAKE_ARRAYS
+from .budget import MANY_KEYS, LargeInts, spread
 from .classes import class_mark, find_class, is_factory, slots_of
 from .forms import (
     AGAIN,
@@ -31,13 +32,6 @@ from .forms import (
 )
 
 
-def make_int(code: int, data: bytes) -> int:
-    """An int that msgpack has no type for."""
-    if code != 0:
-        raise DamagedValue(f"it has an extension value with code {code}")
-    return int.from_bytes(data, "big", signed=True)
-
-
 def _make_tuples(rows: list[Any]) -> list[Any]:
     if any(type(row) is not list for row in rows):
         raise DamagedValue("it has a tuple that is none")
@@ -48,8 +42,26 @@ _MARKS: Final = {code: Mark(code) for code in range(1, 64)}
 unpack: Final = cast(
     "Callable[..., Any]", partial(msgpack.unpackb, strict_map_key=False, unicode_errors="surrogatepass")
 )
+_KEYS: Final[dict[int, slice]] = {
+    **{code: slice(None) for code, kind, _, _ in TYPES if kind in (set, frozenset)},
+    **{code: slice(None, None, 2) for code, kind, _, _ in TYPES if issubclass(kind, dict)},
+}
+"""Where the keys are among the parts of what has some."""
+
+
+def _spread(make: Make, keys: slice) -> Make:
+    """The same, for keys that were not chosen to clash."""
+
+    def make_spread(parts: list[Any]) -> Any:
+        if len(parts) > MANY_KEYS:
+            spread(parts[keys])
+        return make(parts)
+
+    return make_spread
+
+
 _MAKE: Final[dict[int, Make]] = {
-    **{code: make for code, _, _, make in TYPES},
+    **{code: _spread(make, _KEYS[code]) if code in _KEYS else make for code, _, _, make in TYPES},
     **MAKE_ARRAYS,
     TUPLES.code: _make_tuples,
 }
@@ -58,7 +70,8 @@ _MAKE: Final[dict[int, Make]] = {
 class Decoder:
     """What msgpack calls for each extension value and each list, inner ones first."""
 
-    def __init__(self, buffers: memoryview) -> None:
+    def __init__(self, buffers: memoryview, *, imports: bool = True) -> None:
+        self._imports, self._make_int = imports, LargeInts().make
         self.buffers = buffers  # those not yet read: they lie in the order in which the tree names them
         self.open_marks = 0
         self.shared: dict[int, object] = {}
@@ -82,7 +95,7 @@ class Decoder:
 
     def on_extension(self, code: int, data: bytes) -> int:
         if code == 0:
-            return make_int(code, data)
+            return self._make_int(code, data)
         if data:
             raise DamagedValue(f"it has an extension value with code {code}")
         self.open_marks += 1
@@ -110,14 +123,16 @@ class Decoder:
         return self.shared[number]
 
     def make_defaultdict(self, parts: list[Any]) -> object:
-        factory: Any = parts[0] and find_class(parts[0])
+        factory: Any = parts[0] and find_class(parts[0], imports=self._imports)
         if factory is not None and not is_factory(factory):
             raise DamagedValue(f"it has a defaultdict of {parts[0]}")
+        if len(parts) > MANY_KEYS:
+            spread(parts[1::2])
         return defaultdict(factory, pairs(parts[1:]))
 
     def find(self, mark: ExtType, name: str) -> tuple[Any, dict[str, Any]]:
         if name not in self.classes:
-            kind = find_class(name)
+            kind = find_class(name, imports=self._imports)
             self.classes[name] = kind, class_mark(kind), slots_of(kind)
         kind, found, slots = self.classes[name]
         if found is not mark:

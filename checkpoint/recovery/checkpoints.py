@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 
 
 class Look(Message):
-    """It is time to look at the homes that may be due."""
+    """It is time to look at the homes that may be due: it is `when`, also if a timer fires a little early."""
+
+    when: float
 
 
 class CheckpointHandler(Part):
@@ -66,12 +68,13 @@ class CheckpointHandler(Part):
         self._timer = when
         if self._handle is not None:
             self._handle.cancel()  # type: ignore[attr-defined]
-        self._handle = self.ctx.tell_after(max(0.0, when - loop.time()), Look())
+        self._handle = self.ctx.tell_after(max(0.0, when - loop.time()), Look(when))
 
     @on(Look)
     def look(self, message: Look) -> None:
         """Ask those who are due."""
-        now = self.ctx.cell.node.loop.time()
+        # Without `when`, a timer of a nanosecond would follow, and another one while the clock does not move.
+        now = max(message.when, self.ctx.cell.node.loop.time())
         self._timer, self._handle = 0.0, None
         while self._heap and self._heap[0][0] <= now:
             when, path = heapq.heappop(self._heap)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from ...actors.cell import Cell
 from ...actors.errors import MailboxFull
 from ...actors.events import HeldMessages
+from ...actors.mailbox import Senders
 from ..inputs import Batch, Input
 from ..records import MESSAGE, Answer
 from .settings import Held
@@ -32,7 +33,7 @@ class Holding:
         self._rules: dict[str, Held | None] = {"": home.method.held, **dict(home.method.held_topics)}
         self._counted: dict[int, tuple[Input, str]] = {}  # by id, in admission order
         self._waiting: deque[tuple[Ask, str, bytes, str | None, str]] = deque()  # asks that wait
-        self._senders: list[asyncio.Future[None]] = []
+        self._senders = Senders()
         self.topic = ""  # by which the message comes that is admitted next
         self._added = ""
         self.dropped = self.refused = 0
@@ -62,8 +63,7 @@ class Holding:
         Raises:
             MailboxFull: it is a tell, and the policy refuses it.
         """
-        topic, self.topic = self.topic if self.topic in self._rules else "", ""
-        self._added = topic
+        topic = self._added = self._take_topic()
         rule = self._rules[topic]
         if rule is not None and self._count(topic) >= rule.capacity:
             match rule.overflow:
@@ -81,6 +81,11 @@ class Holding:
                     self._drop(topic, rule, 0 if rule.overflow == "latest" else rule.capacity - 1)
         return self.inner is None or self.inner.makes_room(ask, name, body, sender)
 
+    def _take_topic(self) -> str:
+        """By which topic that has a rule of its own the message in hand comes."""
+        topic, self.topic = self.topic, ""
+        return topic if topic in self._rules else ""
+
     def _count(self, topic: str) -> int:
         return sum(by == topic for _, by in self._counted.values())
 
@@ -95,13 +100,20 @@ class Holding:
             home.ends.without_turn(source, answer, batch)
         batch.commit(home.journal)
 
+    def blocks(self, topic: str) -> bool:
+        """Whether the rule of a topic has a sender wait now."""
+        rule = self._rules.get(topic if topic in self._rules else "")
+        return rule is not None and rule.overflow == "block" and self._count(topic) >= rule.capacity
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now, or lost."""
+        return not self.blocks("") and (self.inner is None or self.inner.has_room)
+
     def room(self, topic: str = "") -> asyncio.Future[None] | None:
         """For `send`: None if a message would be taken now, or the policy never waits."""
-        rule = self._rules.get(topic if topic in self._rules else "")
-        if rule is not None and rule.overflow == "block" and self._count(topic) >= rule.capacity:
-            future: asyncio.Future[None] = self._home.node.loop.create_future()
-            self._senders.append(future)
-            return future
+        if self.blocks(topic):
+            return self._senders.wait(self._home.node.loop)
         return None if self.inner is None else self.inner.room()
 
     # -- the end of the isolation -----------------------------------------------------------------------------------
@@ -122,20 +134,14 @@ class Holding:
             ask, name, body, sender, _ = self._waiting.popleft()
             if not ask.is_done and (home.bound is None or home.bound.makes_room(ask, name, body, sender)):
                 home.take(ask, name, body, sender)
-        self._wake()
-
-    def _wake(self) -> None:
-        senders, self._senders = self._senders, []
-        for sender in senders:
-            if not sender.done():
-                sender.set_result(None)
+        self._senders.release()
 
     # -- as the bound whose place this takes ------------------------------------------------------------------------
 
     def added(self, source: Input) -> None:
         """An input was admitted."""
         if source.kind == MESSAGE:
-            self._counted[source.id] = (source, self._added)
+            self._counted[source.id] = (source, self._added or self._take_topic())
             self._added = ""
         if self.inner is not None:
             self.inner.added(source)
@@ -154,7 +160,7 @@ class Holding:
         waiting, self._waiting = self._waiting, deque()
         for ask, *_ in waiting:
             ask.fail(error)
-        self._wake()
+        self._senders.release()
         if self.inner is not None:
             self.inner.release(error)
 
@@ -196,6 +202,12 @@ class Inlet(Cell):
         assert cell is not None
         self.table, self.host, self.state = cell.table, InletHost(cell), cell.state
 
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now, or lost."""
+        home = self.home
+        return home.cell is None or (home.has_room and (home.holding is None or not home.holding.blocks(self.topic)))
+
     def room(self) -> asyncio.Future[None] | None:
         """For `send`: None while there is room."""
         home = self.home
@@ -211,6 +223,9 @@ class Inlet(Cell):
 
 class InletHost:
     """The actor's host, as its inlets see it."""
+
+    def progress(self, cell: Cell) -> object:
+        return None
 
     def __init__(self, cell: Cell) -> None:
         self._cell = cell

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.actor import Actor
 
@@ -16,6 +16,8 @@ class Part(Actor):
     It keeps nothing of its own: each life begins by looking at the homes. Nothing waits for it, either: what must be
     done while it is down is done by the homes themselves.
     """
+
+    _is_part: ClassVar[bool] = True
 
     deterministic = False
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from ..journal import DamagedStore
+from .parts import NOTE
 from .rows import crc_of
 
 MODULUS: Final = 1 << 62  # SQLite integers end at 2**63
@@ -118,7 +119,8 @@ class Scan:
         for name, value, crc in self._db.execute("SELECT name, value, crc FROM notes ORDER BY key"):
             if crc != crc_of(name, value):
                 raise DamagedStore(self._path, None, None, f"the checksum of note {name!r} is wrong")
-            notes[name] = value
+            if name != NOTE:
+                notes[name] = value
         return notes
 
     def _verify(self, chain: Chain) -> None:

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 
 from ..journal import DamagedStore, StoreInUse
 from .database import refuse_broken, refuse_foreign, result_code
+from .parts import Parts, identity_of, lock_holder
 from .rows import crc_of
 
 _KILL_SECONDS: Final = 10.0
@@ -32,9 +33,10 @@ class StoreRow(NamedTuple):
 class Claim:
     """Our claim to be the owner of the store, made through one connection."""
 
-    def __init__(self, db: sqlite3.Connection, path: str) -> None:
+    def __init__(self, db: sqlite3.Connection, parts: Parts) -> None:
         self._db = db
-        self.path = path
+        self._parts = parts
+        self.path = parts.path
         self.epoch = 0
         self._owner = 0, ""
 
@@ -43,7 +45,7 @@ class Claim:
 
         Raises:
             StoreInUse: a living process has the store open, and it may not or cannot be killed.
-            DamagedStore: the file is not ours, or is broken.
+            DamagedStore: the file is not ours, or is broken. ForeignStore: what lies beside it is of another store.
         """
         deadline = time.monotonic() + _KILL_SECONDS
         while True:
@@ -52,6 +54,8 @@ class Claim:
                 seen = self.read()
                 self._refuse_living(seen.pid, seen.start, takeover)
                 refuse_broken(self._db, self.path)
+                self._parts.compare(identity_of(self._db, self.path))
+                self._parts.lock()
                 if self._write_in(seen):
                     return
             except sqlite3.OperationalError as error:
@@ -163,21 +167,3 @@ def has_ended(pidfd: int, seconds: float) -> bool:
     poll = select.poll()
     poll.register(pidfd, select.POLLIN)
     return bool(poll.poll(seconds * 1000))
-
-
-def lock_holder(path: str) -> int | None:
-    """Pid of the process that has an exclusive SQLite lock on the store, from /proc/locks.
-
-    Asking the kernel through `fcntl` would need a descriptor of our own, and closing it would drop the locks of any
-    connection this process has.
-    """
-    files: set[str] = set()
-    for name in (path, f"{path}-shm"):
-        with contextlib.suppress(OSError):
-            info = os.stat(name)
-            files.add(f"{os.major(info.st_dev):02x}:{os.minor(info.st_dev):02x}:{info.st_ino}")
-    for line in Path("/proc/locks").read_text().splitlines():
-        words = line.split()
-        if "WRITE" in words and words[-3] in files and int(words[-4]) > 0:
-            return int(words[-4])
-    return None

@@ -11,6 +11,7 @@ from typing import Final
 
 from ..journal import DamagedStore
 from .files import sync
+from .parts import new_note
 from .rows import crc_of
 
 _APPLICATION: Final = 0x486F6C64  # "Hold", in the file header
@@ -32,8 +33,6 @@ _BUSY_SECONDS: Final = 0.25  # Nobody holds a lock for long, except a stopped pr
 
 def create_database(path: str, folder: str) -> None:
     """Make the database in `folder` and link it into place: half a database is then never seen under its name."""
-    if os.path.exists(f"{path}-wal"):
-        raise DamagedStore(path, None, None, "the file is gone, but its -wal file is still there")
     new = os.path.join(folder, f"new-{os.getpid()}-{threading.get_ident()}")
     with contextlib.suppress(FileNotFoundError):
         os.unlink(new)  # left by an earlier process with our pid
@@ -45,6 +44,7 @@ def create_database(path: str, folder: str) -> None:
         for statement in _SCHEMA:
             db.execute(statement)
         db.execute("INSERT INTO store VALUES (1, 0, 0, '', 0, 0, ?)", (crc_of(0, 0, "", 0, 0),))
+        db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", new_note())
     sync(new)
     try:
         os.link(new, path)

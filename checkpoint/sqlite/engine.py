@@ -46,6 +46,7 @@ class SqliteJournal:
 
     Raises:
         StoreInUse: a live process, this one included, has it open.
+        ForeignStore: its parts do not belong together, or others than this user may write to them; nothing was changed.
         DamagedStore: the file is damaged, or entries that were acknowledged are gone. Damage that concerns one address
             only is raised when that address is used; the others work.
         StoreFailed: the operating system refused.
@@ -65,10 +66,13 @@ class SqliteJournal:
         self.path = os.path.realpath(path)
         self._pack = entry_packer()
         self._store = store = Store(self.path, fsync=synchronous == "fsync")
+        if os.path.islink(path):
+            store.parts.refuse_link(os.path.abspath(path))
         with store.opening(takeover=takeover):
             self._finish()
             self.epoch = store.claim.epoch
-            self._packs = Packs(self.path)
+            self.in_hand = store.hands
+            self._packs = Packs(self.path, store.parts)
             self._reader = ChainReader(store.reader, self.path, store.files)
 
     def _finish(self) -> None:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import mmap
 import os
+import re
+import stat
 from collections.abc import Collection, Sequence
 from itertools import count
-from pathlib import Path
+from typing import Final
 
 from ..journal import StoreFailed
+
+_SNAPSHOT: Final = re.compile(r"\d+-\d+\.snapshot")
+_MADE_HERE: Final = re.compile(r"\d+-\d+\.snapshot(\.tmp)?|new-\d+-\d+(-wal|-shm|-journal)?|store-id\.tmp")
+"""Names that only a store gives to files in the folder of its snapshots."""
 
 
 class SnapshotFiles:
@@ -36,7 +43,9 @@ class SnapshotFiles:
 
     def read(self, name: str) -> bytes:
         """Read a file; OSError or ValueError if there is none of that name."""
-        return Path(self.folder, name).read_bytes()
+        if _SNAPSHOT.fullmatch(name) is None:
+            raise ValueError(f"{name!r} is no name of a snapshot")
+        return read_own(os.path.join(self.folder, name))
 
     def remove(self, names: Sequence[str]) -> None:
         """Remove snapshot files that no row names, which is on the disk (`sync_rows`)."""
@@ -54,8 +63,9 @@ class SnapshotFiles:
             sync(f"{self.path}-wal")
 
     def remove_all_but(self, known: Collection[str]) -> None:
-        """Remove what an earlier owner has written or left half made, and never named in a row."""
-        unknown = [name for name in os.listdir(self.folder) if name not in known]
+        """Remove what an earlier owner has written or left half made, and never named in a row; no other file."""
+        found = [name for name in os.listdir(self.folder) if _MADE_HERE.fullmatch(name) is not None]
+        unknown = [name for name in found if name not in known]
         if unknown:
             self.sync_rows()
             self.remove(unknown)
@@ -91,6 +101,21 @@ def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
             with contextlib.suppress(OSError):
                 os.unlink(name)
         raise
+
+
+def read_own(path: str) -> bytes:
+    """Read a file that the store has written, and no other: no link is followed."""
+    with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+        refuse_shared(path, os.fstat(file.fileno()))
+        return file.read()
+
+
+def refuse_shared(path: str, info: os.stat_result) -> None:
+    """Raise OSError unless it is a regular file under one name that nobody but this process's user can have written."""
+    if not stat.S_ISREG(info.st_mode) or info.st_nlink != 1:
+        raise OSError(errno.EPERM, "it is no regular file, or has several names", path)
+    if info.st_uid != os.geteuid() or info.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+        raise OSError(errno.EPERM, "it belongs to another user, or others may write to it", path)
 
 
 def sync(path: str) -> None:

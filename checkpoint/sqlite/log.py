@@ -14,16 +14,16 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import count
-from pathlib import Path
 from typing import Final, TypeAlias
 
 from ..journal import Primitive
-from .files import Word, sync
+from .files import Word, read_own, refuse_shared, sync
 from .rows import decode_entry
 
 Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]
@@ -32,6 +32,7 @@ Row: TypeAlias = tuple[int, int, int, Primitive, bytes, int]
 MOST_ROWS: Final = 512
 """Rows the log takes, before they go to the database: about a millisecond's work."""
 MOST_BYTES: Final = 512 << 10
+_NAME: Final = re.compile(r"\d+-\d+\.log")
 _MAGIC: Final = b"HFLOG\x01\0\0"
 _SEAL: Final = struct.Struct("=Q")  # 0: open
 _HEAD: Final = struct.Struct("<8sQQ")  # magic, epoch, generation
@@ -96,8 +97,8 @@ class FrontLog:
     # ---- what earlier owners left
 
     def left(self) -> list[str]:
-        """The files that there are."""
-        return [os.path.join(self.folder, name) for name in os.listdir(self.folder)]
+        """The logs that there are; nothing else in the folder is looked at."""
+        return [os.path.join(self.folder, name) for name in os.listdir(self.folder) if _NAME.fullmatch(name)]
 
     def read(self, names: Sequence[str]) -> Iterator[list[Row]]:
         """Keep everybody else from writing to these files; then give what was appended as one, oldest first.
@@ -105,14 +106,15 @@ class FrontLog:
         What is damaged ends its file: whether it was acknowledged, the mark knows.
         """
         for name in names:
-            fd = os.open(name, os.O_WRONLY | os.O_CLOEXEC)
+            fd = os.open(name, os.O_WRONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
             try:
+                refuse_shared(name, os.fstat(fd))
                 os.pwrite(fd, _SEAL.pack(1), 0)
             finally:
                 os.close(fd)
         found: list[tuple[int, int, bytes]] = []
         for name in names:
-            data = Path(name).read_bytes()
+            data = read_own(name)
             start = _SEAL.size + _HEAD.size
             if len(data) < start + _CRC.size:
                 continue

@@ -7,6 +7,7 @@ It is mapped into memory: to set it is no system call.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from typing import Final
@@ -40,7 +41,7 @@ class Mark:
             DamagedStore: later positions were acknowledged, and no power loss explains that they are gone.
         """
         boot = boot_id().encode()
-        self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         found = os.pread(self._fd, _MARK.size + _SYNCED.size, 0)
         if len(found) >= _MARK.size:
             position, was_synced, marked_boot = _MARK.unpack_from(found)
@@ -77,4 +78,5 @@ class Mark:
 
     def remove(self) -> None:
         """Remove the file: the row of the store says all now."""
-        os.unlink(self.path)
+        with contextlib.suppress(FileNotFoundError):
+            os.unlink(self.path)

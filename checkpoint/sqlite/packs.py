@@ -7,7 +7,9 @@ bytes: magic, then for each block a head (offset in its segment, length, stored 
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
+import re
 import struct
 import zlib
 from collections.abc import Collection, Sequence
@@ -17,8 +19,10 @@ from typing import Final
 from ..compression import PLAIN, compressor, decompress
 from ..journal import DamagedStore, StoreFailed
 from ..segments import PAGE, Segment, memory_file
-from .files import write_durably
+from .files import refuse_shared, write_durably
+from .parts import Parts
 
+_NAME: Final = re.compile(r"[0-9a-f]+\.pack")
 _MAGIC: Final = b"HFPK\x01\0\0\0"
 _HEAD: Final = struct.Struct("<QIIII")  # offset, length, stored length, codec, checksum
 
@@ -26,9 +30,10 @@ _HEAD: Final = struct.Struct("<QIIII")  # offset, length, stored length, codec, 
 class Packs:
     """The packs of the store at `path`, in a folder for each address."""
 
-    def __init__(self, path: str) -> None:
+    def __init__(self, path: str, parts: Parts) -> None:
         self.path = path
         self.folder = f"{path}-packs"
+        self._parts = parts
 
     def write(self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int) -> None:
         """Write a new pack durably.
@@ -47,6 +52,10 @@ class Packs:
             for one in (self.folder, folder):
                 with contextlib.suppress(FileExistsError):
                     os.mkdir(one, mode=0o700)
+                if one == self.folder:
+                    self._parts.mark(one)
+                if os.path.islink(one):
+                    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), one)
             write_durably(self._file(address, number), parts)
         except OSError as error:
             raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error
@@ -61,7 +70,8 @@ class Packs:
         wanted = set(places)
         file = memory_file(number)
         try:
-            with open(name, "rb") as pack:
+            with open(os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as pack:
+                refuse_shared(name, os.fstat(pack.fileno()))
                 if pack.read(len(_MAGIC)) != _MAGIC:
                     raise ValueError("it is no pack")
                 while wanted and (head := pack.read(_HEAD.size)):
@@ -89,7 +99,7 @@ class Packs:
             found = os.listdir(self._folder(address))
         except FileNotFoundError:
             return set()
-        return {int(name[: -len(".pack")], 16) for name in found if name.endswith(".pack")}
+        return {int(name[: -len(".pack")], 16) for name in found if _NAME.fullmatch(name)}
 
     def remove(self, address: str, numbers: Collection[int]) -> None:
         """Remove packs that no snapshot needs."""
@@ -102,9 +112,11 @@ class Packs:
         folder = self._folder(address)
         with contextlib.suppress(FileNotFoundError):
             for name in os.listdir(folder):
-                with contextlib.suppress(FileNotFoundError):
-                    os.unlink(os.path.join(folder, name))
-            os.rmdir(folder)
+                if _NAME.fullmatch(name.removesuffix(".tmp")):
+                    with contextlib.suppress(FileNotFoundError):
+                        os.unlink(os.path.join(folder, name))
+            if not os.listdir(folder):  # Else somebody has put something there that is not ours.
+                os.rmdir(folder)
 
     def _folder(self, address: str) -> str:
         return os.path.join(self.folder, blake2b(address.encode(errors="surrogatepass"), digest_size=12).hexdigest())

@@ -6,8 +6,10 @@ import contextlib
 import os
 import sqlite3
 import threading
+import uuid
 from array import array
 from collections.abc import Generator, Sequence
+from time import monotonic
 from typing import Final
 
 from ...actors.errors import HoldfastError
@@ -16,11 +18,15 @@ from .chains import Chain, Scan, create_chain
 from .claim import Claim
 from .database import VERSION, VERSION_WITH_LOG, connect, create_database, result_code
 from .files import SnapshotFiles, sync
+from .hands import Hands
 from .log import FrontLog, NoRoom, Row, Sealed
 from .mark import Mark
+from .parts import Parts
 
 INSERT: Final = "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)"
 _CHECKPOINT_BYTES: Final = 4 << 20
+LOOK_SECONDS: Final = 0.05
+"""How long writes may be acknowledged after the store was deleted or replaced, before anybody looks."""
 _WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
 
 
@@ -42,6 +48,7 @@ class Store:
     def __init__(self, path: str, *, fsync: bool) -> None:
         self.path = path
         self.files = SnapshotFiles(path)
+        self.parts = Parts(path, (self.files.folder, f"{path}-log", f"{path}-packs"))
         self.lock = threading.RLock()
         self.read_lock = threading.Lock()
         self.chains: dict[str, Chain] = {}
@@ -51,7 +58,9 @@ class Store:
         self.failure: HoldfastError | None = None
         self.log = FrontLog(path, is_used=not fsync)
         self._fsync = fsync
+        self._look_at = 0.0
         self._mark = Mark(path)
+        self.hands = Hands(path)
         self.in_doubt = False
         self._wal = -1  # a descriptor of the WAL, once somebody has it synced
         self._is_unsynced = True  # Was anything committed since the last sync?
@@ -76,7 +85,9 @@ class Store:
                 try:
                     self._scan()
                     self._begin_log()
+                    self.hands.open(uuid.UUID(self.parts.id).bytes)
                     yield
+                    self.parts.opened()
                 except BaseException:
                     with contextlib.suppress(sqlite3.Error):
                         self.claim.release()
@@ -90,15 +101,16 @@ class Store:
             raise DamagedStore(self.path, None, None, "its tables are not as they were created") from error
 
     def _connect(self) -> None:
+        is_there = self.parts.inspect()
         with contextlib.suppress(FileExistsError):
             os.mkdir(self.files.folder, mode=0o700)  # not its parents: a mistyped path should not be made true
-        if not os.path.exists(self.path):
+        if not is_there:
             self.log.make_folder()
             create_database(self.path, self.files.folder)
         if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
             raise DamagedStore(self.path, None, None, "the file is empty")
         self.db, self.reader = connect(self.path), connect(self.path)
-        self.claim = Claim(self.db, self.path)
+        self.claim = Claim(self.db, self.parts)
 
     def _configure(self) -> None:
         self.db.execute(f"PRAGMA synchronous = {'FULL' if self._fsync else 'NORMAL'}")
@@ -140,10 +152,9 @@ class Store:
                 reason = f"its log is missing (make an empty folder {log.folder} to go on without what was in it)"
                 raise DamagedStore(self.path, None, None, reason)
             sync(os.path.dirname(self.path))
-        left = log.left()
-        if left and version == VERSION:  # A store was closed, and its owner killed before it had removed them.
-            log.remove(left)
-            left = []
+        self.parts.adopt(self.db)
+        # A store was closed, and its owner killed before it had removed these; or its WAL is missing: the mark knows.
+        stale, left = (log.left(), []) if version == VERSION else ([], log.left())
         rows: list[Row] = []
         for batch in log.read(left):
             if batch[0][0] == self.last + 1:
@@ -152,6 +163,8 @@ class Store:
             elif batch[-1][0] > self.last:
                 break  # A power loss has taken what was before it: the mark knows whether it may be missing.
         self._mark.check(self.last, synced=self._fsync)
+        if stale:
+            log.remove(stale)
         log.rows = rows
         if left:  # They are removed next.
             self.db.execute("PRAGMA synchronous = FULL")
@@ -162,10 +175,17 @@ class Store:
             self._configure()
 
     def close(self) -> None:
-        """Release the store and sync it; a second call does nothing."""
+        """Release the store and sync it; a second call does nothing.
+
+        Raises:
+            StoreFailed: it is not where it was opened, which nobody was told before: what was acknowledged may be gone.
+        """
+        lost = ""
         with self.lock:
             if not self._mark.is_open:
                 return
+            if self.failure is None and self._is_ours():
+                lost = self._lost()
             clean = self.failure is None and not self.in_doubt
             self.failure = self.failure or StoreFailed(self.path, "it is closed")
             self._mark.close()
@@ -178,6 +198,8 @@ class Store:
                     self._retire(clean)
             finally:
                 self._disconnect()
+        if lost:
+            raise StoreFailed(self.path, lost)
 
     def _retire(self, clean: bool) -> None:
         """Leave the last word on how much there is, so that the mark is not needed, and strike ourselves out."""
@@ -193,12 +215,15 @@ class Store:
             db.execute("COMMIT")
         if clean:
             self._mark.remove()
+        self.hands.close(remove=clean)
         self.log.close(remove=clean)
         self.claim.release()
 
     def _disconnect(self) -> None:
         self._mark.close()
         self.log.close(remove=False)
+        self.hands.close(remove=False)
+        self.parts.close()
         if self._wal >= 0:
             wal, self._wal = self._wal, -1
             os.close(wal)
@@ -253,6 +278,8 @@ class Store:
         """Whether the log takes these entries, encoded in so many bytes; else they need a transaction."""
         if self.in_doubt or self.failure is not None or not self.log.takes(len(entries), size):
             return False
+        if monotonic() >= self._look_at:
+            self._look()
         for address, _ in entries:
             chain = self.chains.get(address)
             if chain is None or chain.damage is not None:
@@ -334,12 +361,35 @@ class Store:
     def refresh(self) -> None:
         """Make sure that memory and file agree, after a transaction that was broken off."""
         self.refuse_failed()
+        if monotonic() >= self._look_at:
+            self._look()
         if self.in_doubt:
             self.log.is_broken_off = True
             try:
                 self._scan()
             except sqlite3.Error as error:
                 raise self.translate(error) from error
+
+    def _look(self) -> None:
+        """See now and then that what is written to is still the store: files that were deleted take writes, too.
+
+        Raises:
+            StoreFailed: it is not; from now on everything is refused.
+        """
+        self._look_at = monotonic() + LOOK_SECONDS
+        lost = self._lost()
+        if lost and self._is_ours():  # Else its new owner has done that, and the write itself says so.
+            self.failure = StoreFailed(self.path, lost)
+            self.refuse_failed()
+
+    def _is_ours(self) -> bool:
+        with contextlib.suppress(sqlite3.Error):
+            return bool(self.db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,))
+        return True
+
+    def _lost(self) -> str:
+        problem = self.parts.lost()
+        return problem and f"{problem}: nothing is acknowledged any more; put the store back, and start again"
 
     def translate(self, error: sqlite3.Error | OSError) -> HoldfastError:
         """Our error for theirs; after damage or an I/O error the journal stops for good."""

@@ -98,7 +98,7 @@ def killian_court() -> Path:
         path = Path(folder) / "data" / "killian.g2o.zip"
         if path.is_file():
             return path
-    raise LogError("killian.g2o.zip", 0, "not found: pip install holdfast[demo], or name a log with --log FILE")
+    raise LogError("killian.g2o.zip", 0, "not found: pip install 'holdfast[demo]', or name a log with --log FILE")
 
 
 def read_scans(path: Path) -> Iterator[LaserScan]:

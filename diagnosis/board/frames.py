@@ -208,11 +208,12 @@ def _decoded(number: int, sequence: int, body: bytes) -> Frame:
         raise BadFrame(f"there is no kind 0x{number:02x}", sequence)
     try:
         frame = _frame(kind, body)
+        again = _body(frame)  # Numbers that cannot be are found here, too.
     except (struct.error, UnicodeDecodeError, IndexError) as error:
         raise BadFrame(f"the body of {kind.__name__} is wrong: {error}", sequence) from error
     except BadFrame as error:
         raise BadFrame(error.why, sequence) from error
-    if _body(frame) != body:
+    if again != body:
         raise BadFrame(f"the body of {kind.__name__} holds more than it should", sequence)
     return frame
 

@@ -12,9 +12,15 @@ from ...actors.control.orders import Status, status_of
 from ...actors.errors import HoldfastError, SpecError
 from ...actors.process.relay import OutsideHost, Peer
 from ...actors.process.remote import ProcessHost
+from ...supervision.intensity import admit_restart
 from ..literals import Literal, running
+from ..messages import STARTS, Started
 from .observer import Manner, Observer
 
+FREE: Final = 3
+"""Starts within `WITHIN` seconds after which time is given: who is started more often has a fault that a start does not
+mend."""
+WITHIN: Final = 10.0
 PATIENCE: Final = 1.0
 """Seconds an actor's process gets to answer."""
 
@@ -26,15 +32,24 @@ class NodeObserver(Observer):
         actors: component to address.
         hung_after: seconds; an actor whose turn takes longer, or whose process does not answer so long, counts as not
             running. None: nothing takes too long.
+        settling: seconds after somebody has started an actor again in which nothing that is seen of it, or of what
+            depends on it, is held against it. One that is started more than three times in ten seconds gets none.
         manner: see `Observer`.
     """
 
     def __init__(
-        self, actors: Mapping[str, str], *, hung_after: float | None = None, manner: Manner | None = None
+        self,
+        actors: Mapping[str, str],
+        *,
+        hung_after: float | None = None,
+        settling: float = 1.0,
+        manner: Manner | None = None,
     ) -> None:
         super().__init__(manner=manner)
         self._actors = {running(component): path for component, path in actors.items()}
-        self._hung_after = hung_after
+        self._hung_after, self._settling = hung_after, settling
+        self._lives: dict[Literal, tuple[Cell, int]] = {}
+        self._starts: dict[Literal, tuple[float, ...]] = {}
 
     def on_start(self, restored: bool) -> None:
         """Begin. Raises SpecError in a process of its own."""
@@ -43,6 +58,8 @@ class NodeObserver(Observer):
 
     async def look(self) -> None:
         """Look them all up; those that have to be asked are asked at the same time."""
+        if started := [atom.args[0] for atom, path in self._actors.items() if self._is_new(atom, path)]:
+            await self.ctx.publish(STARTS, Started(tuple(started), self._settling))
         asked: list[Literal] = []
         answers: list[Awaitable[bool | None]] = []
         for atom, path in self._actors.items():
@@ -55,6 +72,20 @@ class NodeObserver(Observer):
         if asked:
             for atom, answer in zip(asked, await asyncio.gather(*answers), strict=True):
                 self.verdict(atom, answer)
+
+    def _is_new(self, atom: Literal, path: str) -> bool:
+        """Whether it has begun another life since the last look, and is to be given time."""
+        cell = self.ctx.cell.node.find(path)
+        if cell is None or not cell.life:
+            return False
+        before, now = self._lives.get(atom), (cell, cell.life)
+        self._lives[atom] = now
+        if before is None or before == now or not self._settling:
+            return False
+        window = admit_restart(self._starts.get(atom, ()), self.now, intensity=FREE, period=WITHIN)
+        if window is not None:
+            self._starts[atom] = window
+        return window is not None
 
     def _runs(self, cell: Cell | None) -> bool | Awaitable[bool | None] | None:
         if cell is None:

@@ -88,6 +88,10 @@ class Observer(Actor):
     def look(self) -> Awaitable[None] | None:
         """It is time to look; may be async."""
 
+    def spares(self, grace: Grace, about: Literal) -> bool:
+        """Whether a grace is for what is said of this."""
+        return not set(grace.names).isdisjoint(about.args)
+
     def afresh(self) -> None:
         """Somebody has acted upon what is observed: forget what was gathered before."""
 
@@ -145,15 +149,16 @@ class Observer(Actor):
     async def _spare(self, message: Grace) -> None:
         now = self.now
         self._grace = {name: until for name, until in self._grace.items() if until > now}
-        self._grace |= {name: max(self._grace.get(name, 0.0), now + message.seconds) for name in message.names}
-        names = set(message.names)
-        if any(not names.isdisjoint(about.args) for about in self._words):
+        spared = {about: word for about, word in self._words.items() if self.spares(message, about)}
+        left_out = {name for about in self._words if about not in spared for name in about.args}
+        until = dict.fromkeys((name for name in message.names if name not in left_out), now + message.seconds)
+        self._grace |= {name: max(self._grace.get(name, 0.0), end) for name, end in until.items()}
+        if spared:
             self.afresh()
-        for about, word in self._words.items():
-            if not names.isdisjoint(about.args):
-                word.debounce.clear()  # samples from before say nothing about after
-                if word.said is not None and not word.said.positive:
-                    self._settle(word, None)
+        for word in spared.values():
+            word.debounce.clear()  # samples from before say nothing about after
+            if word.said is not None and not word.said.positive:
+                self._settle(word, None)
         await self._publish()
 
     def _settle(self, word: _Word, settled: Literal | None) -> None:

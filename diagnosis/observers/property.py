@@ -22,6 +22,7 @@ from ...actors.errors import HoldfastError
 from ...actors.process.relay import OutsideHost
 from ...actors.process.remote import ProcessHost
 from ..literals import Literal
+from ..messages import Grace
 from .node import at_root
 from .observer import Manner, Observer, atom_of
 from .regression import Regression
@@ -100,6 +101,7 @@ class PropertyObserver(Observer):
             for one in bounds
         ]
         self._wanted = {wanted for _, wanted, _, _ in self._bounds}
+        self._restarts_of = {atom for atom, wanted, _, _ in self._bounds if wanted is Property.RESTARTS}
         self._process: psutil.Process | None = None
         self._counts: Statistics | None = None
         self._lives: deque[tuple[float, int]] = deque()
@@ -110,8 +112,12 @@ class PropertyObserver(Observer):
         at_root(self)
         super().on_start(restored)
 
+    def spares(self, grace: Grace, about: Literal) -> bool:
+        """How often others start it is just what is to be known."""
+        return super().spares(grace, about) and not (grace.is_counted and about in self._restarts_of)
+
     def afresh(self) -> None:
-        """How it grew and how often it was restarted before says nothing of after."""
+        """How it grew, and how often repair has restarted it, says nothing of after."""
         self._growth.clear()
         self._lives.clear()
 

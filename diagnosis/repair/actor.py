@@ -20,7 +20,17 @@ from ...actors.message import Message
 from ...supervision.arbiter import Arbiter, arbiter_of
 from ..engine import Diagnosis, State
 from ..literals import BadLiteral, Literal
-from ..messages import DIAGNOSER, DIAGNOSIS, MODEL, OBSERVATIONS, GetDiagnosis, GetObserved, ModelChanged
+from ..messages import (
+    DIAGNOSER,
+    DIAGNOSIS,
+    MODEL,
+    OBSERVATIONS,
+    STARTS,
+    GetDiagnosis,
+    GetObserved,
+    ModelChanged,
+    Started,
+)
 from ..model import Model
 from ..observations import Observation, ObservationSet
 from ..planning import ClingoPlanner, Plan, Planner, Step, TimedOut, Unsolvable, find_plan
@@ -32,6 +42,8 @@ from .executor import DENIED, DONE, SKIPPED, Executor, Result
 from .ledger import Ledger, Memory
 from .policy import Policy
 
+OURS: Final = 5.0
+"""Seconds after an action in which a start that is seen is taken for its work."""
 MOMENT: Final = 0.001
 """Seconds: a timer may come a little early."""
 
@@ -88,7 +100,9 @@ class Repairer(Actor):
         self._blamed: frozenset[str] = frozenset()
         self._midway: set[str] = set()
         self._dry: tuple[str, ...] | None = None
-        self._graced = self._looks_until = -math.inf
+        self._graced = self._looks_until = self._settles = -math.inf
+        self._ours: dict[str, float] = {}
+        self._theirs: dict[str, float] = {}
 
     def on_start(self, restored: bool) -> None:
         """Ask for the present diagnosis."""
@@ -144,6 +158,18 @@ class Repairer(Actor):
         self._wake()
         self._begin()
 
+    @subscribe(STARTS)
+    @on(Started)
+    def _started(self, message: Started) -> None:
+        """Whom somebody else has started is not blamed for what was seen before; what we start, we know of."""
+        now = self.now()
+        theirs = [name for name in message.components if now - self._ours.get(name, -math.inf) > OURS]
+        if theirs:
+            self._theirs |= dict.fromkeys(theirs, now + message.seconds)
+            self._settles = max(self._settles, now + message.seconds)
+            self._graced = max(self._graced, self._settles)
+            self.ctx.tell_after(message.seconds + MOMENT, _GraceIsOver())
+
     @subscribe(MODEL)
     @on(ModelChanged)
     async def _use_model(self, message: ModelChanged) -> None:
@@ -188,7 +214,7 @@ class Repairer(Actor):
 
     def _begin(self) -> None:
         """Open a case, if there is something to repair and none is open."""
-        if self.now() < self._looks_until:
+        if self.now() < max(self._looks_until, self._settles):
             return
         if self._case is None and self._chosen(Case(0, 0.0)) is not None:
             self._memory.cases += 1
@@ -209,7 +235,8 @@ class Repairer(Actor):
     def _alone(self) -> set[str]:
         """Whom nobody is to touch."""
         ours = (self.ctx.path, *self._base)
-        return {*self._policy.exclude, *base_of(self._addresses, ours), *self._memory.given_up}
+        parked = (name for name, address in self._addresses.items() if self._arbiter.is_parked(address))
+        return {*self._policy.exclude, *base_of(self._addresses, ours), *self._memory.given_up, *parked}
 
     async def _repair(self, case: Case) -> None:
         try:
@@ -225,6 +252,9 @@ class Repairer(Actor):
 
     async def _round(self, case: Case) -> bool:
         """One plan; True when the case is over."""
+        if (left := self._settles - self.now()) > 0:
+            await self._sleep(left)
+            return False
         diagnosis = self._diagnosis
         if diagnosis.state is State.HEALTHY:
             return await self._finish(case)
@@ -259,6 +289,9 @@ class Repairer(Actor):
         self._blamed, self._midway = frozenset(bad), set()
         results = await self._executor(bad).execute(problem, outcome)
         case.failures += [f"{result.step} {result.outcome}: {result.why}" for result in results if result.why]
+        if denied := [result for result in results if result.outcome == DENIED]:
+            # Who says no to this does not say yes to what would be tried in its place.
+            return await self._give_up(case, bad, f"{denied[0].step} was not allowed: {denied[0].why}")
         if any(result.outcome == DONE for result in results):
             await self._settled(case, {name for step in outcome.steps for name in step.args[:1]})
         elif all(result.outcome == SKIPPED for result in results):
@@ -425,6 +458,8 @@ class Repairer(Actor):
         target = step.args[0] if step.args else ""
         if not self._policy.may(step.action, self._memory.mode):
             return f"mode {self._memory.mode} does not allow it"
+        if self.now() < self._theirs.get(target, -math.inf):
+            return f"somebody else has just started {target}"
         if target in self._midway:
             return ""
         diagnosis = self._diagnosis
@@ -460,6 +495,7 @@ class Repairer(Actor):
         self._ledger.note(step, self.now())
         self._case.count(step)
         self._midway.update(step.args[:1])
+        self._ours |= dict.fromkeys(reached(self._addresses, self._address(step)), self.now())
         reason = f"diagnosed: {', '.join(sorted(self._blamed))}"
         await self._tell(say.ActionBegan(self._case.number, step, epoch, reason, self.now()))
 
@@ -470,6 +506,7 @@ class Repairer(Actor):
         if result.outcome not in (SKIPPED, DENIED):
             others = reached(self._addresses, self._address(step))
             names = tuple(dict.fromkeys((*step.args[:1], *others)))
+            self._ours |= dict.fromkeys(names, self.now())
             grace = self._actions[step.action].grace if result.outcome == DONE else 0.0
             if grace > 0:
                 self._graced = max(self._graced, self.now() + grace)

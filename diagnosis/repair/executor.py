@@ -167,6 +167,8 @@ class Executor:
                 await action.run(act, *step.args)
         except GrantLost as error:
             return Result(step, LOST, str(error))
+        except InOtherHands as error:  # Whoever has it in another process says so himself.
+            return Result(step, SKIPPED, str(error))
         except Exception as error:  # Whatever a user's action raises is told, and counts as an attempt.
             if scope.expired() and isinstance(error, TimeoutError):
                 return Result(step, FAILED, f"it did not return within {action.timeout:g} s")

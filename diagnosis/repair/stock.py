@@ -18,7 +18,8 @@ from typing import Any, Final, Protocol
 from ...actors.actor import Actor
 from ...actors.errors import HoldfastError
 from ...actors.ref import ActorRef
-from ...supervision.admin import ChildBusy, RestartChild, TerminateChild
+from ...supervision.admin import ChildBusy, ChildParked, RestartChild, TerminateChild
+from ...supervision.arbiter import OPERATOR, InOtherHands
 from ..board import SwitchChannel
 from .actions import Act, ActionFailed, RepairAction, Run
 
@@ -59,7 +60,7 @@ def restart_child(
     timeout: float = PATIENCE,
     **options: Any,
 ) -> RepairAction:
-    """`restart_child(n)`: stop it and start it, in one action."""
+    """`restart_child(n)`: have its supervisor stop it and start it, in one call that nothing can cut in two."""
     run = functools.partial(_restart, addresses=addresses, timeout=timeout)
     more = {"grace": 1.0, "timeout": 2 * timeout} | options
     return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
@@ -126,35 +127,45 @@ def _action(
 
 async def _start(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
     keeper, child = _keeper(act, addresses[node])
+    with contextlib.suppress(ChildBusy):  # It runs, or is being started: whether it does, its observer says.
+        await _ordered(act, keeper, addresses[node], RestartChild(child, unless_parked=True), timeout)
+
+
+async def _ordered(act: Act, keeper: ActorRef[Any], address: str, request: RestartChild, timeout: float) -> None:
     try:
-        started = await keeper.ask(RestartChild(child), timeout)
-    except ChildBusy:
-        return  # It runs, or is being started: whether it does, its observer says.
+        started = await keeper.ask(request, timeout)
+    except ChildParked as error:
+        raise InOtherHands(address, OPERATOR, "it was stopped by order") from error
     if started is None:
-        raise ActionFailed(str(act.step), f"{addresses[node]} did not want to be started")
+        raise ActionFailed(str(act.step), f"{address} did not want to be started")
 
 
 async def _stop(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
     keeper, child = _keeper(act, addresses[node])
-    await keeper.ask(TerminateChild(child), timeout)
+    await keeper.ask(TerminateChild(child, parks=False), timeout)
 
 
 async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
-    await _stop(act, node, addresses=addresses, timeout=timeout)
+    address = addresses[node]
+    keeper, child = _keeper(act, address)
     act.check()
-    await _start(act, node, addresses=addresses, timeout=timeout)
+    try:
+        await _ordered(act, keeper, address, RestartChild(child, running=True, unless_parked=True), 2 * timeout)
+    except ChildBusy as error:
+        raise InOtherHands(address, "its supervisor", f"it is {error.state}") from error
 
 
 async def _roll_back(
     act: Act, node: str, *, addresses: Mapping[str, str], back: Callable[[str], Any], timeout: float
 ) -> None:
-    await _stop(act, node, addresses=addresses, timeout=timeout)
     act.check()
     try:
+        await _stop(act, node, addresses=addresses, timeout=timeout)
+        act.check()
         waiting = back(addresses[node])
         if inspect.isawaitable(waiting):
             await waiting
-    finally:  # Also if it could not be put back: it was running before.
+    finally:  # Also if it could not be put back, or was taken from us meanwhile: it was running before.
         await _start(act, node, addresses=addresses, timeout=timeout)
 
 

@@ -1,10 +1,13 @@
 """Semi-active replication (LFR, leader-follower): both compute, one answers.
 
 Fault model  the crash of a replica: its process, its bricks, a hang that the failure detector sees.
-Guarantee    a reply leaves when the follower has the request: no request is lost or doubled. Hidden non-determinism is
-             found by comparing digests of outcomes, and told (`Diverged`), naming the first request.
-Not covered  value faults: a difference is seen, not whose it is. Non-determinism that no outcome shows.
-Needs        determinism; two units. State access only to bring a follower in later, or back after a divergence.
+Guarantee    a reply leaves when the follower has the request: no request is lost or doubled. A difference between the
+             two is found by comparing digests of all outcomes (`Diverged` names the first request) and, now and then,
+             of the states (`StatesDiffer`); the follower then joins again with the leader's state. What has differed
+             is computed again: if it comes out differently from the same state, that is told (`NondeterminismFound`).
+Not covered  value faults: a difference is seen, not whose it is.
+Needs        determinism; two units. State access only to bring a follower in later, or back after a divergence, and to
+             compare states.
 Cost         little bandwidth: requests and digests. Both units compute.
 Source       Lauer et al. 2018, Tables I and II (A36, A37).
 """
@@ -13,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import math
 import zlib
 from collections import deque
 from typing import Any, ClassVar
@@ -20,21 +24,25 @@ from typing import Any, ClassVar
 from ...actors.errors import HoldfastError
 from ...actors.message import Message
 from ...checkpoint.records import Outcome, TurnEnd
-from ..alarms import Diverged, ProtectionLost
+from ..alarms import Diverged, NondeterminismFound, ProtectionLost, StatesDiffer
 from ..bricks import After, Before, Brick, Proceed
 from ..mechanism import Mechanism, Role
-from ..messages import FORWARDED, Done, Request, Work
+from ..messages import FORWARDED, Done, Request, State, Work
+from ..runs import Missing, Shadow, digest_of_state
 from ..standing import PeerLost
 from ..transfer import GoneAstray
 
+RUNS_AGAIN = 3
+"""How often what has differed is computed again."""
 GONE = 1e-9
 """A deadline that is over, on whatever clock."""
 
 
 class Forward(Message[None]):
-    """A batch, for the follower to compute too (A36)."""
+    """A batch, for the follower to compute too (A36). `looks`: both take a digest of the state behind it."""
 
     work: Work
+    looks: bool = False
 
 
 class Heard(Message[None]):
@@ -44,9 +52,10 @@ class Heard(Message[None]):
 
 
 class Notify(Message[None]):
-    """What the leader's turns have come to: number of the request, turn, digest."""
+    """What the leader's turns have come to: number of the request, turn, digest. `state`: that of the state behind."""
 
     ends: list[tuple[int, int, int]]
+    state: bytes = b""
 
 
 def digest(end: TurnEnd, released: list[int]) -> int:
@@ -88,6 +97,10 @@ class Sender(Brick):
 class Forwarding(Before, Sender):
     """Before of the leader: the follower has a request before anybody gets its reply."""
 
+    @property
+    def _every(self) -> float:
+        return self.mechanism.compare_every if isinstance(self.mechanism, LFR) else math.inf
+
     async def before(self, work: Work) -> Work:
         """Forward a batch; one whose deadline is over is over on both sides."""
         standing = self._standing
@@ -97,7 +110,8 @@ class Forwarding(Before, Sender):
         requests = [decided(one, now) for one in work.requests]
         work = Work(work.epoch, work.config, work.number, requests, work.go, work.again)
         if requests or work.go is not None:
-            standing.forwarded.append(self.send_peer(Forward(work)))
+            looks = standing.server.has_access and standing.looking.is_due(requests, now, self._every)
+            standing.forwarded.append(self.send_peer(Forward(work, looks)))
         return work
 
 
@@ -128,6 +142,8 @@ class Handling(Before):
         work = message.work
         left = [one for one in work.requests if log.find(one.feed.id) is None and one.feed.id not in standing.inside]
         standing.inside.update((one.feed.id, one) for one in left)
+        if message.looks:
+            standing.looking.name(left)
         self.next.tell(Work(standing.epoch, work.config, standing.forwarded_as, left, work.go, work.again))
 
 
@@ -173,7 +189,7 @@ class Notifying(After, Sender):
         standing.forwarded = [task for task in standing.forwarded if not task.done()]
         released = standing.server.released
         digests = [(end.id, end.turn, digest(end, released.get(end.turn, []))) for end in done.ends]
-        self.send_peer(Notify(digests))
+        self.send_peer(Notify(digests, standing.looking.take(standing.server, done)))
         return done
 
 
@@ -187,6 +203,7 @@ class Comparing(After):
         super().__init__(*args)
         self._ours: deque[tuple[int, int, int, str]] = deque()  # number, turn, digest, name
         self._theirs: deque[tuple[int, int, int]] = deque()
+        self._states: dict[int, bytes] = {}  # digests of states that only one of us has come to yet, by request
         self._has_diverged = False
         self._since = 0  # the state that these lead on from
 
@@ -201,6 +218,9 @@ class Comparing(After):
             name = "" if request is None else request.feed.name
             self._ours.append((end.id, end.turn, digest(end, released.get(end.turn, [])), name))
         self._compare()
+        state = self._standing.looking.take(self._standing.server, done)
+        if done.ends:
+            self._compare_states(done.ends[-1].id, done.ends[-1].turn, state)
         return done
 
     async def from_peer(self, message: Message[Any]) -> None:
@@ -210,6 +230,9 @@ class Comparing(After):
         self._begin_anew()
         self._theirs.extend(message.ends)
         self._compare()
+        if message.ends:
+            number, turn, _ = message.ends[-1]
+            self._compare_states(number, turn, message.state)
 
     def _begin_anew(self) -> None:
         """Another state was taken: what came before it is of no concern."""
@@ -217,6 +240,7 @@ class Comparing(After):
             self._since = self._standing.forwarded_as
             self._ours.clear()
             self._theirs.clear()
+            self._states.clear()
             self._has_diverged = False
 
     def _compare(self) -> None:
@@ -228,22 +252,68 @@ class Comparing(After):
             else:
                 ours, theirs = self._ours.popleft(), self._theirs.popleft()
                 if ours[:3] != theirs:
-                    self._diverged(theirs[0], theirs[1], ours[3])
+                    standing = self._standing
+                    number, turn, _ = theirs
+                    standing.node.emit(Diverged(standing.address, standing.path, standing.epoch, number, ours[3], turn))
+                    self._stray(number, turn, ours[3], {ours[2], theirs[2]})
 
-    def _diverged(self, number: int, turn: int, name: str) -> None:
+    def _compare_states(self, number: int, turn: int, digest: bytes) -> None:
+        """One of the two states behind a batch is known; when both are, they must be the same."""
+        if not digest or self._has_diverged:
+            return
+        other = self._states.pop(number, digest)
+        self._states = {number: digest} if other is digest else {}
+        if other != digest:
+            standing = self._standing
+            standing.node.emit(StatesDiffer(standing.address, standing.path, standing.epoch, turn))
+            self._stray(number, turn, "", None)
+
+    def _stray(self, number: int, turn: int, name: str, known: set[int] | None) -> None:
         """From here on our state is not the leader's: we must not lead, and do not count until we have joined again."""
         standing = self._standing
-        standing.node.emit(Diverged(standing.address, standing.path, standing.epoch, number, name, turn))
         if not standing.server.has_access:
             raise HoldfastError(f"{standing.path} has diverged from its leader at request {number}")
         self._has_diverged = True
         standing.unready()
+        begin = standing.server.since_before(number, turn)
+        if begin is not None:
+            self.ctx.create_task(self._compute_again(*begin, number, name, known))
         self.ctx.cell.node.cell_at(standing.paths["protocol"]).ref.tell(GoneAstray())
+
+    async def _compute_again(
+        self, before: State, requests: list[Request], number: int, name: str, known: set[int] | None
+    ) -> None:
+        """Run what has differed again, from the same state: an actor that is deterministic comes to the same each time.
+
+        `known`: digests of the outcomes that the request had; that it has one of these again is no proof of anything.
+        """
+        standing = self._standing
+        heard, shadow = list(standing.server.heard.values()), Shadow(standing, None)
+        found: set[tuple[int, bytes]] = set()
+        turn = before.turn
+        try:
+            for _ in range(RUNS_AGAIN):
+                run = await shadow.run(before, requests, heard)
+                if isinstance(run, Missing) or not run.ends or run.state is None:
+                    return  # It cannot be told.
+                end = run.ends[-1]
+                turn = end.turn
+                found.add((digest(end, dict(run.released).get(end.turn, [])), digest_of_state(run.state)))
+        finally:
+            await shadow.close()
+        if len(found) > 1 or (known is not None and known.isdisjoint(outcome for outcome, _ in found)):
+            kind = NondeterminismFound
+            standing.node.emit(kind(standing.address, standing.path, standing.epoch, number, name, turn))
 
 
 @dataclasses.dataclass(frozen=True)
 class LFR(Mechanism):
-    """Leader-follower replication."""
+    """Leader-follower replication.
+
+    Args:
+        compare_every: seconds between two comparisons of the states, more where one takes longer than 1 % of that.
+            0: behind each batch, whatever it takes; `math.inf`: never.
+    """
 
     name: ClassVar[str] = "lfr"
     replicas: ClassVar[int] = 2
@@ -257,3 +327,9 @@ class LFR(Mechanism):
         "leader": Role(before=Forwarding, proceed=Computing, after=Notifying),
         "follower": Role(before=Handling, proceed=Computing, after=Comparing),
     }
+
+    compare_every: float = 1.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.compare_every, int | float) or not 0 <= self.compare_every <= math.inf:
+            raise ValueError(f"LFR: compare_every must be seconds >= 0, not {self.compare_every!r}")

@@ -4,6 +4,8 @@ Fault model  one replica at a time: crashed, silent, or wrong, for once or for g
 Guarantee    an outcome leaves when two replicas agree on it, state included, and any other that is up has answered.
              A replica that was outvoted ends, is started again and joins with the right state; if it was the one that
              leads, another one leads. Without a majority the ask fails with `NoMajority`, and nothing is changed.
+             Through a failover the third replica stays one that could lead: whoever leads next brings it to its state
+             before anything leaves.
 Not covered  two faulty replicas at the same time; with one of three gone, a wrong value is seen and not masked (the ask
              fails); an ask of the actor in the middle of a turn leaves before the vote; `on_start`.
 Needs        determinism, state access; three units.
@@ -15,23 +17,26 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
+import time
 from typing import Any, ClassVar
 
 import msgspec
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import ActorStopped, HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
 from ..declaration import Cost
 from ..helping import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..mechanism import Mechanism, Role
-from ..messages import Done, Request, StaleEpoch, State
-from ..runs import Deciding, Run, digest_of_state, turns_of, vote
+from ..messages import Done, NotFollowing, Request, StaleEpoch, State, Strayed, is_marker
+from ..runs import Deciding, Digests, Run, turns_of, vote
 from ..standing import PeerLost
 from ..voters import Majority, Median, NoMajority, Undecided
 from .nvp import voter_of
 
 MAJORITY = Majority()
 NAMES = ("r1", "r2", "r3")
+TRIES = 4
+"""How often a replica is asked, if others join or go meanwhile."""
 
 
 class OutvotedHere(HoldfastError):
@@ -57,6 +62,27 @@ class Voting(Deciding):
         self._point: State | None = None
         self._digest = b""
         self._was_alone = False
+        self._digests = Digests()
+        self._strayed: list[str] = []  # replicas that have not got the state behind what leaves next
+
+    async def after(self, done: Done) -> Done | None:
+        """Have the part decided. With what leaves, the root is told which replicas have not got the state behind it."""
+        if is_marker(done.number):
+            await self._bring_others()
+        decided = await super().after(done)
+        strayed, self._strayed = self._strayed, []
+        if decided is not None:
+            decided.more.extend(map(Strayed, strayed))
+        return decided
+
+    async def _bring_others(self) -> None:
+        """We lead from now on: what only we had computed for the last leader leaves when the others have it too."""
+        server = self._standing.server
+        if server.turn < 0 or server.point is None:
+            return
+        point = server.capture()
+        order = Compute(point.turn, self._digest_of(point), None, [], [], True, point.live)
+        await asyncio.gather(*(self._at(path, point, order) for path in self._others()))
 
     async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
         """What two of three have come to."""
@@ -88,6 +114,7 @@ class Voting(Deciding):
             path = standing.path if at == 0 else paths[at - 1]
             standing.node.emit(Outvoted(standing.address, path, standing.epoch, turns_of(runs)))
             if at:
+                self._strayed.append(paths[at - 1])
                 self.ctx.create_task(self._tell(paths[at - 1]))
         if 0 in wrong:  # The right outcomes, and the state behind them, are with the others: one of them leads.
             raise OutvotedHere(f"{standing.path} leads and was outvoted")
@@ -103,7 +130,9 @@ class Voting(Deciding):
 
     def _digest_of(self, state: State) -> bytes:
         if self._point is not state and self._point != state:
-            self._point, self._digest = state, digest_of_state(state)
+            begin = time.perf_counter()
+            self._point, self._digest = state, self._digests.of(state)
+            self._standing.took(time.perf_counter() - begin, state.data.size)
         return self._digest
 
     def _others(self) -> list[str]:
@@ -111,8 +140,8 @@ class Voting(Deciding):
         return [f"{above}/{name}" for name in NAMES if name != own]
 
     async def _at(self, path: str, before: State, order: Compute) -> Computed | None:
-        """What a replica has come to; None if it cannot be reached, or has not computed it."""
-        for _ in range(4):
+        """What a replica has come to; None if it cannot be reached, or has not computed it: then it does not count."""
+        for _ in range(TRIES):
             try:
                 done = await self.ask_at(path, "tmr.before", order)
                 if done.problem == NEEDS_STATE:
@@ -122,9 +151,14 @@ class Voting(Deciding):
                 raise
             except PeerLost:
                 continue  # Another one has joined or gone meanwhile: this one may be there still.
+            except (ActorStopped, NotFollowing):
+                return None  # That life is over: the root knows, and counts on it no more.
             except HoldfastError:
-                return None
-            return None if done.problem else done
+                break
+            if not done.problem:
+                return done
+            break
+        self._strayed.append(path)
         return None
 
     async def _tell(self, path: str) -> None:
@@ -150,6 +184,7 @@ class TMR(Mechanism):
     cpu: ClassVar[str] = "high"
     units: ClassVar[int] = 3
     layer: ClassVar[str] = "replication"
+    keeps_members: ClassVar[bool] = True
     cost: ClassVar[Cost] = Cost(latency=2, total=3, requests=4, recovery=0.02)
     roles: ClassVar[dict[str, Role]] = {
         "leader": Role(before=Computing, after=Voting),

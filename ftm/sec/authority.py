@@ -4,10 +4,23 @@ from __future__ import annotations
 
 import datetime as dt
 import os
+from typing import Any
 
 from ...actors.actor import Actor, on
-from ...actors.message import Message
-from .certificates import LIFETIME, SKEW, about, issue, make_list, make_root, public_of, read_request
+from ...actors.mail import ReplyHandle
+from ...actors.message import Message, Order
+from .certificates import (
+    HEARTBEAT,
+    LIFETIME,
+    SKEW,
+    about,
+    digest_of,
+    issue,
+    make_list,
+    make_root,
+    public_of,
+    read_request,
+)
 from .errors import EnrolmentRefused, NoCertificate, Rejected
 from .keys import SigningKey, raw_public
 
@@ -16,8 +29,12 @@ class GetRoot(Message[bytes]):
     """The authority's own certificate."""
 
 
-class Enrol(Message[bytes]):
-    """Issue a certificate: `request` is from `make_request`. The reply is the certificate."""
+class Enrol(Order[bytes]):
+    """Issue a certificate: `request` is from `make_request`. The reply is the certificate.
+
+    The root's code may say so, and from another process only who was granted the authority's address: who has no key
+    would else be whoever it says, until the real one comes.
+    """
 
     request: bytes
 
@@ -28,14 +45,30 @@ class GetCertificate(Message[bytes]):
     name: str
 
 
-class Revoke(Message[int]):
-    """Revoke all certificates of a participant; the reply is how many that were. Its name is free for another key."""
+class Revoke(Order[int]):
+    """Revoke all certificates of a participant; the reply is how many that were. Its name is free for another key.
+
+    Who may enrol may revoke.
+    """
 
     name: str
 
 
 class GetRevocations(Message[bytes]):
     """The list of revoked certificates, newly signed."""
+
+
+class AwaitRevocations(Message[bytes]):
+    """The list of revoked certificates, as soon as it is another one than that with the digest `known`.
+
+    It comes after `HEARTBEAT` seconds, too: whoever hears nothing for longer must not believe the list it has.
+    """
+
+    known: bytes
+
+
+class _Beat(Message):
+    """Those who wait are to hear that we live."""
 
 
 class CertificationAuthority(Actor):
@@ -66,6 +99,7 @@ class CertificationAuthority(Actor):
         self.issued: dict[str, list[tuple[int, bytes, bytes]]] = {}  # by name: serial, public key, certificate
         self.revoked: dict[int, float] = {}
         self.list_number = 0
+        self._waiting: list[ReplyHandle[bytes]] = []
 
     def on_start(self, restored: bool) -> None:
         if not self.root or public_of(self.root) != raw_public(self._key.public):
@@ -120,9 +154,34 @@ class CertificationAuthority(Actor):
         valid = self._valid(message.name)
         for serial, _, _ in valid:
             self.revoked[serial] = self.ctx.now()
+        self._tell_all()
         return len(valid)
+
+    @on(AwaitRevocations)
+    def _await_revocations(self, message: AwaitRevocations) -> Any:
+        if message.known != digest_of(self.revoked):
+            return self._list()
+        if not self._waiting:
+            self.ctx.tell_after(HEARTBEAT, _Beat())
+        handle: ReplyHandle[bytes] = self.ctx.reply_handle()
+        self._waiting.append(handle)
+        return handle
+
+    @on(_Beat)
+    def _beat(self, message: _Beat) -> None:
+        self._tell_all()
+
+    def _tell_all(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        if waiting:
+            listed = self._list()
+            for handle in waiting:
+                handle.reply(listed)
 
     @on(GetRevocations)
     def _get_revocations(self, message: GetRevocations) -> bytes:
+        return self._list()
+
+    def _list(self) -> bytes:
         self.list_number += 1
         return make_list(self._key, self.root, self.revoked, self.list_number, self.ctx.now())

@@ -6,6 +6,8 @@ A name in a certificate is a participant's: an address, or a word for a client. 
 from __future__ import annotations
 
 import datetime as dt
+import hashlib
+from collections.abc import Iterable
 from typing import Final
 
 import msgspec
@@ -21,7 +23,9 @@ from .keys import SigningKey, is_signed
 DER: Final = serialization.Encoding.DER
 LIFETIME: Final = dt.timedelta(days=30)
 ROOT_LIFETIME: Final = dt.timedelta(days=3650)
-LIST_LIFETIME: Final = dt.timedelta(hours=1)
+LIST_LIFETIME: Final = dt.timedelta(minutes=10)
+HEARTBEAT: Final = 60.0
+"""Seconds after which an authority that lives says again what it has revoked."""
 SKEW: Final = dt.timedelta(minutes=5)
 """How far the clocks of two participants may be apart."""
 MOST_BYTES: Final = 16_384
@@ -148,6 +152,11 @@ def about(certificate: bytes) -> tuple[int, float]:
     return read.serial_number, read.not_valid_after_utc.timestamp()
 
 
+def digest_of(serials: Iterable[int]) -> bytes:
+    """What revoked serial numbers are compared by."""
+    return hashlib.sha256(" ".join(map(str, sorted(serials))).encode()).digest()
+
+
 class Trust:
     """Whom a participant believes: one authority, and its newest list of revocations.
 
@@ -196,6 +205,15 @@ class Trust:
         self.list_number, self._list_until = number, until.timestamp()
         self._revoked = frozenset(revoked.serial_number for revoked in listed)
         return True
+
+    @property
+    def list_digest(self) -> bytes:
+        """What is on the list, in short."""
+        return digest_of(self._revoked)
+
+    def is_list_current(self, now: float) -> bool:
+        """Whether there is a list whose time is not over."""
+        return now <= self._list_until
 
     def is_revoked(self, serial: int) -> bool:
         """Whether a certificate was revoked, as far as is known."""

@@ -114,7 +114,8 @@ class Identity(Secret):
         certificate = await self._authority(GetCertificate(certified(self.path)))
         limits = Limits(settings.rotate_messages, settings.rotate_seconds, lifetime=settings.lifetime)
         life = time.monotonic_ns() if old is None else old.incarnation
-        trust = Trust(root)
+        trust = Trust(root, needs_list=True)  # Who cannot know whether somebody was revoked believes nobody.
+        trust.take_list(await self._authority(GetRevocations()), time.time())
         me = Participant(
             key, certificate, trust, incarnation=life, epoch=self._epoch(), suites=settings.suites, limits=limits
         )
@@ -151,10 +152,10 @@ class Identity(Secret):
             await self._authority(Enrol(request))
         self._enrolled.add(name)
 
-    async def _authority(self, message: Message[Any]) -> Any:
+    async def _authority(self, message: Message[Any], within: float = AUTHORITY_WITHIN) -> Any:
         where = self.mechanism.authority
         try:
-            return await self._node.cell_at(where).ref.ask(message, timeout=AUTHORITY_WITHIN)
+            return await self._node.cell_at(where).ref.ask(message, timeout=within)
         except ActorStopped as error:
             raise MechanismRefused(
                 "sec", f"no authority lives at {where}: start a CertificationAuthority there"

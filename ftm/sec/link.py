@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextvars
 import hashlib
+import time
 from collections import deque
 from typing import Any
 
@@ -31,10 +32,14 @@ from ..sealed import (
     Sealed,
     Still,
 )
+from .authority import AwaitRevocations
+from .certificates import HEARTBEAT
 from .errors import (
     CLOSED,
     MALFORMED,
     REPLAYED,
+    REVOKED,
+    STALE_LIST,
     UNTRUSTED,
     WRONG_PEER,
     WRONG_SESSION,
@@ -49,6 +54,8 @@ CALL, BACK = b"call", b"back"
 PLAIN, OUT_OF_ORDER = "plain", "out_of_order"
 FIRST_WAIT, LONGEST_WAIT = 0.5, 8.0
 """Seconds until a frame that is not answered is sent again; doubled each time."""
+HEARD_WITHIN = HEARTBEAT + LONGEST_WAIT
+"""Seconds in which the authority says something."""
 FIRST_PAUSE, LONGEST_PAUSE = 0.002, 0.25
 """Seconds until a frame that was refused is sent again; the same."""
 MOST_BYTES = 1_000_000
@@ -96,6 +103,38 @@ class Link(Identity):
         self._sessions: dict[bytes, Session] = {}
         self._responses: dict[bytes, Response] = {}
         self._is_closed = False
+        self._watcher: asyncio.Task[None] | None = None
+
+    # -- revocation -------------------------------------------------------------------------------------------------
+
+    async def _identity(self) -> Participant:
+        me = await super()._identity()
+        if self._watcher is None and not self._is_closed:
+            self._watcher = self._node.loop.create_task(self._watch(), context=contextvars.Context())
+        return me
+
+    async def _watch(self) -> None:
+        """Hear from the authority who was revoked, at once; without word from it for too long believe nobody."""
+        while True:
+            me = self._me
+            try:
+                if me is not None:
+                    me.take_list(await self._authority(AwaitRevocations(me.trust.list_digest), HEARD_WITHIN))
+            except Rejected as error:
+                self._refuse(error.reason)
+                await asyncio.sleep(LONGEST_WAIT)
+            except HoldfastError:  # It is between two lives.
+                await asyncio.sleep(FIRST_WAIT)
+            if me is None:
+                await asyncio.sleep(FIRST_WAIT)
+            else:
+                self._end_distrusted(me)
+
+    def _end_distrusted(self, me: Participant) -> None:
+        is_current = me.trust.is_list_current(time.time())
+        for session in self._sessions.values():
+            if not is_current or me.trust.is_revoked(session.peer.serial):
+                session.close(REVOKED if is_current else STALE_LIST)
 
     # -- hand-shakes ------------------------------------------------------------------------------------------------
 
@@ -348,6 +387,8 @@ class Link(Identity):
     def close(self) -> None:
         """End all sessions; nothing is sent or accepted any more."""
         self._is_closed = True
+        if self._watcher is not None:
+            self._watcher.cancel()
         for session in self._sessions.values():
             session.close()
         self._sessions.clear()

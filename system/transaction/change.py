@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from ...actors.control.orders import Migrate
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
-from .mechanisms import Attach, Compose, Detach, DetachLayer, Transition, Update
+from .mechanisms import Attach, Compose, Detach, DetachLayer, OnProtection, Transition, Update
 from .moving import Move
 from .operation import Operation, Step
 from .running import StartAgain, StopChild
@@ -19,6 +20,7 @@ from .structure import Add, Remove, Reorder, SetFlags, named_spec, text_of
 from .wiring import Bind, Register, Unbind, Unregister
 
 if TYPE_CHECKING:
+    from ...ftm.events import MechanismSettled
     from ..system import ActorSystem
 
 
@@ -128,12 +130,13 @@ class Change:
         """Nest one more mechanism inside of those that it has, or outside."""
         self.step(Compose(target, mechanism, outside=outside))
 
-    def transition(self, target: Target, mechanism: Any) -> None:
+    def transition(self, target: Target, mechanism: Any, *, whole: bool = False) -> None:
         """Put a mechanism in the place of the one of its sort, or several in the place of all, outermost first.
 
-        Only the bricks that differ are touched.
+        A tuple of one is that one. With `whole=True` what is given is the whole stack, also if it is only one. Only the
+        bricks that differ are touched.
         """
-        self.step(Transition(target, mechanism))
+        self.step(Transition(target, mechanism, whole=whole))
 
     def update(self, target: Target, brick: str, new: Any, *, mechanism: str = "", role: str = "") -> None:
         """Give one brick new code.
@@ -162,6 +165,15 @@ class Change:
     def steps(self) -> tuple[Step, ...]:
         """The steps, in order."""
         return tuple(Step(n, one.verb, one.target, one.text) for n, one in enumerate(self._operations, 1))
+
+    async def settled(self) -> tuple[MechanismSettled, ...]:
+        """Wait until it is known whether the mechanisms that this transaction has changed stay.
+
+        A new stack of mechanisms is on probation for some seconds: if it ends a replica, or lets nothing pass, the one
+        before comes back. Called behind the transaction; one for each address, in the order of the steps.
+        """
+        on_probation = [one.probation for one in self._operations if isinstance(one, OnProtection)]
+        return tuple([await asyncio.shield(one.settled) for one in on_probation if one is not None])
 
     @property
     def difference(self) -> tuple[str, ...]:

@@ -7,14 +7,15 @@ import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from ...actors.cell import Cell
-from ...actors.errors import CannotMove
 from ...supervision.arbiter import Grant, Hand, arbiter_of
 from ...supervision.respec import recipe_spec
+from ..moving import to_its_end
 from .draft import Draft, Place, Target, is_elsewhere, rules
 from .living import OnLiving
 from .operation import wrong
 
 if TYPE_CHECKING:
+    from ...ftm.probation import Probation
     from ..system import ActorSystem
 
 PROTECT_TIMEOUT = 60.0
@@ -31,6 +32,8 @@ class OnProtection(OnLiving):
         self._after: Any = None  # and that there is to be
         self._has_begun = False
         self._grant: Grant | None = None
+        self.probation: Probation | None = None
+        """Whether it stays is known when this is over; None: at once."""
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
@@ -62,16 +65,7 @@ class OnProtection(OnLiving):
             else moves.protect(cell, system.homes, mechanism, PROTECT_TIMEOUT)
         )
         self._under_way = system.node.loop.create_task(change, name=f"mechanism of {cell.path}")
-        await self._to_its_end(self._under_way)
-
-    async def _to_its_end(self, change: asyncio.Task[None]) -> None:
-        """Wait for it. Raises what it raises; CannotMove if it is the system that ends."""
-        try:
-            await asyncio.shield(change)
-        except asyncio.CancelledError:
-            if change.cancelled():  # Not we: nobody has cancelled whoever waits here.
-                raise CannotMove(self.target, "the system ends") from None
-            raise
+        await to_its_end(self.target, self._under_way)
 
     async def undo(self, system: ActorSystem) -> None:
         if not self._has_begun:
@@ -85,7 +79,7 @@ class OnProtection(OnLiving):
             cell = self.cell(system)
             if described(mechanism_of(cell)) != described(self._before):  # Else it stayed as it was.
                 await self._run(system, cell, self._before)
-            system.protection.over(self.target)
+            system.mechanism_notes.over(self.target)
         finally:
             self._give_back(system)
 
@@ -102,7 +96,7 @@ class OnProtection(OnLiving):
         cell = self.cell(system)
         self._grant = arbiter_of(system.node).claim(self.target, Hand.ADAPTATION, self.text)
         self._before, self._has_begun = mechanism_of(cell), True
-        system.protection.begun(self.target, self.text)
+        system.mechanism_notes.begun(self.target, self.text)
         await self._run(system, cell, self._after)
 
     def verify(self, system: ActorSystem) -> None:
@@ -113,12 +107,20 @@ class OnProtection(OnLiving):
             raise wrong(self.target, "its mechanism is another one again")
 
     def seal(self, system: ActorSystem) -> None:
-        system.protection.put(self.target, self._before, self._after)
-        system.protection.over(self.target)
+        notes, target, before, after = system.mechanism_notes, self.target, self._before, self._after
+        notes.put(target, before, after)
+        notes.over(target)
+
+        def back() -> None:
+            notes.put(target, after, before)
+            notes.flush()
+
+        if self.probation is not None:
+            self.probation.on_back = back
         self._give_back(system)
 
     async def finish(self, system: ActorSystem) -> None:
-        system.protection.flush()
+        system.mechanism_notes.flush()
 
 
 class Attach(OnProtection):
@@ -206,7 +208,8 @@ class Adapt(OnProtection):
     async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
         change = system._moves.adapt(cell, mechanism, PROTECT_TIMEOUT)
         self._under_way = system.node.loop.create_task(change, name=f"adaptation of {cell.path}")
-        await self._to_its_end(self._under_way)
+        await to_its_end(self.target, self._under_way)
+        self.probation = getattr(cell.host, "probation", None)  # None: it has been detached since.
 
     def _give_up(self, system: ActorSystem) -> None:
         if self._under_way is not None and not self._under_way.done():
@@ -246,16 +249,16 @@ class Transition(Adapt):
 
     verb: ClassVar[str] = "transition"
 
-    def __init__(self, target: Target, mechanism: Any) -> None:
+    def __init__(self, target: Target, mechanism: Any, *, whole: bool = False) -> None:
         super().__init__(target)
-        self._mechanism = mechanism
+        self._mechanism, self._whole = mechanism, whole
 
     @property
     def text(self) -> str:
         return f"transition of {self.target} to {mechanism_text(self._mechanism)}{self._from_to}"
 
     def _wanted(self, before: Any) -> tuple[Any, ...]:
-        layers: tuple[Any, ...] = rules().replaced(before, self._mechanism)
+        layers: tuple[Any, ...] = rules().replaced(before, self._mechanism, whole=self._whole)
         return layers
 
 

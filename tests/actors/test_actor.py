@@ -87,6 +87,23 @@ async def test_a_message_without_handler_is_refused_at_the_call_every_time(syste
     assert system.dead_letters == 0
 
 
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("send", ["tell", "ask", "send"])
+async def test_what_is_no_message_is_refused_with_advice(send: str, isolation: Any) -> None:
+    class Any_(hf.Message[int]): ...
+
+    async with hf.ActorSystem(log=False) as system:
+        ref: Any = await system.start(hf.child("counter", hf.start(hf.Actor), isolation=isolation))
+        for no_message, advice in (
+            ("hello", "class MyMessage(hf.Message[...])"),
+            (Any_, "send an instance, Any_(...)"),
+        ):
+            with pytest.raises(hf.BadMessage) as caught:
+                await getattr(ref, send)(no_message)  # A tell would return None, were it not refused.
+            assert advice in str(caught.value)
+            assert "@on(str)" not in str(caught.value)
+
+
 async def test_a_refusal_ends_the_turn_well(system: hf.ActorSystem) -> None:
     class Strict(hf.Actor):
         @hf.on(Add)
@@ -116,6 +133,13 @@ def test_two_handlers_for_one_message_are_refused_when_the_class_is_made() -> No
             @hf.on(Add)
             def two(self, message: Add) -> int:
                 return 2
+
+
+def test_an_async_init_is_refused_when_the_class_is_made() -> None:
+    with pytest.raises(TypeError, match=r"__init__ cannot be async: what has to be awaited goes into on_start"):
+
+        class Waits(hf.Actor):
+            async def __init__(self) -> None: ...  # type: ignore[misc]
 
 
 def test_a_handler_whose_annotation_contradicts_is_refused_when_the_class_is_made() -> None:

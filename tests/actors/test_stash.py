@@ -81,6 +81,30 @@ async def test_a_stashed_ask_has_no_reply_until_it_is_handled(system: hf.ActorSy
     assert await asked == 1
 
 
+class Later(hf.Message[None]): ...
+
+
+class Patient(Shop):
+    """Lets customers in from a background task, when no message wakes it."""
+
+    @hf.on(Later)
+    def later(self, message: Later) -> None:
+        async def open_soon() -> None:
+            await asyncio.sleep(0)
+            self.open = True
+            self.ctx.unstash()
+
+        self.ctx.create_task(open_soon())
+
+
+async def test_unstash_wakes_an_actor_that_is_idle(system: hf.ActorSystem) -> None:
+    """Also from background work, behind which no message comes."""
+    shop = system.spawn(hf.start(Patient))
+    asked = shop.ask(Item(1))
+    await shop.ask(Later())
+    assert await asked == 1
+
+
 async def test_one_message_instance_sent_twice_is_two_messages(system: hf.ActorSystem) -> None:
     shop, same = system.spawn(hf.start(Shop)), Item(7)
     shop.tell(same)

@@ -350,3 +350,142 @@ async def test_a_stop_that_takes_too_long_becomes_a_kill(system: hf.ActorSystem)
     await system.stop(one)
     assert loop.time() - begin == pytest.approx(5.0, abs=0.1)
     assert system.tree() == ["/t"]
+
+
+# -- whom on_stop is called for, and what it may say ------------------------------------------------------------------
+
+
+class Says(Plain):
+    """Tells of its end, and gives what it was given as its result."""
+
+    def __init__(self, told: list[str], says: Any = None) -> None:
+        self.told, self.says = told, says
+
+    async def on_stop(self, reason: hf.ExitReason) -> Any:
+        self.told.append(str(reason))
+        if isinstance(self.says, BaseException):
+            raise self.says
+        return self.says
+
+
+class FailsToStart(Says):
+    async def on_start(self, restored: bool) -> None:
+        self.ctx.spawn(hf.start(Says, self.told), "helper")
+        raise self.says
+
+
+@pytest.mark.parametrize("traps", [False, True])
+async def test_on_stop_is_called_when_a_supervisor_stops_its_child(system: hf.ActorSystem, traps: bool) -> None:
+    told: list[str] = []
+    ref = await system.start(hf.child("a", hf.start(Says, told)))
+
+    def trap(actor: hf.Actor) -> None:
+        actor.ctx.trap_exits = traps
+
+    await ref.ask(Do(trap))
+    await system.stop(ref)
+    assert told == ["shutdown"]
+
+
+@pytest.mark.parametrize("error", [ValueError("no device"), hf.Ignore("not today")])
+async def test_a_start_that_fails_has_nothing_to_take_down_but_its_children(
+    system: hf.ActorSystem, error: Exception
+) -> None:
+    told: list[str] = []
+    start = system.start(hf.child("a", hf.start(FailsToStart, told, error)))
+    if isinstance(error, hf.Ignore):
+        assert await start is None
+    else:
+        with pytest.raises(hf.StartFailed, match="no device"):
+            await start
+    assert told == ["shutdown"]  # It is the helper's.
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid(60.0)])
+async def test_an_exit_that_is_not_trapped_cuts_off_wherever_the_state_is(
+    system: hf.ActorSystem, recovery: Any
+) -> None:
+    told: list[str] = []
+    peer = system.spawn(hf.start(Plain))
+    ref = await system.start(hf.child("a", hf.start(Cut, str(id(told))), recovery=recovery, restart="temporary"))
+    TOLD[str(id(told))] = told
+    await ref.ask(Linked(peer.path))
+    peer.kill()
+    while "/t/a" in system.tree():
+        await asyncio.sleep(0)
+    assert told == []
+
+
+TOLD: dict[str, list[str]] = {}
+
+
+class Linked(hf.Message[None]):
+    path: str
+
+
+class Cut(hf.Actor):
+    """Its state can be saved: where it tells of its end is known by name."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @hf.on(Linked)
+    def link(self, message: Linked) -> None:
+        if message.path:
+            self.ctx.link(self.ctx.find(message.path, hf.Actor))
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        TOLD[self.name].append(str(reason))
+
+
+@pytest.mark.parametrize(
+    ("says", "reason", "restarted"),
+    [
+        (None, "shutdown (mine)", False),
+        ("anything else", "shutdown (mine)", False),
+        (hf.Shutdown("no use"), "shutdown (no use)", False),
+        (hf.Crash("Later", "it was not saved"), "Later: it was not saved", True),
+        (OSError("disk full"), "OSError: disk full", True),
+    ],
+)
+async def test_on_stop_may_say_why_the_life_ends(
+    system: hf.ActorSystem, says: Any, reason: str, restarted: bool
+) -> None:
+    told: list[str] = []
+    ref = await system.start(hf.child("a", hf.start(Says, told, says), restart="transient"))
+    ended = ref._cell.ended()
+    with system.events() as events:
+        ref.tell(Do(lambda actor: actor.ctx.stop(hf.Shutdown("mine"))))
+        assert str(await ended) == reason
+        await system.node.settled()
+        kinds = [type(event).__name__ for event in events.take()]
+    assert told == ["shutdown (mine)"]
+    assert ("ChildRestarted" in kinds) is restarted
+    assert ("ActorCrashed" in kinds) is isinstance(says, hf.Crash)
+    assert ("HookFailed" in kinds) is isinstance(says, OSError)
+
+
+async def test_a_crash_stays_the_reason_when_on_stop_fails_too(system: hf.ActorSystem) -> None:
+    ref = system.spawn(hf.start(Says, [], OSError("disk full")))
+    ended = ref._cell.ended()
+    ref.tell(Do(lambda _: 1 / 0))
+    assert "ZeroDivisionError" in str(await ended)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_who_stops_with_a_crash_has_crashed(system: hf.ActorSystem, isolation: Any) -> None:
+    ref = await system.start(hf.child("a", hf.start(Gives), isolation=isolation, restart="temporary"))
+    with system.events() as events:
+        ref.tell(Give())
+        while not (told := [event for event in events.take() if isinstance(event, hf.ActorCrashed)]):
+            await asyncio.sleep(0)
+    assert [(event.address, str(event.reason)) for event in told] == [("/t/a", "Up: it gives up")]
+
+
+class Give(hf.Message): ...
+
+
+class Gives(hf.Actor):
+    @hf.on(Give)
+    def give(self, message: Give) -> None:
+        self.ctx.stop(hf.Crash("Up", "it gives up"))

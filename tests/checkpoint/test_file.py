@@ -290,3 +290,26 @@ async def test_a_fresh_start_and_a_change_of_specs_see_the_file_too(tmp_path: Pa
         async with hf.ActorSystem("app", log=False, store=store, recovery=hf.load_recovery(path)) as system:
             await system.start(hf.supervisor("top", children=[spec]), fresh=fresh)
             assert await system.ref("/app/top/x", Doer).ask(Seen()) == ([] if fresh else ["one"])
+
+
+async def test_a_table_that_is_for_nobody_is_told_of(tmp_path: Path, isolation: str) -> None:
+    """Nothing in the file is passed over in silence: a name may be misspelt."""
+    path = tmp_path / "recovery.toml"
+    tables = ["/app/of-*/doer", "/app/doer", "/app/doter", "tests.checkpoint.players:Hooks"]
+    path.write_text("".join(f'["{table}"]\n' for table in tables))
+    async with hf.ActorSystem("app", log=False, recovery=str(path)) as system:
+        await start(system, isolation, "doer", hf.start(Doer))
+        stream = system.events()
+    told = [(one.table, one.where) for one in stream.take() if isinstance(one, hf.RecoveryTableUnused)]
+    other = ("/app/doer", 2) if isolation == "subtree" else ("/app/of-*/doer", 1)
+    names = [other, ("/app/doter", 3), ("tests.checkpoint.players:Hooks", 4)]
+    assert sorted(told) == sorted((name, f"{path}, line {line}, [{name}]") for name, line in names)
+
+
+def test_a_topic_without_a_message_is_refused() -> None:
+    with pytest.raises(TypeError, match="@subscribe without @on"):
+
+        class Deaf(hf.Actor):
+            @hf.subscribe("/scan")
+            def scan(self, message: Note) -> int:
+                return 0

@@ -310,7 +310,7 @@ async def test_the_supervisor_answers_while_a_recorded_child_starts_by_order(
                 await asked
         else:
             await system.stop(top(system))
-            with pytest.raises((hf.StartFailed, hf.ActorStopped)):
+            with pytest.raises(hf.AskFailed, match="shutdown"):
                 await asked
 
 

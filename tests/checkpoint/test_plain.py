@@ -162,6 +162,40 @@ async def test_a_topic_can_feed_a_method(system: hf.ActorSystem) -> None:
     assert actor_of(ref).program.log == ["turn 7", "move 1.0"]
 
 
+class Announcer:
+    """Publishes from whatever is called: a callback of its own, or a method that a topic or a message calls."""
+
+    def __init__(self, bus: hf.Bus) -> None:
+        self._bus = bus
+        bus.subscribe("/goal", self.on_goal)
+
+    def on_goal(self, message: Goal) -> None:
+        self._bus.publish("/out", Note(f"goal {message.n}"))
+
+    async def on_turn(self, message: Turn) -> None:
+        self._bus.publish("/out", Note("turn"))
+
+    def state(self) -> list[int]:
+        self._bus.publish("/out", Note("state"))
+        return [1]
+
+
+AnnouncerActor = hf.wrap(
+    Announcer, "AnnouncerActor", methods={State: "state"}, callbacks={"/goal": Goal, "/turn": (Turn, "on_turn")}
+)
+
+
+async def test_what_any_call_of_a_program_sends_leaves_with_it(isolation: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        out = await system.start(hf.child("out", hf.start(Out)))
+        ref = await start(system, isolation, "announcer", hf.start(AnnouncerActor), recovery=hf.hybrid())
+        assert await ref.ask(State(), timeout=30.0) == [1]
+        await system.publish("/turn", Turn(7))
+        await system.publish("/goal", Goal(3))
+        assert await ref.ask(State(), timeout=30.0) == [1]
+        assert await out.ask(Notes()) == ["state", "turn", "goal 3", "state"]
+
+
 class Clockwork:
     def __init__(self, bus: hf.Bus) -> None:
         self.ticks = list[float]()

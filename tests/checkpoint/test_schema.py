@@ -19,6 +19,8 @@ class Get(hf.Message[list[float]]): ...
 
 
 class Old(hf.Actor):
+    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:New", f"{__name__}:Stubborn", f"{__name__}:Never")
+
     def __init__(self) -> None:
         self.total = 7
         self.grid = np.ones(200_000)
@@ -31,6 +33,7 @@ class Old(hf.Actor):
 class New(hf.Actor):
     """Keeps the sum in another variable, as two numbers."""
 
+    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:Old", f"{__name__}:Never")
     schema_version: ClassVar[int] = 3
 
     def __init__(self) -> None:
@@ -51,12 +54,14 @@ class New(hf.Actor):
 class Never(New):
     """Comes from a version that `migrate` does not know."""
 
+    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:Old", f"{__name__}:New", f"{__name__}:Stubborn")
     schema_version: ClassVar[int] = 2
 
 
 class Stubborn(Old):
     """Has another version, and no way to it."""
 
+    formerly: ClassVar[tuple[str, ...]] = (f"{__name__}:Old", f"{__name__}:New", f"{__name__}:Stubborn")
     schema_version: ClassVar[int] = 2
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import datetime as dt
+import gc
 import logging
 import os
 import random
@@ -25,6 +26,7 @@ import pytest
 import holdfast as hf
 from tests.checkpoint.players import start
 
+WORLD = "a message, or ctx.pipe_to_self(),"
 CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "time.time": (lambda: time.time(), "ctx.now()"),
     "time.monotonic": (lambda: time.monotonic(), "ctx.now()"),
@@ -43,11 +45,24 @@ CALLS: dict[str, tuple[Callable[[], Any], str]] = {
     "secrets.token_hex": (lambda: secrets.token_hex(), "ctx.random"),
     "secrets.choice": (lambda: secrets.choice([1, 2]), "ctx.random"),
     "numpy.random": (lambda: np.random.rand(), "ctx.random"),
+    "os.getpid": (lambda: os.getpid(), "ctx.path"),
+    "os.listdir": (lambda: os.listdir("."), WORLD),
+    "os.getenv": (lambda: os.getenv("HOME"), WORLD),
+    "os.environ.get": (lambda: os.environ.get("HOME"), WORLD),
+    "os.environ.__getitem__": (lambda: os.environ["PATH"], WORLD),
+    "open": (lambda: open(os.devnull).close(), WORLD),
+    "Path.read_text": (lambda: Path(__file__).read_text(), WORLD),
+    "Path.exists": (lambda: Path(__file__).exists(), WORLD),
+    "id": (lambda: id(object()), "ctx.path"),
+    "loop.time": (lambda: asyncio.get_running_loop().time(), "ctx.now() or ctx.pipe_to_self()"),
     "asyncio.ensure_future": (lambda: asyncio.ensure_future(asyncio.Future()), "ctx.pipe_to_self()"),
 }
 
 
-NAMES = {"secrets.choice": "random.SystemRandom.choice"}  # where it does not call itself as it is called
+NAMES = {
+    "loop.time": "asyncio.get_running_loop",
+    "secrets.choice": "random.SystemRandom.choice",
+}  # where it does not call itself as it is called
 
 
 class Call(hf.Message[str]):
@@ -88,6 +103,8 @@ class Asker(hf.Actor):
         self.ctx.random.randint(1, 6)
         self.ctx.random.shuffle([1, 2, 3])
         random.Random(3).random()
+        {"a": 1}.get("a")
+        str(np.arange(3))
         np.random.default_rng(3).random()
         dt.datetime.fromtimestamp(self.ctx.now(), dt.UTC)
         self.ctx.pipe_to_self(asyncio.sleep(0), lambda _: Done())
@@ -211,3 +228,53 @@ def test_the_settings_are_checked() -> None:
     for wrong in wrongs:
         with pytest.raises(hf.SpecError, match=f"hybrid: {next(iter(wrong))} must be"):
             hf.hybrid(**wrong)
+
+
+class Garbage:
+    """Is in a circle, so only the collector can end it; and it asks the world then."""
+
+    ended = 0
+
+    def __init__(self) -> None:
+        self.me = self
+
+    def __del__(self) -> None:
+        Garbage.ended += bool(time.time())
+
+
+class Litter(hf.Message[int]):
+    explicit: bool
+
+
+class Litterer(hf.Actor):
+    def __init__(self) -> None:
+        self.count = 0
+
+    @hf.on(Litter)
+    async def litter(self, message: Litter) -> int:
+        for _ in range(3):
+            self.count += len([[Garbage()] for _ in range(2_000)])
+            if message.explicit:
+                gc.collect()
+            await asyncio.sleep(0)
+        return self.count
+
+
+@pytest.mark.parametrize("explicit", [False, True])
+async def test_a_turn_is_not_blamed_for_what_the_collector_runs(system: hf.ActorSystem, explicit: bool) -> None:
+    calls: list[float] = []
+
+    def others(phase: str, info: dict[str, int]) -> None:
+        calls.append(time.perf_counter())
+
+    ref = await start(system, "task", "one", hf.start(Litterer), recovery=STRICT)
+    before = Garbage.ended
+    gc.callbacks.append(others)
+    try:
+        assert await ref.ask(Litter(explicit), timeout=30.0) == 6_000
+        gc.collect()
+    finally:
+        gc.callbacks.remove(others)
+    assert calls
+    assert Garbage.ended - before == 6_000
+    assert gc.isenabled()

@@ -1,5 +1,6 @@
 """The command line: what it says when it cannot do what it is asked, and its exit status."""
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -22,11 +23,11 @@ def test_it_prints_its_version() -> None:
     assert result.stdout.startswith("holdfast")
 
 
-@pytest.mark.parametrize("package", ["typer", "rich", "numpy", "PIL"])
-def test_a_missing_package_is_named_with_what_to_install(package: str) -> None:
+@pytest.mark.parametrize(("package", "extra"), [("typer", "cli"), ("rich", "cli"), ("numpy", "demo"), ("PIL", "demo")])
+def test_a_missing_package_is_named_with_what_to_install(package: str, extra: str) -> None:
     text = cli.missing_extra(ModuleNotFoundError("gone", name=f"{package}.core"))
     assert f"'{package}'" in text
-    assert "pip install holdfast[demo]" in text
+    assert f"pip install 'holdfast[{extra}]'" in text
 
 
 def test_any_other_missing_module_is_an_error() -> None:
@@ -37,8 +38,39 @@ def test_any_other_missing_module_is_an_error() -> None:
 def test_without_typer_there_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delitem(sys.modules, "holdfast.console.commands")
     monkeypatch.setitem(sys.modules, "typer", None)
-    with pytest.raises(SystemExit, match=r"pip install holdfast\[demo\]"):
+    with pytest.raises(SystemExit, match=r"pip install 'holdfast\[cli\]'"):
         cli.app()
+
+
+BARE = """
+import sys
+
+for name in ("numpy", "PIL", "rtbdata"):
+    sys.modules[name] = None  # as if it were not installed
+from holdfast.console.cli import app
+
+sys.argv[1:] = {arguments}
+app()
+"""
+
+
+def bare(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """The command where only the extra `cli` is installed."""
+    program = BARE.format(arguments=list(arguments))
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=120)
+
+
+def test_the_command_line_needs_nothing_of_the_demo(tmp_path: Path) -> None:
+    done = bare("tree", "--socket", str(tmp_path / "gone.sock"))
+    assert (done.returncode, done.stdout) == (UNUSABLE, "")
+    assert "gone.sock" in done.stderr
+    assert "pip install" not in done.stderr
+
+
+def test_the_demo_names_its_own_extra(tmp_path: Path) -> None:
+    done = bare("demo", "--log", str(tmp_path / "gone.g2o"))
+    assert done.returncode == DIFFERS
+    assert "pip install 'holdfast[demo]'" in done.stderr
 
 
 def test_no_such_log(tmp_path: Path) -> None:

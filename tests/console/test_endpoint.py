@@ -16,7 +16,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.console import endpoint as endpoint_module
-from holdfast.console.endpoint import Endpoint, EndpointInUse, control_endpoint
+from holdfast.console.endpoint import Endpoint, EndpointInUse, claimed, control_endpoint
 from holdfast.console.remote import NotReached, RemoteRef, RemoteSystem
 from holdfast.console.wire import LARGEST, RESPONSE, BadRequest, Request, Tree, WrongUser, frame, outcome
 from tests.system.trees import Add, Counter, counter, picture, ref
@@ -143,6 +143,8 @@ BAD = {
     "unknown request": HEAD.pack(20) + msgspec.msgpack.encode({"ask": "shutdown all"})[:20].ljust(20, b"\0"),
     "too large": HEAD.pack(LARGEST + 1),
     "unknown field": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "tree", "all": True})),
+    "no UTF-8": (lambda body: HEAD.pack(len(body)) + body)(b"\x82\xa3ask\xa7whereis\xa4name\xa2\xff\xfe"),
+    "nesting without end": (lambda body: HEAD.pack(len(body)) + body)(b"\x81\xa3ask" * 300_000),
     "wrong type": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "whereis", "name": 5})),
 }
 
@@ -169,20 +171,61 @@ async def test_a_client_that_goes_in_the_middle_of_a_frame_hurts_nobody(system: 
     assert await far(path, lambda remote: remote.tree()) == system.tree()
 
 
-async def test_too_many_clients_are_turned_away(
+async def test_idle_clients_make_room_for_the_next(
     system: hf.ActorSystem, path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Whoever holds connections and says nothing cannot lock the operator out: the idlest one goes."""
     monkeypatch.setattr(endpoint_module, "MOST_CLIENTS", 2)
     held = [await asyncio.open_unix_connection(path) for _ in range(2)]
     for reader, writer in held:
         writer.write(frame(Tree()))
         assert await reader.readexactly(4)  # It is served: it counts from now on.
-    response, _ = await raw(path, frame(Tree()))
-    with pytest.raises(BadRequest, match="2 connections already"):
-        outcome(response)
+    held[1][1].write(frame(Tree())[:3])  # This one has begun to say something, and does not go on.
+    for _ in range(3):
+        assert await far(path, lambda remote: remote.tree()) == system.tree()
     for _, writer in held:
         writer.close()
         await writer.wait_closed()
+
+
+async def test_clients_at_work_are_not_sent_away(
+    system: hf.ActorSystem, path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(endpoint_module, "MOST_CLIENTS", 1)
+    at_work, finish = asyncio.Event(), asyncio.Event()
+
+    async def wait(endpoint: Endpoint, request: Any) -> Any:
+        at_work.set()
+        await finish.wait()
+        return system.tree()
+
+    monkeypatch.setattr(Endpoint, "_do", wait)
+    reader, writer = await asyncio.open_unix_connection(path)
+    writer.write(frame(Tree()))
+    await at_work.wait()
+    response, _ = await raw(path, frame(Tree()))
+    with pytest.raises(BadRequest, match="1 connections already"):
+        outcome(response)
+    finish.set()
+    (size,) = HEAD.unpack(await reader.readexactly(4))
+    assert outcome(RESPONSE.decode(await reader.readexactly(size))) == system.tree()
+    writer.close()
+    await writer.wait_closed()
+
+
+async def test_a_path_that_somebody_is_about_to_take_is_left_alone(system: hf.ActorSystem, tmp_path: Path) -> None:
+    """Between the look at a dead process's socket and a socket in its place there is a moment: it has one owner."""
+    where = tmp_path / "app.sock"
+    with socket.socket(socket.AF_UNIX) as dead:
+        dead.bind(str(where))
+    before = os.lstat(where).st_ino
+    with claimed(where), pytest.raises(EndpointInUse, match="a live process listens there"):
+        async with control_endpoint(system, where):
+            pass
+    assert os.lstat(where).st_ino == before
+    async with control_endpoint(system, where):
+        assert await far(where, lambda remote: remote.tree()) == system.tree()
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_request_is_typed() -> None:

@@ -163,5 +163,5 @@ def test_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         return None
 
     monkeypatch.setattr("importlib.util.find_spec", find_nothing)
-    with pytest.raises(LogError, match=r"pip install holdfast\[demo\]"):
+    with pytest.raises(LogError, match=r"pip install 'holdfast\[demo\]'"):
         killian_court()

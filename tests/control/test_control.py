@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import os
+import resource
 import signal
 from pathlib import Path
 from typing import Any
@@ -249,11 +250,13 @@ async def test_a_replaced_state_that_cannot_be_saved_is_undone(tmp_path: Path, i
         recipe = hf.start(Account)
         one = await system.start(hf.child("one", recipe, isolation=isolation, recovery=hf.hybrid(interval=3600.0)))
         assert await one.ask(Add(1)) == 1
-        folder = tmp_path / "app.db-snapshots"
-        folder.rmdir()  # large states are files in there
-        with pytest.raises(hf.ControlFailed, match="the new state could not be saved"):
-            await system.replace_state(one, large)
-        folder.mkdir()
+        limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, limits[1]))  # large states are files
+        try:
+            with pytest.raises(hf.ControlFailed, match="the new state could not be saved"):
+                await system.replace_state(one, large)
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         assert await one.ask(Add(1), timeout=30.0) == 2
         assert await system.get_state(one) == {"total": 2, "seen": [1, 1]}
 

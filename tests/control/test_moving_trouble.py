@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.process.mover import Move
 from tests.control.movers import (
     OTHER,
     Fussy,
     Leaves,
     Work,
-    Worker,
     lives_in,
     moved,
 )
@@ -170,26 +170,51 @@ async def test_the_old_process_ends_after_a_move(system: hf.ActorSystem, recover
     assert await one.ask(Add(1)) == 1
 
 
-async def test_what_was_said_of_an_earlier_attempt_counts_for_nothing(
-    system: hf.ActorSystem, recovery: Any, tmp_path: Path
+@pytest.fixture
+def given_up_at_rest(monkeypatch: pytest.MonkeyPatch) -> list[Move]:
+    """Attempts that run out of time at the very instant at which the old life is told to be at rest; two of them."""
+    attempts: list[Move] = []
+    at_rest = Move.at_rest
+
+    def give_up(move: Move) -> None:
+        at_rest(move)
+        attempts.append(move)
+        if len(attempts) <= 2:
+            move.give_up("the time is over")
+
+    monkeypatch.setattr(Move, "at_rest", give_up)
+    return attempts
+
+
+@pytest.mark.parametrize("suspended", [False, True])
+async def test_an_attempt_right_after_one_that_was_given_up_takes_nothing_of_it(
+    system: hf.ActorSystem, recovery: Any, here: Any, suspended: bool, given_up_at_rest: list[Move]
 ) -> None:
-    """An attempt that was given up has the word "at rest" on its way, when the next one begins."""
-    one = await system.start(hf.child("one", hf.start(Worker), recovery=recovery, isolation="process"))
-    gate = tmp_path / "gate"
-    one.tell(Work(str(gate)))
+    """The luggage of the earlier attempt is on its way when the next one begins: what was done since is in neither."""
+    one = await system.start(hf.child("one", hf.start(Account), recovery=recovery, isolation=here))
     assert await one.ask(Add(1)) == 1
-    process = system._workers.of(one._cell)
-    assert process is not None
-    nobody = process.on_move
-    moving = asyncio.ensure_future(system.set_isolation(one, "task", timeout=30.0))
-    while process.on_move is nobody:
-        await asyncio.sleep(0)
-    process.on_move({"step": "taken", "attempt": 0, "at": 0.0, "trap_exits": False, "suspended": False})
-    assert await one.ask(Add(1)) == 2
-    assert lives_in(system, one) == "process"
-    gate.touch()
-    await moving
-    async with asyncio.timeout(30):
-        while await one.ask(Add(0)) != 102:
-            await asyncio.sleep(0.005)
-    assert lives_in(system, one) == "task"
+    asks: list[asyncio.Future[int]] = []
+    if suspended:
+        await system.suspend(one)
+    for _ in range(2):
+        with pytest.raises(hf.CannotMove, match="the time is over"):
+            await system.set_isolation(one, OTHER[here])
+        asks.append(one.ask(Add(10), timeout=60.0))
+    await system.set_isolation(one, OTHER[here])
+    assert len(given_up_at_rest) == 3
+    if suspended:
+        await system.resume(one)
+    assert await asyncio.gather(*asks) == [11, 21]
+    assert await one.ask(Total()) == 21
+    assert lives_in(system, one) == OTHER[here]
+
+
+async def test_who_waits_for_a_move_hears_that_the_system_ends(recovery: Any, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    async with hf.ActorSystem("ending", log=False) as system:
+        one = await system.start(hf.child("one", hf.start(Fussy, str(gate), "hang"), recovery=recovery))
+        gate.touch()  # The next life does not come up.
+        moving = asyncio.ensure_future(system.set_isolation(one, "process", timeout=300.0))
+        await asyncio.sleep(0)  # It has begun.
+    with pytest.raises(hf.CannotMove, match="the system ends"):  # Nobody has cancelled us.
+        await moving

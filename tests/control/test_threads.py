@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable
@@ -219,6 +221,80 @@ async def test_a_killed_life_does_not_wait_for_its_thread(
     assert await sink.ask(Total()) == 0
 
 
+class Busy:
+    """How many threads are in it, until it is opened."""
+
+    def __init__(self) -> None:
+        self.gate, self._lock = threading.Event(), threading.Lock()
+        self.now = self.most = 0
+
+    def stay(self, actor: Blocks) -> None:
+        with self._lock:
+            self.now += 1
+            self.most = max(self.most, self.now)
+        self.gate.wait(60.0)
+        with self._lock:
+            self.now -= 1
+
+
+async def test_threads_that_killed_lives_have_left_count_among_the_forty(system: hf.ActorSystem) -> None:
+    """And what waits for one is done when there is one."""
+    busy = Busy()
+    children = [hf.child(f"one{number}", hf.start(Blocks)) for number in range(30)]
+    await system.start(hf.supervisor("all", children=children, intensity=1000))
+    actors = [system.ref(f"/app/all/one{number}", Blocks) for number in range(30)]
+    killed = [actor.ask(Do(busy.stay), timeout=60.0) for actor in actors]
+    async with asyncio.timeout(60.0):
+        while busy.now < 30:
+            await asyncio.sleep(0.005)
+    for actor in actors:
+        actor.kill()
+    assert {type(one) for one in await asyncio.gather(*killed, return_exceptions=True)} == {hf.AskFailed}
+    waiting = [actor.ask(Do(busy.stay), timeout=60.0) for actor in actors]
+    async with asyncio.timeout(60.0):
+        while busy.now < 40 or not all([(await system.get_status(actor)).turn for actor in actors]):
+            await asyncio.sleep(0.005)
+    busy.gate.set()
+    await asyncio.gather(*waiting)
+    assert busy.most == 40
+
+
+HANGING = """
+import threading
+import holdfast as hf
+
+class Go(hf.Message): ...
+
+class Hangs(hf.Actor):
+    @hf.on(Go, to_thread=True)
+    def go(self, message: Go) -> None:
+        begun.set()
+        threading.Event().wait()
+
+async def main():
+    async with hf.ActorSystem("app", log=False) as system:
+        system.spawn(hf.start(Hangs)).tell(Go())
+        jobs = hf.Tasks(await system.start(hf.tasks("jobs")))
+        try:
+            await jobs.run(threading.Event().wait, timeout=0.1)
+        except hf.AskTimeout:
+            await jobs.run(begun.wait)
+            system.ref("/app/$1", hf.Actor).kill()
+
+begun = threading.Event()
+if __name__ == "__main__":
+    hf.run(main())
+    print("over")
+"""
+
+
+def test_a_thread_that_hangs_does_not_keep_the_program_alive(tmp_path: Path) -> None:
+    script = tmp_path / "hanging.py"
+    script.write_text(HANGING)
+    ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
+    assert (ended.stdout, ended.returncode) == ("over\n", 0), ended.stderr
+
+
 def test_only_a_plain_def_can_block() -> None:
     with pytest.raises(TypeError, match="`async def`: to_thread is for handlers that block"):
 
@@ -226,3 +302,31 @@ def test_only_a_plain_def_can_block() -> None:
             @hf.on(Now, to_thread=True)
             async def now(self, message: Now) -> int:
                 return 1
+
+
+class Peer(hf.Actor):
+    @hf.on(Do)
+    def do(self, message: Do) -> Any:
+        return message.work(self)
+
+
+class Traps(Blocks):
+    def on_exit(self, source: hf.ActorRef[hf.Actor], reason: hf.ExitReason) -> None:
+        self.heard = str(reason)
+
+
+async def test_what_a_thread_sets_on_its_ctx_is_set_on_the_actor_s() -> None:
+    """Trapping exits, say: the next life of the attribute would be that of the turn."""
+
+    def trap(actor: hf.Actor) -> None:
+        actor.ctx.trap_exits = True
+
+    async with hf.ActorSystem(log=False) as system:
+        peer, traps = system.spawn(hf.start(Peer)), system.spawn(hf.start(Traps))
+        await traps.ask(Do(trap))
+        await traps.ask(Do(lambda actor: actor.ctx.link(peer)))
+        peer.kill()
+        assert await traps.ask(Do(lambda actor: actor.ctx.trap_exits)) is True
+        while not await traps.ask(Do(lambda actor: getattr(actor, "heard", ""))):
+            pass
+        assert await traps.ask(Do(lambda actor: actor.heard)) == "killed"

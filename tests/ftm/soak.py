@@ -76,7 +76,7 @@ class Changes:
         names = [one.name for one in found.layers]
         choices: dict[str, Any] = {
             "detach": lambda change: change.detach(ref),
-            "transition": lambda change: change.transition(ref, stack),
+            "transition": lambda change: change.transition(ref, stack, whole=True),
         }
         if "tr" in names:
             choices["detach a layer"] = lambda change: change.detach(ref, "tr")

@@ -64,7 +64,7 @@ class Slow(Counter):
 async def transition(system: hf.ActorSystem, ref: hf.ActorRef[Any], mechanism: Any, seconds: float = 30) -> None:
     several = mechanism if isinstance(mechanism, tuple) else (mechanism,)
     async with system.transaction(timeout=seconds) as change:
-        change.transition(ref, several)
+        change.transition(ref, several, whole=True)
 
 
 async def protected(system: hf.ActorSystem, start: Any = None, mechanism: Any = None, **spec: Any) -> hf.ActorRef[Any]:

@@ -473,3 +473,29 @@ async def test_a_change_that_the_end_of_the_system_overtakes_fails(mechanism: An
     with pytest.raises(hf.TransactionFailed, match="the system ends"):
         async with asyncio.timeout(20):
             await changing
+
+
+@pytest.mark.parametrize("place", ["task", "process", "subtree"])
+async def test_who_waits_for_room_is_let_in_by_whoever_lives_there_next(
+    system: hf.ActorSystem, recovery: Any, place: Any
+) -> None:
+    """Sends and asks: attached, and detached again."""
+    isolation: Any = "process" if place == "process" else "task"
+    spec = hf.child("alice", hf.start(Counter), recovery=recovery, isolation=isolation, mailbox=hf.bounded(2))
+    if place == "subtree":
+        await system.start(hf.supervisor("top", children=[spec], isolation="process"))
+        ref = system.ref("/app/top/alice", Counter)
+    else:
+        ref = await system.start(spec)
+    for move in (attach, detach):
+        await system.suspend(ref)
+        first = len((await system.get_state(ref))["tags"])
+        sends = [asyncio.ensure_future(ref.send(Add(tag))) for tag in range(6)]
+        asks = [ref.ask(Add(tag), timeout=60.0) for tag in range(6, 9)]
+        await asyncio.sleep(0)  # All have found it full, or wait.
+        assert not all(send.done() for send in sends)
+        await move(system, ref)
+        await system.resume(ref)
+        async with asyncio.timeout(60):
+            await asyncio.gather(*sends, *asks)
+        assert await ref.ask(Total(), timeout=60.0) == first + 9

@@ -12,11 +12,14 @@ from hypothesis import strategies as st
 
 import holdfast as hf
 from holdfast.actors.actor import Start
-from holdfast.ftm.detector import HIGHEST, Accrual, Detection, Detector, OwnClock
+from holdfast.actors.own_clock import OwnClock
+from holdfast.ftm.detector import HIGHEST, Accrual, Detection, Detector
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.orders import Beat
 from tests.ftm.accounts import Counter
+from tests.ftm.test_failover import group_of, two_again
 
 DETECTION = Detection(interval=0.05, threshold=8.0, pause=0.2, spread=0.01)
 
@@ -106,7 +109,7 @@ class Watched:
         known = {(name, life) for name, life, _ in self.suspects}
         return [one for one in self.up.items() if one not in known]
 
-    def suspect(self, name: str, life: int, why: str) -> None:
+    def silent(self, name: str, life: int, why: str) -> None:
         self.suspects.append((name, life, self.loop.time()))
 
 
@@ -184,7 +187,7 @@ async def test_the_outermost_mechanism_that_says_how_is_heard() -> None:
             ((PBR(), TR()), Detection()),
         ):
             async with system.transaction(timeout=30) as change:
-                change.transition(ref, layers)
+                change.transition(ref, layers, whole=True)
             assert host.group.detection == said
 
 
@@ -198,3 +201,25 @@ async def test_a_killed_detector_suspects_nobody_any_more() -> None:
         detector._cell.kill()
         await asyncio.sleep(10.0)
         assert watched.suspects == []
+
+
+async def test_a_new_replica_is_not_judged_by_an_earlier_one_of_its_name(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("one", hf.start(Counter), mechanism=TMR()))
+    await two_again(ref)
+    group = group_of(ref)
+    (gone,) = {"r2", "r3"} - set(adapted_to := (await changed(system, ref, PBR())))
+    assert len(adapted_to) == 2
+    detector = group.cell_of("detector")
+    assert detector is not None
+    assert isinstance(detector.actor, Detector)
+    before = detector.actor._known[gone, 1]
+    assert gone in await changed(system, ref, TMR())
+    assert detector.actor._known[gone, 1] is not before
+
+
+async def changed(system: hf.ActorSystem, ref: hf.ActorRef[Counter], mechanism: hf.Mechanism) -> tuple[str, ...]:
+    """The replicas that there are with another mechanism, when all are there."""
+    async with system.transaction(timeout=120) as change:
+        change.transition(ref, mechanism)
+    await two_again(ref)
+    return group_of(ref).names

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from holdfast.ftm.application import Application
 from holdfast.ftm.judge import ADAPT, HOLD, NONE, STAY, Judge, Readings, Settings, Signals, Threshold, Verdict
-from holdfast.ftm.model import Faults, Resources
+from holdfast.ftm.model import Faults, Resources, response_price
 from tests.ftm.declarations import EIGHT
 
 APP = Application("Account", state_bytes=10_000, request_bytes=100, rate=100)
@@ -51,6 +51,31 @@ def test_a_drop_in_bandwidth_leads_from_pbr_to_lfr() -> None:
     assert (verdict.kind, verdict.target, verdict.is_urgent) == (ADAPT, ("lfr",), True)
     assert verdict.reason.startswith("pbr is not valid any more: pbr: sends 1.01e+06 bytes/s between units")
     assert verdict.reason.endswith("lfr is the cheapest that is")
+
+
+@pytest.mark.parametrize("state", [1_000, 20_000, 1_000_000, 100_000_000])
+def test_bandwidth_that_returns_leads_back_from_lfr_to_pbr(state: int) -> None:
+    """A22, A21: with the settings that nobody has touched."""
+    app = msgspec.structs.replace(APP, state_bytes=state)
+    one = judge(settings=Settings(required=CRASH), application=app, bandwidth=50.0 * state)
+    for now in range(20):
+        follow(one, float(now))
+    assert one.current == ("lfr",)
+    one.read(Readings(bandwidth=1e12))
+    one.resources = msgspec.structs.replace(one.resources, bandwidth=1e12)
+    for now in range(20, 1000):
+        follow(one, float(now))
+    assert one.current == ("pbr",)
+
+
+def test_a_battery_that_runs_low_leads_to_what_computes_least() -> None:
+    """A18: LFR answers sooner, and computes twice."""
+    one = Judge(QUICK, APP, ("lfr",), EIGHT, Resources(units=2), response_price)
+    assert one.decide(0).kind == STAY
+    one.read(Readings(energy=0.1))
+    assert follow(one, 1).target == ("pbr",)
+    one.resources = msgspec.structs.replace(one.resources, energy=1.0)  # On mains again.
+    assert follow(one, 2).target == ("lfr",)
 
 
 def test_transient_faults_add_tr_and_their_end_takes_it_away() -> None:

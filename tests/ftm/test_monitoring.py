@@ -15,6 +15,7 @@ from holdfast.ftm.adaptations import (
     MonitoringBlind,
     NothingValid,
 )
+from holdfast.ftm.alarms import Diverged, NondeterminismFound
 from holdfast.ftm.application import Application
 from holdfast.ftm.events import MechanismAttached, MechanismChanged, MechanismDetached, ReplicaFaulty
 from holdfast.ftm.judge import Readings
@@ -151,6 +152,24 @@ async def test_divergence_shows_that_a_declaration_was_wrong() -> None:
         assert not (await world.report()).application.is_deterministic
         world.ref.tell(ApplicationIs(msgspec.structs.replace(APP, version="2")))
         assert (await world.report()).application.is_deterministic
+
+    await in_world(play, current=("lfr",))
+
+
+async def test_a_difference_is_a_wrong_value_until_it_is_known_to_be_the_applications_fault() -> None:
+    """What masks value faults needs determinism: a flipped bit must not rule it out."""
+    at = "/app/alice"
+
+    async def play(world: World) -> None:
+        for turn in range(3):
+            world.system.node.emit(Diverged(at, f"{at}/ftm/r2", 1, turn, "Add", turn))
+        await advance(1)
+        report = await world.report()
+        assert report.application.is_deterministic
+        assert "transient_value" in report.faults.classes
+        world.system.node.emit(NondeterminismFound(at, f"{at}/ftm/r2", 1, 3, "Add", 3))
+        await advance(1)
+        assert not (await world.report()).application.is_deterministic
 
     await in_world(play, current=("lfr",))
 

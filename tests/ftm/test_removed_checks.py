@@ -308,7 +308,7 @@ CHECKS = {
         "test_a_higher_epoch_ends",
     ),
     "the observer's own lag is nobody's silence": Check(
-        "ftm/detector.py",
+        "actors/own_clock.py",
         "        late = max(0.0, now - self._real - self._period)\n",
         "        late = 0.0\n",
         "tests/ftm/test_detector.py",

@@ -446,5 +446,6 @@ async def test_what_comes_twice_is_done_once_in_order(secured: hf.ActorSystem) -
     assert [back.body for back in backs] == [b"%d" % n for n in range(9)] == done
     assert len(lost) > 9
     outer.close()
+    inner.close()
     with pytest.raises(LinkLost):
         await outer.call("/app/c/ftm/r1", TELLS, Part("", b""), reach, lambda: True)

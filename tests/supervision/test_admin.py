@@ -243,6 +243,7 @@ async def test_children_added_by_hand_are_restarted_but_do_not_outlive_their_sup
         while (known := await children_of(system)) != {"static": "running"}:
             assert known in (
                 {},
+                {"static": "starting"},
                 {"static": "running", "dynamic": "running"},
                 {"static": "running", "dynamic": "stopped"},
             )

@@ -91,7 +91,7 @@ async def test_what_becomes_of_siblings(strategy: str, sibling: str, expected: s
 async def answer(supervisor: hf.ActorRef[Any], call: hf.Message[Any]) -> str:
     """What a call gives, in the words of the document."""
     try:
-        reply = await supervisor.ask(call)
+        reply = await supervisor.ask(call, 60.0)
     except hf.Refusal as no:
         return type(no).__name__
     return {hf.ActorRef: "ref", hf.ChildSpec: "spec", type(None): "None"}[type(reply)]
@@ -106,12 +106,20 @@ def call_of(name: str, plan: Plan) -> hf.Message[Any]:
 async def test_admin_calls(call: str, state: str, expected: str) -> None:
     plan = Plan()
     async with hf.ActorSystem(log=False) as system:
-        children = [] if state == "unknown" else [kid(plan, "a", backoff=SLOW)]
+        if state == "starting":
+            plan.todo["a"] = [60.0]
+        children = [] if state in ("unknown", "starting") else [kid(plan, "a", backoff=SLOW)]
+        if state == "stopping":
+            children = [hf.child("a", hf.start(Lingers))]
         family = await Family.start(system, plan, *children)
         if state == "stopped":
             await family.top.ask(hf.TerminateChild("a"))
         elif state == "restarting":
             await end(family, "a", "crash")
+        elif state == "starting":
+            family.top.tell(hf.StartChild(kid(plan, "a", late=True)))
+        elif state == "stopping":
+            family.top.tell(hf.TerminateChild("a"))
         assert (await family.states()).get("a", "unknown") == state
         assert await answer(family.top, call_of(call, plan)) == expected
 
@@ -128,6 +136,65 @@ async def test_admin_calls_to_a_dynamic_supervisor(call: str, state: str, expect
             await end(family, "a", "crash")
         assert (await family.states()).get("a", "unknown") == state
         assert await answer(top, call_of(call, plan)) == expected
+
+
+class Lingers(hf.Actor):
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        await asyncio.sleep(2.0)
+
+
+class Ends(hf.Actor):
+    """Tells whether its hook was called."""
+
+    def __init__(self, told: list[str], how: str) -> None:
+        self.told, self.how = told, how
+        self.ctx.trap_exits = "trapping" in how and "or not" not in how
+
+    def on_start(self, restored: bool) -> None:
+        if "start" in self.how:
+            raise OSError("no")
+
+    def on_stop(self, reason: hf.ExitReason) -> None:
+        self.told.append(str(reason))
+
+    @hf.on(Boom)
+    def boom(self, message: Boom) -> None:
+        raise ValueError("boom")
+
+    @hf.on(Leave)
+    def leave(self, message: Leave) -> None:
+        self.ctx.stop(message.reason)
+
+    @hf.on(Life)
+    def life(self, message: Life) -> int:
+        self.ctx.link(self.ctx.find("/app/peer", hf.Actor))
+        return self.ctx.life
+
+
+@pytest.mark.parametrize(("how", "_column", "expected"), cells("end of a life"))
+async def test_whom_on_stop_is_called_for(how: str, _column: str, expected: str) -> None:
+    told: list[str] = []
+    async with hf.ActorSystem(log=False) as system:
+        peer = system.spawn(hf.start(hf.Actor), "peer")
+        start = system.start(hf.child("a", hf.start(Ends, told, how), restart="temporary"))
+        if "start" in how:
+            with pytest.raises(hf.StartFailed):
+                await start
+        else:
+            ref = await start
+            await ref.ask(Life())
+            if how == "kill":
+                ref.kill()
+            elif "told" in how:
+                await system.stop(ref)
+            elif "EXIT" in how:
+                peer.kill()
+            else:
+                ref.tell(Leave() if "ctx" in how else Boom())
+        await system.node.settled()
+        await system.node.settled()
+        assert "/app/a" not in system.tree()
+        assert bool(told) is (expected == "called")
 
 
 class Work(hf.Message[str]):

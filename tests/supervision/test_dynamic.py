@@ -315,7 +315,10 @@ class Hire(hf.Message[str]):
 
 
 class Boss(hf.Actor):
-    """Lives in a process, and asks a supervisor elsewhere for workers."""
+    """Lives in a process, and asks supervisors elsewhere, which it is bound to, for workers."""
+
+    plain: hf.Binding[hf.Supervisor]
+    pool: hf.Binding[hf.Supervisor]
 
     @hf.on(Hire)
     async def hire(self, message: Hire) -> str:
@@ -333,9 +336,10 @@ class Boss(hf.Actor):
 async def test_an_actor_in_a_process_starts_from_a_template_but_sends_no_code() -> None:
     """Nothing that comes from a process is imported or made in the root, so its specs are not opened there."""
     async with hf.ActorSystem(log=False) as system:
-        boss = await system.start(hf.child("boss", hf.start(Boss), isolation="process"))
         plain = await begin(system)
+        boss = await system.start(hf.child("boss", hf.start(Boss), isolation="process", bindings={"plain": plain.path}))
         assert "from an actor process is not taken here" in await boss.ask(Hire(plain, "spec"))
         assert await plain.ask(hf.WhichChildren()) == []
         pool = await system.start(hf.dynamic("pool", template=hf.child(None, hf.start(Adder))))
+        system.bind(boss, "pool", pool)
         assert await boss.ask(Hire(pool, "args")) == "/app/pool/w 3"

@@ -6,6 +6,9 @@ import asyncio
 import os
 import re
 import socket
+import tempfile
+import textwrap
+import threading
 from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
@@ -96,6 +99,42 @@ async def test_start_returns_when_its_output_says_so(system: hf.ActorSystem) -> 
 async def test_a_prompt_has_no_end_of_line_and_is_a_sign_too(system: hf.ActorSystem) -> None:
     await system.start(sh("printf 'ready> '; exec sleep 99", ready=r"ready> $"))
     assert (await info(system)).lines == ["ready> "]
+
+
+async def test_a_sign_that_is_cut_in_a_very_long_line_is_found(system: hf.ActorSystem) -> None:
+    """Lines are handed on in pieces of 16 KiB or more; a sign may begin in one and end in the next."""
+    script = """
+    import os, time
+    os.write(1, b"x" * (16 * 1024 - 3) + b"LISTEN")
+    while not os.path.exists({path!r}): time.sleep(0.005)
+    os.write(1, b"ING{end}")
+    time.sleep(99)
+    """
+    for name, end in (("part", "y" * 20_000), ("line", "\\n")):
+        path = f"/proc/self/cwd/{name}-go"
+        with tempfile.TemporaryDirectory() as folder:
+            spec = python(textwrap.dedent(script).format(path=path, end=end), id=name, ready="LISTENING", cwd=folder)
+            with system.events() as events:
+                starting = asyncio.ensure_future(system.start(spec))
+                line = await next_event(events, hf.LogLine)
+                assert line.text.endswith("LISTEN")
+                Path(folder, f"{name}-go").touch()
+                await asyncio.wait_for(starting, 60)
+
+
+async def test_a_function_that_blocks_holds_up_nobody_and_not_beyond_its_time(system: hf.ActorSystem) -> None:
+    gate = threading.Event()
+    late = asyncio.ensure_future(refused(system, sh("exec sleep 99", ready=gate.wait, ready_timeout=0.2)))
+    assert "it was not ready after 0.2 s" in await asyncio.wait_for(late, 60)
+    gate.set()
+
+
+async def test_a_function_that_is_cancelled_is_a_failed_start(system: hf.ActorSystem) -> None:
+    async def cancelled() -> bool:
+        raise asyncio.CancelledError
+
+    told = await asyncio.wait_for(refused(system, sh("exec sleep 99", ready=cancelled)), 60)
+    assert "what `ready` waited for was cancelled" in told
 
 
 async def test_a_file_that_appears_or_changes(system: hf.ActorSystem, tmp_path: Path) -> None:

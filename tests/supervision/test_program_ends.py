@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -135,6 +136,11 @@ def broken(pid: int) -> None:
     raise OSError(f"cannot reach {pid - pid}")
 
 
+async def cancelled(pid: int) -> None:
+    """As if it had awaited something that somebody else has cancelled."""
+    raise asyncio.CancelledError
+
+
 async def test_it_is_asked_to_end_as_it_wants_to_be(system: hf.ActorSystem) -> None:
     assert await said_at_its_end(system) == "SIGTERM"
     assert await said_at_its_end(system, stop=signal.SIGINT) == "SIGINT"
@@ -144,7 +150,7 @@ async def test_it_is_asked_to_end_as_it_wants_to_be(system: hf.ActorSystem) -> N
     assert await said_at_its_end(system, shutdown="brutal_kill") == ""
 
 
-@pytest.mark.parametrize("stop", [broken, ["no-such-command"], ["false"], ["sleep", "99"], signal.SIGURG])
+@pytest.mark.parametrize("stop", [broken, cancelled, ["no-such-command"], ["false"], ["sleep", "99"], signal.SIGURG])
 async def test_if_that_does_not_end_it_it_gets_sigterm(system: hf.ActorSystem, stop: Any) -> None:
     assert await said_at_its_end(system, stop=stop, shutdown=1.0) == "SIGTERM"
 
@@ -234,6 +240,62 @@ async def test_a_keeper_that_is_killed_takes_its_program_with_it(system: hf.Acto
         assert (await next_event(events, hf.ProcessDied)).reason == hf.Signal(9)
         await ends.all()
         assert (await next_event(events, hf.ProcessStarted)).pid == (await info(system)).pid
+
+
+OTHER_USER = """
+import asyncio, sys
+import holdfast as hf
+
+BECOME = "import os, time; os.setuid(65534); print('up', flush=True); time.sleep(99)"
+
+async def main():
+    async with hf.ActorSystem("app", log=False, intensity=1) as system:
+        ended = asyncio.Event()
+
+        def tell(event):
+            if type(event).__name__ in ("HookFailed", "ChildStartFailed", "ProcessDied"):
+                print(event.reason, flush=True)
+            if isinstance(event, hf.ProcessDied):
+                ended.set()
+
+        system.node.events.add_sink(tell)
+        spec = hf.program([sys.executable, "-c", BECOME], id="it", ready="up", shutdown=1.0)
+        ref = await system.start(spec)
+        print((await ref.ask(hf.ProgramInfo())).pid, flush=True)
+        if {kills}:
+            ref.kill()  # The next life does not begin, and so ends the tree.
+        else:
+            await system.stop(ref)
+        await ended.wait()
+
+if __name__ == "__main__":
+    hf.run(main())
+"""
+
+
+@pytest.mark.skipif(os.geteuid() != 0 or shutil.which("setpriv") is None, reason="needs root, and setpriv")
+@pytest.mark.parametrize("kills", [False, True])
+async def test_one_that_has_become_another_user_is_still_watched_and_told_of(
+    tmp_path: Path, ends: Ends, kills: bool
+) -> None:
+    """Root without the right to kill stands for a user whose program is root's. No second one is started beside it."""
+    script = tmp_path / "root.py"
+    script.write_text(OTHER_USER.format(kills=kills))
+    command = ["setpriv", "--bounding-set=-kill", "--inh-caps=-kill", sys.executable, str(script)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as root:
+        assert root.stdout is not None
+        async with asyncio.timeout(60):
+            pid = int(await asyncio.to_thread(root.stdout.readline))
+            ends.add(pid)
+            denied = await asyncio.to_thread(root.stdout.readline)
+            assert f"it cannot be ended from here, and runs on until somebody else ends it (process {pid}" in denied
+            if kills:
+                refused = await asyncio.to_thread(root.stdout.readline)
+                assert "that of an earlier life still runs" in refused
+            os.kill(pid, signal.SIGKILL)
+            rest = await asyncio.to_thread(root.stdout.read)
+            assert ("TreeFailed" if kills else "SIGKILL") in rest
+    await ends.all()
 
 
 ROOT_PROGRAM = """

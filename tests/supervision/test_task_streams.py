@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import sys
 from collections.abc import AsyncIterator, Callable, Iterator
 from typing import Any
 
@@ -197,3 +198,26 @@ async def test_a_stream_wider_than_the_supervisor_allows_is_refused() -> None:
 async def test_a_stream_of_processes() -> None:
     async with opened() as (_, jobs):
         assert await values(jobs.stream(add, [1, 2, 3], max_concurrency=2, isolation="process")) == [2, 3, 4]
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+async def test_an_item_costs_the_same_however_many_run_at_once(ordered: bool) -> None:
+    """Counted in callbacks that are hung on futures, not in seconds."""
+
+    async def callbacks_with(most: int) -> int:
+        count = 0
+
+        def called(frame: object, event: str, function: Any) -> None:
+            nonlocal count
+            count += event == "c_call" and function.__name__ == "add_done_callback"
+
+        async with opened() as (_, jobs):
+            sys.setprofile(called)
+            try:
+                found = await values(jobs.stream(add, range(100), max_concurrency=most, ordered=ordered))
+            finally:
+                sys.setprofile(None)
+        assert sorted(found) == list(range(1, 101))
+        return count
+
+    assert await callbacks_with(100) < 2 * await callbacks_with(5)

@@ -166,10 +166,22 @@ async def test_a_function_that_cancels_itself_fails_and_leaves_nothing() -> None
     async def cancels() -> int:
         raise asyncio.CancelledError
 
+    async def cancels_its_task() -> int:
+        task = asyncio.current_task()
+        assert task is not None
+        task.cancel()
+        await asyncio.sleep(0)
+        return 1
+
     async with opened() as (_, jobs):
-        error = await refused(jobs.run(cancels))
-        assert isinstance(error, hf.AskFailed)
-        assert await jobs.children() == []
+        for function, why in (
+            (cancels, "what it waited for was cancelled"),
+            (cancels_its_task, "cancelled from within"),
+        ):
+            error = await refused(asyncio.wait_for(jobs.run(function), 30))
+            assert isinstance(error, hf.AskFailed)
+            assert why in str(error)
+            assert await jobs.children() == []
 
 
 # -- children of the supervisor -------------------------------------------------------------------------------------
@@ -455,3 +467,49 @@ async def test_results_have_the_functions_type() -> None:
         async for result in jobs.stream(str, [1]):
             assert_type(result, hf.Ok[int, str] | hf.Failed[int])
             assert result == hf.Ok(1, "1")
+
+
+# -- what would end the program -------------------------------------------------------------------------------------
+
+
+async def leave_the_program(how: str) -> None:
+    await asyncio.sleep(0)
+    raise SystemExit(3) if how == "SystemExit" else KeyboardInterrupt
+
+
+def leave_it_from_a_thread(how: str) -> None:
+    raise SystemExit(3) if how == "SystemExit" else KeyboardInterrupt
+
+
+@pytest.mark.parametrize("how", ["SystemExit", "KeyboardInterrupt"])
+@pytest.mark.parametrize("job", [leave_the_program, leave_it_from_a_thread])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_job_that_would_end_the_program_ends_itself(how: str, job: Any, isolation: Any) -> None:
+    async with hf.ActorSystem(log=False) as system:
+        jobs = hf.Tasks(await system.start(hf.tasks("jobs")))
+        with pytest.raises(hf.RemoteCrash, match=how):
+            await jobs.run(job, how, isolation=isolation)
+        task = asyncio.current_task()
+        assert task is not None
+        assert not task.cancelling()
+        assert await jobs.run(asyncio.sleep, 0, "still here") == "still here"
+
+
+@pytest.mark.parametrize("how", ["SystemExit", "KeyboardInterrupt"])
+async def test_so_does_background_work_of_an_actor(how: str) -> None:
+    class Works(Caller):
+        @hf.on(Begin)
+        def begin(self, message: Begin) -> None:
+            self.ctx.create_task(leave_the_program(how))
+
+    async with hf.ActorSystem(log=False) as system:
+        ref = await system.start(hf.child("works", hf.start(Works)))
+        with system.events() as events:
+            ref.tell(Begin())
+            while not (told := [event for event in events.take() if isinstance(event, hf.ActorCrashed)]):
+                await asyncio.sleep(0)
+        assert [how in str(event.reason) for event in told] == [True]
+        assert await ref.ask(Do(functools.partial(asyncio.sleep, 0, "again"))) == "again"
+
+
+class Begin(hf.Message): ...

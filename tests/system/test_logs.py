@@ -1,6 +1,7 @@
 """What an operator reads: a crash with its traceback, and floods limited and counted (DESIGN 9, otp.md W13)."""
 
 import asyncio
+import logging
 from collections.abc import Iterator, MutableMapping
 from typing import Any
 
@@ -18,6 +19,23 @@ class Boom(hf.Message):
 
 
 class Ping(hf.Message[str]): ...
+
+
+class Stillborn(hf.Actor):
+    def on_start(self, restored: bool) -> None:
+        raise OSError("no device")
+
+
+class Silent(hf.Actor):
+    """Says nothing of what it was given."""
+
+    @hf.on(Boom)
+    def boom(self, message: Boom) -> None:
+        raise ValueError
+
+    @hf.on(Ping)
+    def ping(self, message: Ping) -> str:
+        return "pong"
 
 
 class Fragile(hf.Actor):
@@ -49,10 +67,103 @@ async def test_a_crash_is_logged_with_its_traceback(records: list[Record]) -> No
     assert (crash["log_level"], crash["system"], crash["address"]) == ("error", "shop", "/shop/fragile")
     assert crash["reason"] == "ValueError: the glass fell"
     assert crash["message"].endswith("test_logs.Boom")
-    assert crash["traceback"].startswith("Traceback (most recent call last):")
-    assert "raise ValueError(message.text)" in crash["traceback"]
-    (restart,) = of(records, "child restarted")
-    assert (restart["log_level"], restart["address"], restart["attempt"]) == ("warning", "/shop/fragile", 1)
+    assert crash["exception"].startswith("Traceback (most recent call last):")
+    assert "raise ValueError(message.text)" in crash["exception"]
+    assert (crash["restarts"], crash["allowed"]) == (0, 3)
+    assert len(records) == 1
+
+
+async def test_each_crash_has_one_record_and_it_counts_the_restarts(records: list[Record]) -> None:
+    async with hf.ActorSystem() as system:
+        top = hf.supervisor("top", intensity=1, restart="temporary", children=[hf.child("x", hf.start(Fragile))])
+        await system.start(top)
+        fragile = system.ref("/app/top/x", Fragile)
+        for _ in range(2):
+            fragile.tell(Boom())
+            await system.node.settled()
+    crashes = of(records, "actor crashed")
+    assert [(crash["restarts"], crash["allowed"]) for crash in crashes] == [(0, 1), (1, 1)]
+    assert ["exception" in record for record in records] == [True, True, False]
+    assert records[-1]["event"] == "supervisor gave up"
+
+
+async def test_a_crash_that_no_supervisor_sees_is_logged_all_the_same(records: list[Record]) -> None:
+    async with hf.ActorSystem() as system:
+        system.spawn(hf.start(Fragile), "alone").tell(Boom())
+        await system.node.settled()
+        await asyncio.sleep(2.0)  # of the virtual clock
+        (crash,) = records
+    assert (crash["event"], crash["address"]) == ("actor crashed", "/app/alone")
+    assert "restarts" not in crash
+
+
+async def test_a_child_that_cannot_start_has_one_record_with_the_traceback(records: list[Record]) -> None:
+    async with hf.ActorSystem() as system:
+        with pytest.raises(hf.StartFailed):
+            await system.start(hf.child("stillborn", hf.start(Stillborn)))
+    (record,) = records
+    assert (record["event"], record["log_level"], record["message"]) == ("child not started", "error", "on_start")
+    assert "no device" in record["exception"]
+
+
+@pytest.mark.parametrize("log_payloads", [False, True])
+async def test_what_is_in_a_message_is_logged_only_if_asked_for(records: list[Record], log_payloads: bool) -> None:
+    async with hf.ActorSystem(log_payloads=log_payloads) as system:
+        ref = await system.start(hf.child("fragile", hf.start(Silent)))
+        ref.tell(Boom("secret"))
+        assert await ref.ask(Ping()) == "pong"
+    (crash,) = of(records, "actor crashed")
+    assert ("secret" in repr(crash)) == ("payload" in crash) == log_payloads
+
+
+class FromStandard(logging.Handler):
+    """Keeps the records of standard logging."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.records: list[logging.LogRecord] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.records.append(record)
+
+
+@pytest.fixture
+def standard() -> Iterator[FromStandard]:
+    """A program that has set up standard logging, and never heard of structlog."""
+    before = structlog.get_config() if structlog.is_configured() else None
+    structlog.reset_defaults()
+    logger, handler = logging.getLogger("holdfast"), FromStandard()
+    logger.addHandler(handler)
+    yield handler
+    logger.removeHandler(handler)
+    if before is not None:
+        structlog.configure(**before)
+
+
+async def test_standard_logging_gets_the_record_where_structlog_is_not_set_up(standard: FromStandard) -> None:
+    async with hf.ActorSystem("shop") as system:
+        ref = await system.start(hf.child("fragile", hf.start(Fragile)))
+        ref.tell(Boom("100 % gone"))
+        assert await ref.ask(Ping()) == "pong"
+    (record,) = standard.records
+    assert (record.levelno, record.name) == (logging.ERROR, "holdfast")
+    assert record.getMessage().startswith("actor crashed address='/shop/fragile'")
+    assert "reason='ValueError: 100 % gone'" in record.getMessage()
+    shown = logging.Formatter().format(record)
+    assert shown.count("Traceback (most recent call last):") == 1
+    assert shown.endswith("ValueError: 100 % gone")
+    assert vars(record)["holdfast"]["restarts"] == 0
+
+
+async def test_standard_logging_decides_which_levels_are_seen(standard: FromStandard) -> None:
+    logging.getLogger("holdfast").setLevel(logging.CRITICAL)
+    try:
+        async with hf.ActorSystem() as system:
+            system.spawn(hf.start(Fragile), "fragile").tell(Boom())
+            await system.node.settled()
+    finally:
+        logging.getLogger("holdfast").setLevel(logging.NOTSET)
+    assert standard.records == []
 
 
 async def test_a_supervisor_that_gives_up_is_logged_as_an_error(records: list[Record]) -> None:

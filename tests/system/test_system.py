@@ -1,6 +1,7 @@
 """The actor system as a guest in a running asyncio program: life, errors, names, topics, bindings (DESIGN 3)."""
 
 import asyncio
+from typing import Any, assert_type
 
 import pytest
 
@@ -461,3 +462,14 @@ async def test_a_cancel_while_the_system_stops_waits_for_the_end() -> None:
     with pytest.raises(asyncio.CancelledError):
         await task
     assert said == ["shutdown"]
+
+
+async def test_a_ref_is_typed_by_what_was_started(system: hf.ActorSystem) -> None:
+    """The type checkers look at this one."""
+    spec = assert_type(hf.child("typed", hf.start(Typed)), hf.ChildSpec[Typed])
+    assert_type(await system.start(spec), hf.ActorRef[Typed])
+    tree = hf.supervisor("tree", children=[spec])
+    assert_type(await system.start(tree), hf.ActorRef[Any])
+
+
+class Typed(hf.Actor): ...

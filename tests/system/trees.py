@@ -35,7 +35,7 @@ class Counter(hf.Actor):
     def boom(self, message: Boom) -> None:
         raise RuntimeError("boom")
 
-    @hf.on(Life)
+    @hf.on(Life, readonly=True)
     def life(self, message: Life) -> int:
         return self.ctx.life
 

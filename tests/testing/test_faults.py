@@ -105,6 +105,37 @@ async def test_the_end_puts_everything_back(counter: Ref, faults: Faults) -> Non
     assert await counter.ask(Add(5)) == 5
 
 
+@virtual
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+@pytest.mark.parametrize("first", ["admit", "reply", "turn begin"])
+@pytest.mark.parametrize("second", ["admit", "reply", "turn end"])
+async def test_faults_strike_only_within_their_contexts_which_end_in_any_order(
+    actor_system: GuardedSystem, faults: Faults, first: str, second: str, recovery: hf.Method | None
+) -> None:
+    counter = await actor_system.start(hf.child("counter", hf.start(Counter), recovery=recovery))
+    one = faults.on(counter, at=first, delay=1.0, seconds=9.0)
+    two = faults.on(counter, at=second, delay=1.0, seconds=20.0)
+    assert await counter.ask(Add(1), timeout=60.0) == 1
+    assert now() == pytest.approx(29.0)
+    one.end()
+    assert await counter.ask(Add(1), timeout=60.0) == 2
+    assert now() == pytest.approx(49.0), "the other one still strikes"
+    two.end()
+    assert await counter.ask(Add(1), timeout=60.0) == 3
+    assert now() == pytest.approx(49.0)
+    assert [strike.at for strike in faults.strikes].count(first) == 1 + (first == second) * 2
+
+
+@virtual
+@pytest.mark.parametrize("at", ["admit", "reply"])
+async def test_what_is_delayed_goes_on_when_the_faults_end(counter: Ref, faults: Faults, at: str) -> None:
+    async with faults.on(counter, at=at, delay=1.0, seconds=9.0):
+        answer = counter.ask(Add(1), timeout=60.0)
+        await asyncio.sleep(2.0)
+        assert not answer.done()
+    assert (await answer, now()) == (1, 2.0)
+
+
 # -- admit -----------------------------------------------------------------------------------------------------------
 
 
@@ -320,7 +351,8 @@ async def test_frame_drop_is_a_message_lost_for_good(actor_system: GuardedSystem
     async with faults.on(ref, at=at, drop=1.0, times=1):
         with pytest.raises(hf.AskTimeout) as late:
             await ref.ask(Linger(0.0), timeout=0.2)  # The first of its type: its name is lost with the frame.
-        assert late.value.handled is None
+        # What never reached the process was surely not begun there.
+        assert late.value.handled is (False if at == "frame out" else None)
     assert await ref.ask(Total(), timeout=60.0) == (1 if at == "frame out" else 2)
     assert await ref.ask(Linger(0.0), timeout=60.0) == (2 if at == "frame out" else 3)
 

@@ -363,3 +363,147 @@ def test_loading_the_plugin_imports_no_other_module_of_testing(pytester: pytest.
         "print(sorted(name for name in sys.modules if name.startswith('holdfast.testing')))",
     )
     assert done.outlines == ["['holdfast.testing', 'holdfast.testing.plugin']"]
+
+
+@pytest.mark.parametrize("loops", ["", "uvloop asyncio"], ids=["own loop", "chosen loops"])
+@pytest.mark.parametrize("scope", ["class", "module", "package", "session"])
+def test_a_system_runs_in_the_loop_of_its_test_whatever_its_scope(suite, scope: str, loops: str) -> None:
+    result = suite(
+        f"""
+async def reached(system, probe):
+    assert await asyncio.wait_for(system.spawn(hf.start(Counter)).ask(Add(1)), 30) == 1
+    probe.ref.tell(Add(1))
+    await probe.expect(Add(1))
+
+@pytest.mark.asyncio(loop_scope="{scope}")
+async def test_first(actor_system, probe):
+    await reached(actor_system, probe)
+
+@pytest.mark.asyncio(loop_scope="{scope}")
+async def test_in_the_same_loop(actor_system, probe, actor_systems):
+    await reached(actor_system, probe)
+    assert (await actor_systems("other")).node.loop is asyncio.get_running_loop()
+
+async def test_in_a_loop_of_its_own(actor_system, probe):
+    await reached(actor_system, probe)
+""",
+        holdfast_loops=loops,
+    )
+    result.assert_outcomes(passed=6 if loops else 3)
+
+
+def test_the_default_scope_of_tests_counts(suite) -> None:
+    result = suite(
+        """
+async def test_adds(actor_system):
+    assert await asyncio.wait_for(actor_system.spawn(hf.start(Counter)).ask(Add(1)), 30) == 1
+""",
+        asyncio_default_test_loop_scope="session",
+    )
+    result.assert_outcomes(passed=1)
+
+
+@pytest.mark.parametrize("mode", ["auto", "strict"])
+def test_a_test_of_the_plugin_of_anyio_is_refused_in_one_sentence(suite, mode: str) -> None:
+    result = suite(
+        """
+@pytest.mark.anyio
+async def test_adds(actor_system):
+    assert await actor_system.spawn(hf.start(Counter)).ask(Add(1)) == 1
+""",
+        asyncio_mode=mode,
+    )
+    assert result.parseoutcomes()["errors"] >= 1
+    result.stdout.fnmatch_lines(["*mark it with @pytest.mark.asyncio instead of @pytest.mark.anyio*"])
+    result.stdout.no_fnmatch_line("*was left running*")
+
+
+# -- simulate --------------------------------------------------------------------------------------------------------
+
+
+def test_simulate_honours_markers_and_the_configuration(suite) -> None:
+    result = suite("""
+from holdfast.testing import simulate
+
+async def crash(system):
+    system.spawn(hf.start(Counter), "counter").tell(Add(-1))
+    await system.node.settled()
+
+@simulate(seeds=2)
+@pytest.mark.holdfast(crashes=1)
+async def test_marked_below(system):
+    await crash(system)
+
+@pytest.mark.holdfast(crashes=True)
+@simulate(seeds=2)
+async def test_marked_above(system):
+    await crash(system)
+
+@pytest.mark.holdfast(crashes=True)
+class TestMarked:
+    @simulate(seeds=2)
+    async def test_class(self, system, tmp_path):
+        await crash(system)
+
+@pytest.mark.holdfast(crashes=2)
+@simulate(seeds=2)
+async def test_too_few(system):
+    await crash(system)
+
+@simulate(seeds=2)
+async def test_not_expected(system):
+    await crash(system)
+""")
+    result.assert_outcomes(passed=3, failed=2)
+    result.stdout.fnmatch_lines(["*1 crashes (2 expected*"])
+
+
+def test_simulate_fails_for_what_is_left_behind(suite) -> None:
+    result = suite("""
+import os
+from holdfast.testing import simulate
+
+KEPT = []
+
+@simulate(seeds=2)
+async def test_leaves_a_task(system):
+    system.left = asyncio.create_task(asyncio.sleep(1e9))
+
+@simulate(seeds=2)
+async def test_leaves_files(system):
+    KEPT.extend(os.open(__file__, os.O_RDONLY) for _ in range(20))
+
+def test_tidies_up():
+    for file in KEPT:
+        os.close(file)
+
+@pytest.mark.holdfast(leaks=True)
+@simulate(seeds=2)
+async def test_may_leave_a_task(system):
+    system.left = asyncio.create_task(asyncio.sleep(1e9))
+""")
+    result.assert_outcomes(passed=2, failed=2)
+    result.stdout.fnmatch_lines(["*a task was left running*", "*seed=0: repeat it*", "*a descriptor was left open*"])
+
+
+def test_given_stands_above_simulate(suite) -> None:
+    result = suite("""
+from hypothesis import given, settings, strategies as st
+from holdfast.testing import simulate
+
+@settings(max_examples=5, database=None, derandomize=True)
+@given(st.integers(0, 9), st.booleans())
+@simulate(seeds=2)
+async def test_adds(system, n, again):
+    counter = system.spawn(hf.start(Counter))
+    assert await counter.ask(Add(n)) == n
+    assert again in (True, False)
+
+@settings(max_examples=20, database=None, derandomize=True)
+@given(n=st.integers(0, 9))
+@simulate(seeds=2)
+async def test_finds(system, n):
+    assert await system.spawn(hf.start(Counter)).ask(Add(n)) < 3
+""")
+    result.assert_outcomes(passed=1, failed=1)
+    result.stdout.fnmatch_lines(["*seed=0: repeat it*"])

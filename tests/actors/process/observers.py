@@ -69,6 +69,7 @@ class Observer(Notebook):
     """Watches others, publishes and sends."""
 
     port: hf.Binding[Notebook]
+    second: hf.Binding[Notebook]
 
     def __init__(self) -> None:
         super().__init__()

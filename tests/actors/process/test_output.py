@@ -6,8 +6,11 @@ import asyncio
 import os
 from typing import Any
 
+import pytest
+
 import holdfast as hf
 from holdfast.actors.events import LogLine
+from holdfast.actors.process import output
 from holdfast.actors.process.output import LONGEST, OutputReader
 from tests.actors.process.players import Run, Worker
 from tests.actors.process.waiting import next_event, until
@@ -84,3 +87,29 @@ async def test_the_end_of_the_pipe_is_the_end_of_the_reader() -> None:
     reader.close()
     reader.close()
     assert found == ["a", "b"]
+
+
+async def test_others_have_their_turn_between_the_lines_of_one_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(output, "SLICE_SECONDS", 0.0)
+    loop = asyncio.get_running_loop()
+    out, into = os.pipe2(os.O_CLOEXEC)
+    os.set_blocking(out, False)
+    turns, found = 0, list[int]()
+    closed = asyncio.Event()
+
+    def take_turn() -> None:
+        nonlocal turns
+        turns += 1
+        if not closed.is_set():
+            loop.call_soon(take_turn)
+
+    loop.call_soon(take_turn)
+    os.write(into, b"y\n" * 1000)
+    reader = OutputReader(loop, out, lambda line: found.append(turns))
+    await until(lambda: len(found) == 1000)
+    os.write(into, b"y\n" * 1000)
+    os.close(into)
+    reader.close(closed.set)  # What is left is taken in the same way.
+    await asyncio.wait_for(closed.wait(), 60)
+    assert len(found) == 2000
+    assert max(found.count(turn) for turn in set(found)) <= 2

@@ -160,7 +160,8 @@ async def test_kill_9_is_told_over_links_and_monitors(system: hf.ActorSystem) ->
 
 
 async def test_stop_and_kill_by_ref(make: Make) -> None:
-    one, stopped, killed = await make("one"), await make("stopped"), await make("killed")
+    stopped, killed = await make("stopped"), await make("killed")
+    one = await make("one", bindings={"port": "/app/stopped", "second": "/app/killed"})
     ends = stopped._cell.ended(), killed._cell.ended()
     one.tell(StopChild(stopped))
     one.tell(StopChild(killed, kill=True))

@@ -33,6 +33,11 @@ def reopened(path: Path) -> Saved:
         return journal.load(A)
 
 
+def made(folder: Path | str) -> list[Path]:
+    """What is in a folder of a store besides its identity."""
+    return sorted(one for one in Path(folder).iterdir() if one.name != "store-id")
+
+
 def edit(path: Path, *statements: str) -> None:
     """Damage a closed store behind its back."""
     with closing(sqlite3.connect(path, isolation_level=None)) as db:

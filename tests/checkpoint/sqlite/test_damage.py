@@ -13,11 +13,12 @@ import pytest
 
 from holdfast.checkpoint.journal import (
     DamagedStore,
+    ForeignStore,
     Saved,
     StoreFailed,
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
-from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, line, numbers, reopened, spawn
+from tests.checkpoint.sqlite.stores import A, B, edit, end, flip, inputs, line, made, numbers, reopened, spawn
 
 
 @pytest.fixture
@@ -112,7 +113,7 @@ def test_a_hole_in_the_middle_is_located_and_leaves_others_alone(filled: Path) -
         "UPDATE snapshots SET data = CAST('rob' AS BLOB) WHERE data = CAST('bob' AS BLOB)",
         "DELETE FROM snapshots WHERE data = CAST('bob' AS BLOB)",
         "UPDATE notes SET value = CAST('values' AS BLOB)",
-        "UPDATE notes SET name = 'other'",
+        "UPDATE notes SET name = 'other' WHERE key = (SELECT max(key) FROM notes)",
         "UPDATE store SET epoch = 0",
         "UPDATE store SET live = live + 1",
         "DELETE FROM store",
@@ -129,7 +130,7 @@ def test_damaged_rows_are_refused(filled: Path, statement: str) -> None:
 
 @pytest.mark.parametrize("damage", ["flip", "truncate", "remove", "row"])
 def test_a_damaged_snapshot_gives_way_to_the_older_one_with_all_entries_since(filled: Path, damage: str) -> None:
-    (file,) = Path(f"{filled}-snapshots").iterdir()
+    (file,) = made(f"{filled}-snapshots")
     if damage == "flip":
         flip(file, 8_000_001)
     elif damage == "truncate":
@@ -144,7 +145,7 @@ def test_a_damaged_snapshot_gives_way_to_the_older_one_with_all_entries_since(fi
 
 
 def test_without_a_usable_snapshot_nothing_is_made_up(filled: Path) -> None:
-    (file,) = Path(f"{filled}-snapshots").iterdir()
+    (file,) = made(f"{filled}-snapshots")
     file.unlink()
     edit(filled, "UPDATE snapshots SET data = CAST('oldest' AS BLOB) WHERE turn = 2")
     with closing(SqliteJournal(filled)) as journal:
@@ -195,7 +196,7 @@ def test_a_wal_that_lost_acknowledged_entries_is_refused(path: Path) -> None:
 def test_a_wal_without_its_database_is_refused(path: Path) -> None:
     killed(path)
     path.unlink()
-    with pytest.raises(DamagedStore, match="-wal"):
+    with pytest.raises(ForeignStore, match="-wal"):
         SqliteJournal(path)
 
 

@@ -18,7 +18,7 @@ import pytest
 from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal, log
 from holdfast.checkpoint.sqlite.log import FrontLog
-from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, numbers, reopened
+from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, made, numbers, reopened
 
 
 def rows(path: Path) -> int:
@@ -33,7 +33,7 @@ def version(path: Path) -> int:
 
 
 def logs(path: Path) -> list[Path]:
-    return sorted(Path(f"{path}-log").iterdir())
+    return made(f"{path}-log")
 
 
 def left(journal: SqliteJournal, name: str = "left") -> Path:
@@ -165,7 +165,7 @@ def test_a_log_that_is_gone_is_missed(killed: Path) -> None:
     file.unlink()
     with pytest.raises(DamagedStore, match="were acknowledged"):
         SqliteJournal(killed)
-    file.parent.rmdir()
+    shutil.rmtree(file.parent)
     Path(f"{killed}-mark").unlink()  # Only the database and its WAL were copied.
     for _ in range(2):
         with pytest.raises(DamagedStore, match="its log is missing"):

@@ -23,7 +23,7 @@ from holdfast.checkpoint.journal import (
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite.rows import crc_of
-from tests.checkpoint.sqlite.stores import A, disown, edit, end, inputs, line, numbers, reopened, spawn
+from tests.checkpoint.sqlite.stores import A, disown, edit, end, inputs, line, made, numbers, reopened, spawn
 
 
 def test_the_epoch_rises_at_each_opening(path: Path) -> None:
@@ -132,7 +132,7 @@ def test_an_owner_whose_epoch_is_stale_writes_nothing(store: SqliteJournal, path
         assert journal.epoch == 3
         assert (journal.load(A).snapshot, numbers(journal.load(A))) == (b"1", [0, 1])
         assert journal.noted("key") is None
-    assert os.listdir(f"{path}-snapshots") == []
+    assert made(f"{path}-snapshots") == []
 
 
 def test_after_close_everything_is_refused(path: Path) -> None:

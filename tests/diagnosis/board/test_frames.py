@@ -3,7 +3,7 @@
 import zlib
 
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from holdfast.diagnosis.board import BadFrame, ChannelSpecification, Measurements, Reading, Specification
@@ -105,6 +105,10 @@ def whole(kind: int, body: bytes, sequence: int = 7) -> bytes:
 
 
 @given(st.integers(0, 255), st.binary(max_size=200))
+@example(kind=4, body=b"\x007\x00\x00")  # more milliseconds than there may be
+@example(kind=4, body=b"\0\0\0\x09")
+@example(kind=3, body=b"\x0a\x01")
+@example(kind=5, body=b"\x04\0")
 def test_a_whole_frame_is_heard_exactly_or_refused_and_the_next_one_is_heard(kind: int, body: bytes) -> None:
     decoder = Decoder()
     decoder.feed(whole(kind, body) + encode(8, Done()))

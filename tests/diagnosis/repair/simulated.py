@@ -376,13 +376,13 @@ class Scene:
 
 
 async def settle(system: hf.ActorSystem, world: World) -> None:
-    """Have the nodes run that are to, and no others; their supervisors let those be that end in good order."""
+    """Have the nodes run that are to, and no others: a supervisor lets those be that end so, and repair does not."""
     wanted = set(world.running)
     for name in world.nodes:
         keeper = system.ref(keeper_of(name), hf.Supervisor)
         is_up = [one.state for one in await keeper.ask(hf.WhichChildren())] == ["running"]
         if is_up and name not in wanted:
-            await keeper.ask(hf.TerminateChild("node"))
+            await keeper.ask(hf.TerminateChild("node", parks=False))
         if not is_up and name in wanted:
             await keeper.ask(hf.RestartChild("node"))
 

@@ -27,6 +27,7 @@ from holdfast.diagnosis.repair import (
     start_node,
     stop_node,
 )
+from holdfast.supervision.arbiter import Hand, InOtherHands, arbiter_of
 
 LONG = 20.0
 RESET = "(:action reset_usb :parameters (?d - device) :precondition (bad ?d) :effect (and (good ?d) (not (bad ?d))))"
@@ -129,7 +130,7 @@ async def test_restart_child(system: hf.ActorSystem) -> None:
     assert await life(system, addresses["b"]) == 1
 
 
-async def test_a_restart_stops_halfway_when_the_actor_is_taken_away(system: hf.ActorSystem) -> None:
+async def test_a_restart_does_not_begin_when_the_actor_was_taken_away(system: hf.ActorSystem) -> None:
     addresses = await tree(system)
 
     def taken() -> None:
@@ -137,7 +138,91 @@ async def test_a_restart_stops_halfway_when_the_actor_is_taken_away(system: hf.A
 
     with pytest.raises(ActionFailed, match="failover has it"):
         await do(system, restart_child(addresses), "a", check=taken)
-    assert await states(system) == {"a": "stopped", "b": "running"}
+    assert await states(system) == {"a": "running", "b": "running"}
+    assert await life(system, addresses["a"]) == 1
+
+
+class Slow(hf.Actor):
+    """Its end waits until it is let go."""
+
+    def __init__(self, ending: list[asyncio.Event]) -> None:
+        self._ending = ending
+
+    @hf.on(Who)
+    def _who(self, message: Who) -> int:
+        return self.ctx.life
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        began, ends = self._ending
+        began.set()
+        await ends.wait()
+
+
+@pytest.mark.parametrize("who", ["its caller is killed", "its caller is cancelled"])
+async def test_a_restart_that_has_begun_is_carried_out_whoever_ends_meanwhile(system: hf.ActorSystem, who: str) -> None:
+    # T63: between the stop and the start nobody has the actor but its supervisor.
+    ending = [asyncio.Event(), asyncio.Event()]
+    await system.start(hf.supervisor("s", children=[hf.child("a", hf.start(Slow, ending))]))
+    path = "/t/s/a"
+
+    class Repairing(hf.Actor):
+        async def on_start(self, restored: bool) -> None:
+            act = Act(Step("restart_child", ("a",)), 1, "a test", self.ctx, lambda: None)
+            self.work = self.ctx.create_task(restart_child({"a": path})(act, "a"))
+
+    caller = system.spawn(hf.start(Repairing))
+    async with asyncio.timeout(LONG):
+        await ending[0].wait()
+        if who == "its caller is killed":
+            caller._cell.kill()
+        else:
+            actor = caller._cell.actor
+            assert isinstance(actor, Repairing)
+            actor.work.cancel()
+        with pytest.raises(InOtherHands, match="its supervisor"):
+            arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else")
+        ending[1].set()
+        assert await system.ref(path, Slow).ask(Who()) == 2
+
+
+async def test_what_an_operator_has_stopped_is_started_by_an_operator_only(system: hf.ActorSystem) -> None:
+    addresses = await tree(system)
+    keeper = system.ref("/t/s/low", hf.Supervisor)
+    for _ in range(2):
+        await keeper.ask(hf.TerminateChild("a"))
+        for one in (restart_child(addresses), start_node(addresses)):
+            with pytest.raises(InOtherHands, match="an operator: it was stopped by order"):
+                await do(system, one, "a")
+        for address in (addresses["a"], "/t/s/low", "/t/s"):  # Nor with those above it: it would come with them.
+            with pytest.raises(InOtherHands, match="an operator"):
+                arbiter_of(system.node).claim(address, Hand.REPAIR, "slow")
+        assert await states(system) == {"a": "stopped", "b": "running"}
+        await keeper.ask(hf.RestartChild("a"))
+        await do(system, restart_child(addresses), "a")
+        arbiter_of(system.node).release(arbiter_of(system.node).claim("/t/s", Hand.REPAIR, "slow"))
+
+
+async def test_what_an_operator_stops_while_repair_restarts_it_stays_stopped(system: hf.ActorSystem) -> None:
+    ending = [asyncio.Event(), asyncio.Event()]
+    await system.start(hf.supervisor("s", children=[hf.child("a", hf.start(Slow, ending))]))
+    keeper = system.ref("/t/s", hf.Supervisor)
+    async with asyncio.timeout(LONG):
+        restart = asyncio.create_task(do(system, restart_child({"a": "/t/s/a"}), "a"))
+        await ending[0].wait()
+        stopped = keeper.ask(hf.TerminateChild("a"))
+        await keeper.ask(hf.WhichChildren())  # By then it has come to the order before.
+        ending[1].set()
+        await stopped
+        with pytest.raises(hf.StartFailed):
+            await restart
+        assert [one.state for one in await keeper.ask(hf.WhichChildren())] == ["stopped"]
+
+
+async def test_a_child_of_a_dynamic_supervisor_is_restarted_where_it_is(system: hf.ActorSystem) -> None:
+    keeper = await system.start(hf.dynamic("d"))
+    await keeper.ask(hf.StartChild(hf.child("a", hf.start(Node))))
+    await do(system, restart_child({"a": "/t/d/a"}), "a")
+    assert await life(system, "/t/d/a") == 2
 
 
 async def test_restart_subtree(system: hf.ActorSystem) -> None:

@@ -1,0 +1,79 @@
+"""Errands: what a supervisor does that has to wait for others. No wait is in a turn of its own.
+
+An errand is written as a coroutine. It is stepped in turns of the actor; where it waits, that turn ends, and when what
+it waits for has come, the rest is another item in the actor's mailbox. So the actor answers, and can be stopped, while
+children start and stop; and what an errand finds after a wait may be different from what it left.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Coroutine
+from typing import Any
+
+from ..actors import lives
+from ..actors.context import ActorContext
+from ..actors.errors import HoldfastError
+from ..actors.mail import LEAVE, Item, ReplyHandle
+from ..actors.message import Refusal
+
+
+class Errand(Item):
+    """One errand of one life. It is dropped where it stands when that life ends."""
+
+    __slots__ = ("_ctx", "_first", "is_over", "work")
+
+    def __init__(
+        self, ctx: ActorContext, work: Coroutine[Any, Any, None], first: lives.FirstTurn | None = None
+    ) -> None:
+        self._ctx, self.work, self._first = ctx, work, first
+        self.is_over = False
+
+    def step(self) -> None:
+        """Go on until it waits. Raises what the coroutine raises."""
+        try:
+            awaited: asyncio.Future[Any] = self.work.send(None)
+        except StopIteration:
+            self.is_over = True
+            return
+        except BaseException:
+            self.is_over = True
+            raise
+        awaited._asyncio_future_blocking = False  # As a task would: we do wait for it.
+        self._ctx.cell.node.errand_waits()
+        awaited.add_done_callback(self._woken)
+
+    def _woken(self, awaited: asyncio.Future[Any]) -> None:
+        cell = self._ctx.cell
+        if not self._ctx.closed:
+            cell.push(self)
+        cell.node.errand_goes_on()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        try:
+            item.step()
+        except Exception as error:
+            if item._first is None:
+                raise
+            lives.crash(item._ctx.cell, item._first, error)  # It is the start of this life that has failed.
+            return LEAVE
+        if item.is_over and item._first is not None:
+            lives.came_up(item._ctx.cell)
+        return None
+
+
+async def answered(ctx: ActorContext, handle: ReplyHandle[Any], work: Coroutine[Any, Any, Any]) -> None:
+    """Do what was asked for, and answer: an error is the caller's business, not our crash."""
+    item = ctx.item
+    try:
+        reply = await work
+    except Refusal as no:
+        if handle.ask is None:
+            ctx.cell.node.refused(ctx.cell, item, no)
+        else:
+            handle.ask.fail(no)
+    except HoldfastError as error:
+        handle.fail(error)
+    else:
+        handle.reply(reply)

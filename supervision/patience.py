@@ -1,0 +1,72 @@
+"""How long an end may take at most: of a child its own `shutdown`, of a supervisor all that its children may take."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+from ..actors import stacks, stopping
+from ..actors.cell import DOWN, GONE, Cell
+from ..actors.events import StopOverdue
+from ..actors.lives import GRACE
+
+if TYPE_CHECKING:
+    from .spec import ChildSpec
+
+SLACK = 5.0
+"""Seconds that a supervisor may take beyond what its children may."""
+FOREVER = float("inf")
+
+
+def end_within(cell: Cell, gone: asyncio.Future[Any]) -> None:
+    """See to it that a supervisor whose spec sets no limit ends within that of its children; `gone` is its end.
+
+    When that is over something is wrong: what hangs is told (StopOverdue), and all of it is killed.
+    """
+    seconds = most_below(cell, cell.spec) + SLACK
+    if seconds == FOREVER or gone.done():
+        return
+    timer = cell.node.loop.call_later(seconds, _overdue, cell, seconds)
+    gone.add_done_callback(lambda _: timer.cancel())
+
+
+def _overdue(cell: Cell, seconds: float) -> None:
+    if cell.state not in (DOWN, GONE):
+        cell.node.emit(StopOverdue(cell.path, seconds, stacks.blocked_below(cell)))
+        cell.kill()
+
+
+def most(cell: Cell | None, spec: ChildSpec | None) -> float:
+    """Seconds after which a child that is told to stop has ended."""
+    if spec is None:
+        return stopping.PATIENCE + GRACE
+    match spec.shutdown:
+        case "brutal_kill":
+            return GRACE
+        case "infinity":
+            return most_below(cell, spec) + SLACK if spec.is_supervisor else FOREVER
+        case seconds:
+            return seconds + GRACE
+
+
+def most_below(cell: Cell | None, spec: ChildSpec | None) -> float:
+    """Seconds that the children of a supervisor may take to end: one after another, or all at once."""
+    limits = list(_limits(cell, spec))
+    actor = None if cell is None else cell.actor
+    at_once = getattr(actor if actor is not None else None if spec is None else spec.start.kind, "_is_dynamic", False)
+    return max(limits, default=0.0) if at_once else sum(limits)
+
+
+def _limits(cell: Cell | None, spec: ChildSpec | None) -> Iterator[float]:
+    """What each child may take: of those in this process as their specs say, elsewhere as far as it is known here."""
+    living = dict((cell.children or {}) if cell is not None else {})
+    known: dict[str, ChildSpec] = {}
+    if spec is not None and (cell is None or cell.actor is None):
+        known = {one.id: one for one in spec.below()}
+    template = next((one for name, one in known.items() if name == "*"), None)
+    for name in {**living, **known}:
+        if name != "*":
+            child = living.get(name)
+            own = child.spec if child is not None and hasattr(child.spec, "shutdown") else None
+            yield most(child, own or known.get(name, template))

@@ -1,0 +1,146 @@
+"""What an ended life owed fails at once with the reason of its end, wherever it was lived."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+
+LONG = 600.0  # No test waits for this.
+
+
+class Question(hf.Message[str]): ...
+
+
+class Answer(hf.Message): ...
+
+
+class Count(hf.Message[int]): ...
+
+
+class End(hf.Message):
+    how: str
+
+
+class Promises(hf.Actor):
+    """Answers later, if ever."""
+
+    def __init__(self) -> None:
+        self.waiting: list[hf.ReplyHandle[str]] = []
+
+    @hf.on(Question)
+    def ask(self, message: Question) -> hf.ReplyHandle[str]:
+        self.waiting.append(self.ctx.reply_handle())
+        return self.waiting[-1]
+
+    @hf.on(Answer)
+    def answer(self, message: Answer) -> None:
+        for handle in self.waiting:
+            handle.reply("late")
+
+    @hf.on(Count)
+    def count(self, message: Count) -> int:
+        return len(self.waiting)
+
+    @hf.on(End)
+    def end(self, message: End) -> None:
+        if message.how == "crash":
+            raise ValueError("boom")
+        self.ctx.stop()
+
+
+REASONS = {
+    "crash": "ValueError: boom",
+    "stop": "normal",
+    "kill": "killed",
+    "terminate": "shutdown",
+    "its supervisor": "shutdown",
+    "the system": "shutdown",
+}
+
+
+async def end(system: hf.ActorSystem, ref: hf.ActorRef[Promises], how: str) -> None:
+    top = system.ref(ref.path.rpartition("/")[0], hf.Supervisor)
+    match how:
+        case "kill":
+            ref.kill()
+        case "terminate":
+            await top.ask(hf.TerminateChild("a"), LONG)
+        case "its supervisor":
+            await system.stop(top)
+        case "the system":
+            await system.shutdown()
+        case _:
+            ref.tell(End(how))
+
+
+async def promise_and_end(system: hf.ActorSystem, place: str, restart: Any, how: str) -> None:
+    child = hf.child("a", hf.start(Promises), restart=restart, isolation="process" if place == "process" else "task")
+    await system.start(hf.supervisor("top", children=[child], isolation="process" if place == "subtree" else "task"))
+    ref = system.ref("/t/top/a", Promises)
+    asked = [ref.ask(Question(), LONG) for _ in range(3)]
+    assert await ref.ask(Count(), LONG) == 3
+    await end(system, ref, how)
+    for one in asked:
+        with pytest.raises(hf.AskFailed, match=REASONS[how]):
+            await one
+
+
+@pytest.mark.parametrize("how", REASONS)
+@pytest.mark.parametrize("restart", ["permanent", "temporary"])
+async def test_a_promised_reply_fails_with_the_end(system: hf.ActorSystem, restart: Any, how: str) -> None:
+    await promise_and_end(system, "task", restart, how)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("how", ["crash", "stop", "kill"])
+@pytest.mark.parametrize("place", ["process", "subtree"])
+async def test_so_does_one_in_another_process(system: hf.ActorSystem, place: str, how: str) -> None:
+    await promise_and_end(system, place, "permanent", how)
+
+
+async def test_on_stop_may_still_answer(system: hf.ActorSystem) -> None:
+    class Polite(Promises):
+        async def on_stop(self, reason: hf.ExitReason) -> None:
+            await asyncio.sleep(0)
+            self.answer(Answer())
+
+    ref = system.spawn(hf.start(Polite))
+    asked = ref.ask(Question(), LONG)
+    await system.node.settled()
+    await system.stop(ref)
+    assert await asked == "late"
+
+
+async def test_a_recorded_actor_keeps_its_promises_over_a_crash(system: hf.ActorSystem) -> None:
+    """Its handles come back with its state."""
+    ref = await system.start(hf.child("a", hf.start(Promises), recovery=hf.hybrid(60.0)))
+    asked = ref.ask(Question(), LONG)
+    ref.tell(End("crash"))
+    ref.tell(Answer())
+    assert await asked == "late"
+
+
+async def test_who_waits_for_a_lock_hears_that_the_registry_is_gone(system: hf.ActorSystem) -> None:
+    """Its locks belong to its address: they outlive its lives, and end with it."""
+    spec = hf.registry("names")
+    names: hf.Registry[str, Any] = hf.Registry(await system.start(spec), LONG)
+    async with names.lock("k"):
+        waiting = asyncio.ensure_future(names.lock("k").__aenter__())
+        await system.node.settled()
+        names.ref.kill()
+        await system.node.settled()
+        assert not waiting.done()
+        await system.stop(names.ref)
+        with pytest.raises(hf.ActorStopped):
+            await waiting
+
+
+async def test_an_actor_that_moves_takes_its_promises_along(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("a", hf.start(Promises)))
+    asked = ref.ask(Question(), LONG)
+    await system.set_isolation(ref, "process")
+    await system.set_isolation(ref, "task")
+    ref.tell(Answer())
+    assert await asked == "late"

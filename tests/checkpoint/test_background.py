@@ -1,0 +1,116 @@
+"""Background work that ends without a result: somebody is told, and nothing waits for it any more (T34)."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint.players import start
+
+
+class Begin(hf.Message):
+    how: str
+
+
+class Ended(hf.Message):
+    how: str
+
+
+class Unknown(hf.Message): ...
+
+
+class Lives(hf.Message[tuple[int, list[str]]]): ...
+
+
+async def works() -> str:
+    return "done"
+
+
+async def fails() -> str:
+    raise OSError("no luck")
+
+
+async def is_cancelled() -> str:
+    work: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+    work.cancel()
+    return await work
+
+
+def stumbles(result: Any) -> hf.Message:
+    raise LookupError(f"a callback stumbles over {result!r}")
+
+
+def nothing(result: Any) -> Any:
+    return None
+
+
+def failed(error: BaseException) -> hf.Message:
+    return Ended(type(error).__name__)
+
+
+WAYS: dict[str, tuple[Any, Any, Any]] = {
+    "raises": (fails, Ended, None),
+    "is cancelled": (is_cancelled, Ended, None),
+    "then raises": (works, stumbles, failed),
+    "failed raises": (fails, Ended, stumbles),
+    "failed raises after a cancellation": (is_cancelled, Ended, stumbles),
+    "gives no message": (works, nothing, failed),
+    "gives a message of others": (works, lambda _: Unknown(), failed),
+}
+
+
+class Worker(hf.Actor):
+    def __init__(self) -> None:
+        self.ended: list[str] = []
+
+    @hf.on(Begin)
+    def begin(self, message: Begin) -> None:
+        if message.how == "told":
+            self.ctx.pipe_to_self(is_cancelled(), Ended, failed)
+        else:
+            work, then, otherwise = WAYS[message.how]
+            self.ctx.pipe_to_self(work(), then, otherwise)
+
+    @hf.on(Ended)
+    def end(self, message: Ended) -> None:
+        self.ended.append(message.how)
+
+    @hf.on(Lives, readonly=True)
+    def lives(self, message: Lives) -> tuple[int, list[str]]:
+        return self.ctx.life, self.ended
+
+
+@pytest.fixture(params=["plain", "recorded"])
+def method(request: pytest.FixtureRequest) -> hf.Method | None:
+    return None if request.param == "plain" else hf.hybrid(interval=3600.0)
+
+
+@pytest.mark.parametrize("how", WAYS)
+async def test_work_that_ends_without_a_message_crashes_the_actor_once(
+    how: str, method: hf.Method | None, isolation: str
+) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        worker = await start(system, isolation, "worker", hf.start(Worker), recovery=method)
+        with system.events() as stream:
+            worker.tell(Begin(how))
+            async with asyncio.timeout(30.0):
+                async for event in stream:
+                    if isinstance(event, hf.ActorCrashed):
+                        break
+        assert await worker.ask(Lives(), timeout=30.0) == (2, [])
+        if method is not None:  # Nothing is held for it any more.
+            await system.checkpoint(worker, timeout=30.0)
+
+
+async def test_cancelled_work_is_a_failure_that_can_be_taken(method: hf.Method | None, isolation: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        worker = await start(system, isolation, "worker", hf.start(Worker), recovery=method)
+        worker.tell(Begin("told"))
+        async with asyncio.timeout(30.0):
+            while (await worker.ask(Lives(), timeout=30.0)) != (1, ["CancelledError"]):
+                await asyncio.sleep(0)
+        if method is not None:
+            await system.checkpoint(worker, timeout=30.0)

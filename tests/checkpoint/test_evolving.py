@@ -1,0 +1,203 @@
+"""Code that would misread what is recorded is refused, with the difference in words; other code goes on with it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+import holdfast as hf
+from holdfast.checkpoint.shapes import difference, shape_of
+from tests.checkpoint.test_restart_root import PATHS
+
+PLAYER = Path(__file__).with_name("evolving_player.py")
+CODE = """
+import holdfast as hf
+
+
+class Add(hf.Message[int]):
+    n: int
+    b: int = 7
+
+
+class Get(hf.Message[list[int]]): ...
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.xs: list[int] = []
+        self.total = 0
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.xs.append(message.n * 100 + message.b)
+        self.late = len(self.xs)
+        return len(self.xs)
+
+    @hf.on(Get, readonly=True)
+    def read(self, message: Get) -> list[int]:
+        return self.xs
+"""
+WHOLE = str([107, 207, 307, 407, 507])
+
+
+def run(folder: Path, code: str, what: str) -> subprocess.CompletedProcess[str]:
+    (folder / "code.py").write_text(code)
+    return subprocess.run(
+        [sys.executable, str(PLAYER), str(folder / "code.py"), str(folder / "app.db"), what],
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": PATHS, "PYTHONDONTWRITEBYTECODE": "1"},
+    )
+
+
+class Case(NamedTuple):
+    """A change of the code, and what is said of it: "" if the new code goes on; `waits`: only if something waits."""
+
+    old: str
+    new: str
+    problem: str
+    waits: bool = False
+
+
+FIELDS = "    n: int\n    b: int = 7\n"
+CASES = {
+    "swapped": Case(FIELDS, "    b: int\n    n: int = 7\n", "its fields were (n, b), now they are (b, n)", True),
+    "inserted": Case(FIELDS, "    z: int = 0\n    n: int = 0\n    b: int = 7\n", "now they are (z, n, b)", True),
+    "removed": Case(FIELDS + "\n", "    n: int\n    b = 7\n\n", "now they are (n)", True),
+    "added": Case(FIELDS, FIELDS + "    why: str = ''\n", ""),
+    "another variable": Case("self.total = 0", "self.total = 0; self.more = 1", ""),
+    "another class": Case("class A(", "class A: ...\nclass B(", "it was recorded by evolving:A"),
+    "a declared class": Case("class A(hf.Actor):", "class B(hf.Actor):\n    formerly = ('evolving:A',)", ""),
+}
+
+
+@pytest.mark.parametrize("what", ["killed", "saved", "stopped"])
+@pytest.mark.parametrize("name", CASES)
+def test_code_goes_on_with_what_it_can_read(tmp_path: Path, name: str, what: str) -> None:
+    case = CASES[name]
+    assert run(tmp_path, CODE, what).returncode == (0 if what == "stopped" else -9)
+    code = CODE.replace(case.old, case.new)
+    assert code != CODE
+    if "class B(" in code:
+        code = code.replace("class A: ...\n", "") + "\n\nA = B\n"
+    done = run(tmp_path, code, "read")
+    if case.problem and not (case.waits and what == "stopped"):
+        assert (done.returncode, done.stdout) == (1, "")
+        assert "does not fit the code" in done.stderr
+        assert case.problem in done.stderr
+        done = run(tmp_path, CODE, "read")  # Nothing was changed: the old code goes on.
+    assert (done.stdout, done.stderr) == (WHOLE, "")
+
+
+@pytest.mark.parametrize("what", ["saved", "stopped"])
+def test_a_renamed_variable_is_refused_until_somebody_says_what_becomes_of_it(tmp_path: Path, what: str) -> None:
+    run(tmp_path, CODE, what)
+    renamed = CODE.replace("self.xs", "self.ys")
+    done = run(tmp_path, renamed, "read")
+    assert "it was saved with the variables (xs, total), evolving.A has (ys, total): xs would be lost" in done.stderr
+    migrate = """class A(hf.Actor):
+    schema_version = 2
+
+    @classmethod
+    def migrate(cls, state, from_version):
+        return {"ys" if name == "xs" else name: value for name, value in state.items()}
+"""
+    done = run(tmp_path, renamed.replace("class A(hf.Actor):", migrate), "read")
+    assert (done.stdout, done.stderr) == (WHOLE, "")
+
+
+def test_code_that_was_rolled_back_is_refused_what_it_would_drop(tmp_path: Path) -> None:
+    """A field that was added, and is in the journal, would be gone."""
+    added = CODE.replace(FIELDS, FIELDS + "    why: str = ''\n")
+    run(tmp_path, added, "killed")
+    done = run(tmp_path, CODE, "read")
+    assert "its fields were (n, b, why), now they are (n, b)" in done.stderr
+    assert run(tmp_path, added, "read").stdout == WHOLE
+
+
+class Add(hf.Message[int]):
+    n: int = 1
+
+
+class Get(hf.Message[int]): ...
+
+
+class Account(hf.Actor):
+    def __init__(self) -> None:
+        self.euros = 0
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.euros += message.n
+        return self.euros
+
+    @hf.on(Get, readonly=True)
+    def get(self, message: Get) -> int:
+        return self.euros
+
+
+class Double(Account):
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.euros += 2 * message.n
+        return self.euros
+
+
+class Heir(Double):
+    formerly = (f"{__name__}:Double",)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_code_that_was_replaced_is_not_replayed_by_the_old_one(tmp_path: Path, isolation: str) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+
+    def spec(kind: type[Account]) -> hf.ChildSpec:
+        recovery = hf.hybrid(interval=1000.0)
+        return hf.child("a", hf.start(kind), isolation=isolation, recovery=recovery)  # type: ignore[arg-type]
+
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        account = await system.start(spec(Account))
+        for _ in range(5):
+            await account.ask(Add())
+        await system.suspend(account)
+        await system.replace_code(account, Double)
+        await system.resume(account)
+        assert [await account.ask(Add()) for _ in range(5)][-1] == 15
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        for _ in range(2):
+            with pytest.raises(
+                hf.StartFailed, match=r"it was recorded by .*:Double, and is to be started as .*:Account"
+            ):
+                await system.start(spec(Account))
+        account = await system.start(spec(Double))
+        assert await account.ask(Get()) == 15
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        account = await system.start(spec(Heir))
+        assert await account.ask(Add()) == 17
+    async with hf.ActorSystem("app", store=store, log=False) as system:
+        account = await system.start(spec(Account), fresh=True)
+        assert await account.ask(Get()) == 0
+
+
+class Inner(hf.Message):
+    x: int
+    y: int
+
+
+class Outer(hf.Message):
+    one: Inner
+    many: list[Inner]
+    by_name: dict[str, Inner | None]
+
+
+def test_structs_in_a_message_count_too() -> None:
+    shape = shape_of(Outer)
+    assert [place for place, *_ in shape] == ["", "one", "many[]", "by_name[]"]
+    swapped = tuple((place, by_position, fields[::-1] if place else fields) for place, by_position, fields in shape)
+    assert difference(shape, swapped) == "one: its fields were (x, y), now they are (y, x)"
+    assert difference(shape, shape) == ""

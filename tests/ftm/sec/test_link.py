@@ -1,0 +1,99 @@
+"""The two ends of a secured link, in one process: what is between them is the test's."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm.mechanisms.sec import SEC
+from holdfast.ftm.sealed import TELLS, Agree, Back, Call, Greet, LinkLost, Part, Refused, SecuredLink
+from holdfast.ftm.sec.authority import CertificationAuthority, GetRoot, Revoke
+
+CA = "/app/ca"
+PROXY, REPLICA = "/app/c/ftm/proxy", "/app/c/ftm/r1"
+
+
+class Wire:
+    """The way from the proxy to the replica; the epoch of each end is the test's, too."""
+
+    def __init__(self, system: hf.ActorSystem) -> None:
+        self.epochs = {PROXY: 1, REPLICA: 1}
+        sec = SEC(CA)
+        self.inner: SecuredLink = sec.open_link(system.node, "/app/c", REPLICA, lambda: self.epochs[REPLICA])
+        self.outer: SecuredLink = sec.open_link(
+            system.node, "/app/c", PROXY, lambda: self.epochs[PROXY], lambda: [REPLICA]
+        )
+        self.done: list[bytes] = []
+        self.refused: list[str] = []
+        self.on_frame = lambda: None
+        self.is_wanted = True
+
+    async def _handle(self, call: Call) -> Back:
+        self.done.extend(part.body for part in call.parts)
+        return Back("reply", "", call.parts[0].body)
+
+    async def _reach(self, message: Any, seconds: float) -> Any:
+        try:
+            if isinstance(message, Greet):
+                return await self.inner.greet(message.hello)
+            if isinstance(message, Agree):
+                return await self.inner.agree(message.hello, message.finish)
+            self.on_frame()
+            return await self.inner.take(message.frame, self._handle)
+        except Refused as no:
+            self.refused.append(no.reason)
+            raise
+
+    async def ask(self, body: bytes) -> Back:
+        return await self.outer.call(REPLICA, TELLS, Part("", body), self._reach, lambda: self.is_wanted)
+
+    def close(self) -> None:
+        self.inner.close()
+        self.outer.close()
+
+
+async def test_a_frame_of_an_epoch_that_has_ended_at_the_receiver_is_refused() -> None:
+    # T48: the one who led before has a session, and has not heard yet that it leads no longer.
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        wire = Wire(system)
+        await wire.outer.ready()
+        assert (await wire.ask(b"in its epoch")).body == b"in its epoch"
+
+        def on_frame() -> None:
+            wire.epochs[REPLICA] = 2  # while the frame is on its way
+            wire.on_frame = lambda: None
+            wire.is_wanted = False
+
+        wire.on_frame = on_frame
+        with pytest.raises(LinkLost):
+            await wire.ask(b"after its end")
+        assert wire.refused == ["wrong_session"] or wire.refused == ["stale_epoch"]
+        assert wire.done == [b"in its epoch"]
+        wire.is_wanted, wire.epochs[PROXY] = True, 2
+        assert (await wire.ask(b"in the next")).body == b"in the next"
+        wire.close()
+
+
+@pytest.mark.parametrize("whom", [PROXY, REPLICA])
+async def test_a_revocation_ends_the_sessions_there_are(whom: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        authority = await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        wire = Wire(system)
+        await wire.outer.ready()
+        assert (await wire.ask(b"before")).body == b"before"
+        with system.events() as events:
+            assert await authority.ask(Revoke(whom)) == 1
+            await authority.ask(GetRoot())  # Whoever waited for a revocation has heard of it before this.
+            asked = asyncio.ensure_future(wire.ask(b"after"))
+            async with asyncio.timeout(20.0):
+                while not ({one.reason for one in events.take() if isinstance(one, hf.FrameRefused)} & {"revoked"}):
+                    await asyncio.sleep(0)
+            wire.is_wanted = False
+            with pytest.raises(LinkLost):
+                await asked
+        assert wire.done == [b"before"]
+        wire.close()

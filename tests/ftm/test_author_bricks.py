@@ -1,0 +1,78 @@
+"""What a brick of one's own can do with one request: refuse it, answer it; what becomes of one that it lets fall."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import ClassVar
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm.alarms import RequestsDropped
+from holdfast.ftm.bricks import Before
+from holdfast.ftm.mechanism import Mechanism, Role
+from holdfast.ftm.messages import RequestDropped, Work
+from tests.ftm.accounts import Add, Counter, Tags
+
+REFUSED, ANSWERED, DROPPED = -1, -2, -3
+"""Amounts that the brick does something about."""
+
+
+class TooMuch(hf.Refusal):
+    amount: int
+
+
+class Guard(Before):
+    async def before(self, work: Work) -> Work | None:
+        assert isinstance(self.mechanism, Guarding)
+        for one in list(work.requests):
+            message = self.message_of(one)
+            match message.amount if isinstance(message, Add) else 0:
+                case -1:
+                    work = self.refuse(work, one, TooMuch(amount=message.amount))
+                case -2:
+                    work = self.answer(work, one, 77)
+                case -3 if self.mechanism.whole:
+                    return None
+                case -3:
+                    rest = [other for other in work.requests if other is not one]
+                    work = Work(work.epoch, work.config, work.number, rest, work.go, work.again)
+        return work
+
+
+@dataclasses.dataclass(frozen=True)
+class Guarding(Mechanism):
+    """Masks nothing, needs nothing."""
+
+    name: ClassVar[str] = "guarding"
+    layer: ClassVar[str] = "assertion"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(before=Guard), "other": Role(before=Guard)}
+
+    whole: bool = False
+    """Whether a brick that drops one request drops its whole batch."""
+
+
+@pytest.mark.parametrize("below", ["pbr", "lfr"])
+async def test_one_request_is_refused_or_answered_and_leaves_no_trace(system: hf.ActorSystem, below: str) -> None:
+    stack = hf.compose(Guarding(), hf.PBR() if below == "pbr" else hf.LFR())
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
+    assert await ref.ask(Add(1)) == 1
+    with pytest.raises(TooMuch):
+        await ref.ask(Add(2, REFUSED))
+    assert await ref.ask(Add(3, ANSWERED)) == 77
+    ref.tell(Add(4, REFUSED))
+    assert await ref.ask(Add(5)) == 2
+    assert await ref.ask(Tags()) == [1, 5]
+
+
+@pytest.mark.parametrize("whole", [False, True])
+async def test_a_request_that_a_brick_lets_fall_fails_and_is_told(system: hf.ActorSystem, whole: bool) -> None:
+    stack = hf.compose(Guarding(whole=whole), hf.PBR())
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
+    with system.events() as events:
+        with pytest.raises(RequestDropped):
+            await ref.ask(Add(1, DROPPED), timeout=60)
+        (told,) = [one for one in events.take() if isinstance(one, RequestsDropped)]
+    assert (told.address, told.numbers.isdecimal()) == (ref.path, True)
+    assert await ref.ask(Add(2)) == 1
+    assert await ref.ask(Tags()) == [2]

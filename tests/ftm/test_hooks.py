@@ -1,0 +1,51 @@
+"""What a protected actor's `on_start` sets up is there once, whoever leads."""
+
+from __future__ import annotations
+
+import os
+import signal
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.checkpoint.players import until
+
+
+class Tick(hf.Message): ...
+
+
+class Count(hf.Message[int]): ...
+
+
+class Ticking(hf.Actor):
+    def __init__(self) -> None:
+        self.count = 0
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.every(3600.0, Tick())
+        self.ctx.subscribe("/topic")
+
+    @hf.on(Tick)
+    def tick(self, message: Tick) -> None:
+        self.count += 1
+
+    @hf.on(Count)
+    def add(self, message: Count) -> int:
+        self.count += 1
+        return self.count
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=3600.0)], ids=["fresh", "hybrid"])
+async def test_a_timer_of_on_start_is_there_once_after_failovers(recovery: hf.Method | None) -> None:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        spec = hf.child("ticking", hf.start(Ticking), recovery=recovery, mechanism=hf.PBR())
+        ref = await system.start(spec)
+        host: Any = ref._cell.host
+        assert await ref.ask(Count(), timeout=30.0) == 1
+        for count in (2, 3, 4):
+            await until(lambda: len(host.group.members) > 1)
+            primary = host.group.primary
+            os.kill(system.pid_of(system.ref(f"/app/ticking/ftm/{primary}", hf.Actor)), signal.SIGKILL)
+            assert await ref.ask(Count(), timeout=60.0) == count
+            assert [interval for *_, interval in host.switch.timers.saved().values()] == [3600.0]

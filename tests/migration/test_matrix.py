@@ -1,0 +1,199 @@
+"""Every actor, wherever it lives, taken to every other place: the table in docs/control.md, cell by cell.
+
+A cell that refuses says why, by the number of a note below the table. These notes may only become fewer.
+`HOLDFAST_MATRIX=n` runs the walks with faults n times as often.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import re
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.actors.process.mover import Move
+from tests.migration.travellers import KINDS, Luggage, Stream, Traveller, path, take, tree
+
+TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")
+TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
+# Each note: the actors it is about, whether it is about promised replies alone, what the refusal says.
+NOTES: dict[str, tuple[set[str], bool, str]] = {
+    "¹": ({"plain"}, True, "replies? that only its handles|an ask waits for its reply"),
+    "²": ({"recorded", "checkpoint_only"}, False, "its journal is kept by its address"),
+    "³": (set(KINDS), False, "its process knows it by its address|no supervisor looks after it|is kept by its address"),
+    "⁴": (set(KINDS), False, "its supervisor lives in another process"),
+    "⁵": (set(KINDS), False, "it is protected by a mechanism|it has PBR already"),
+}
+
+
+def cells() -> list[Any]:
+    """(place, kind, step, the note that refuses it or "")."""
+    found = re.search(r"^\| it lives in \|.*\n\|[-|]+\|\n(?:\|.*\n)+", TEXT, re.M)
+    assert found, "the table of moves"
+    head, _, *rows = ([text.strip().strip("`") for text in row.strip("|").split("|")] for row in found[0].splitlines())
+    return [
+        pytest.param(row[0], kind, step, cell.partition(" ")[2], id=f"{row[0]}-{kind}-{step}")
+        for row in rows
+        for step, cell in zip(head[1:], row[1:], strict=True)
+        for kind in KINDS
+        if cell != "–"
+    ]
+
+
+def refusal(kind: str, note: str, *, owes: bool) -> str:
+    """What the refusal of this cell says; "" if there is none."""
+    if not note:
+        return ""
+    kinds, only_owing, why = NOTES[note]
+    return why if kind in kinds and (owes or not only_owing) else ""
+
+
+def test_the_notes_become_fewer() -> None:
+    used = {cell.values[3] for cell in cells()} - {""}
+    assert used == set(NOTES)
+    assert len(NOTES) <= 5
+
+
+@pytest.fixture
+async def system() -> Any:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as running:
+        await running.start(hf.supervisor("there", intensity=1000))
+        yield running
+
+
+async def travel(system: hf.ActorSystem, place: str, kind: str, step: str, note: str, *, owes: bool) -> None:
+    await system.start(tree(place, kind))
+    ref = system.ref(path(place), Traveller)
+    luggage, stream = Luggage(system, ref, owes=owes), Stream(ref)
+    await luggage.pack()
+    await stream.reached(20)
+    why = refusal(kind, note, owes=owes)
+    if why:
+        with pytest.raises((hf.CannotMove, hf.TransactionRefused, hf.TransactionFailed), match=why):
+            await take(system, ref, step)
+    else:
+        await take(system, ref, step)
+    await stream.reached(20)
+    await stream.stop()
+    seen = await luggage.unpack()
+    stream.judge(seen["added"])
+
+
+@pytest.mark.parametrize(("place", "kind", "step", "note"), cells())
+async def test_an_actor_is_taken_there_with_all_it_has(
+    system: hf.ActorSystem, place: str, kind: str, step: str, note: str
+) -> None:
+    """Under a stream of asks and tells, with a stash, a timer, a link, a bounded mailbox and a reply that it owes."""
+    await travel(system, place, kind, step, note, owes=True)
+
+
+OWING = [
+    cell
+    for cell in cells()
+    if cell.values[3] and NOTES[cell.values[3]][1] and cell.values[1] in NOTES[cell.values[3]][0]
+]
+
+
+@pytest.mark.parametrize(("place", "kind", "step", "note"), OWING)
+async def test_it_is_taken_there_if_it_owes_no_reply(
+    system: hf.ActorSystem, place: str, kind: str, step: str, note: str
+) -> None:
+    await travel(system, place, kind, step, note, owes=False)
+
+
+class Walk:
+    """Random steps through the table, some of them with a fault; what was refused is tried again at once."""
+
+    def __init__(self, system: hf.ActorSystem, kind: str, place: str, draw: random.Random, faults: Faults) -> None:
+        self._system, self._kind, self.place, self._draw, self._faults = system, kind, place, draw, faults
+        self._home = place if place != "replicas" else "a task"
+        self.ref: hf.ActorRef[Any] = system.ref(path(place), Traveller)
+        self.steps: list[str] = []
+
+    async def go(self, count: int, stream: Stream) -> None:
+        for _ in range(count):
+            await self._step(stream)
+            await stream.reached(5)
+
+    async def _step(self, stream: Stream) -> None:
+        options = [
+            step
+            for place, kind, step, note in (cell.values for cell in cells())
+            if (place, kind) == (self.place, self._kind) and step != "move" and not refusal(kind, note, owes=False)
+        ]
+        step = self._draw.choice(options)
+        fault = self._draw.choice(("none", "given up", "killed"))
+        self.steps.append(f"{step} ({fault})")
+        if fault == "given up":
+            self._faults.give_up = True
+        taking = asyncio.ensure_future(take(self._system, self.ref, step))
+        if fault == "killed" and self._kind == "recorded" and self.place == "a process":
+            for _ in range(self._draw.randrange(40)):
+                await asyncio.sleep(0)
+            self._kill()
+        try:
+            await taking
+        except (hf.CannotMove, hf.TransactionFailed):
+            assert fault != "none"
+            await take(self._system, self.ref, step)
+        self._faults.give_up = False
+        places = {"task": "a task", "process": "a process", "protect": "replicas", "unprotect": self._home}
+        self.place = places[step]
+        if step in ("task", "process"):
+            self._home = self.place
+
+    def _kill(self) -> None:
+        try:
+            pid = self._system.pid_of(self.ref)
+        except hf.NoSuchActor:
+            return  # It lives nowhere just now.
+        if pid != os.getpid():
+            os.kill(pid, signal.SIGKILL)
+
+
+class Faults:
+    """Ends an attempt at the instant at which the old life is at rest."""
+
+    def __init__(self) -> None:
+        self.give_up = False
+
+    def at_rest(self, move: Move) -> None:
+        if self.give_up:
+            self.give_up = False
+            move.give_up("the time is over")
+
+
+@pytest.fixture
+def faults(monkeypatch: pytest.MonkeyPatch) -> Faults:
+    faults, at_rest = Faults(), Move.at_rest
+
+    def struck(move: Move) -> None:
+        at_rest(move)
+        faults.at_rest(move)
+
+    monkeypatch.setattr(Move, "at_rest", struck)
+    return faults
+
+
+@pytest.mark.parametrize("seed", range(4 * TIMES))
+async def test_random_walks_lose_double_and_reorder_nothing(system: hf.ActorSystem, faults: Faults, seed: int) -> None:
+    draw = random.Random(seed)
+    kind, place = draw.choice(list(KINDS)), draw.choice(["a task", "a process", "a process, below its supervisor"])
+    await system.start(tree(place, kind))
+    walk = Walk(system, kind, place, draw, faults)
+    luggage, stream = Luggage(system, walk.ref, owes=kind != "plain"), Stream(walk.ref)
+    print(f"seed {seed}: {kind}, from {place}")
+    await luggage.pack()
+    try:
+        await walk.go(5, stream)
+    finally:
+        print(f"seed {seed}: {' '.join(walk.steps)}")
+    await stream.stop()
+    seen = await luggage.unpack()
+    stream.judge(seen["added"])

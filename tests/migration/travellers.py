@@ -1,0 +1,254 @@
+"""An actor that carries all there is to carry, the places it can be sent to, and who judges its way."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from typing import Any
+
+import holdfast as hf
+
+
+class Add(hf.Message[int]):
+    n: int
+
+
+class Later(hf.Message[int]):
+    """Answered when somebody says `Give`."""
+
+
+class Give(hf.Message[bool]):
+    n: int
+
+
+class Keep(hf.Message[int]):
+    """Stashed until somebody says `Open`."""
+
+    n: int
+
+
+class Open(hf.Message[bool]): ...
+
+
+class Remind(hf.Message[bool]):
+    """Have a timer tell `Rung`."""
+
+    seconds: float
+
+
+class Rung(hf.Message): ...
+
+
+class Seen(hf.Message[dict[str, Any]]): ...
+
+
+class Tie(hf.Message[bool]):
+    """Link, and watch."""
+
+    other: hf.ActorRef[Any]
+
+
+class Traveller(hf.Actor):
+    """Counts what is added. Beside that it can stash, owe a reply, have a timer running, and be linked."""
+
+    def __init__(self) -> None:
+        self.total = 0
+        self.added: list[int] = []
+        self.rung = 0
+        self.ends: list[str] = []
+        self.is_open = False
+        self.handle: hf.ReplyHandle[int] | None = None
+
+    @hf.on(Add)
+    def add(self, message: Add) -> int:
+        self.total += message.n
+        self.added.append(message.n)
+        return self.total
+
+    @hf.on(Later)
+    def later(self, message: Later) -> Any:
+        self.handle = self.ctx.reply_handle()
+        return self.handle
+
+    @hf.on(Give)
+    def give(self, message: Give) -> bool:
+        handle, self.handle = self.handle, None
+        if handle is not None:
+            handle.reply(message.n)
+        return handle is not None
+
+    @hf.on(Keep)
+    def keep(self, message: Keep) -> int:
+        if not self.is_open:
+            self.ctx.stash()
+            return 0
+        self.added.append(message.n)
+        return message.n
+
+    @hf.on(Open)
+    def open(self, message: Open) -> bool:
+        self.is_open = True
+        self.ctx.unstash()
+        return True
+
+    @hf.on(Remind)
+    def remind(self, message: Remind) -> bool:
+        self.ctx.tell_after(message.seconds, Rung())
+        return True
+
+    @hf.on(Rung)
+    def ring(self, message: Rung) -> None:
+        self.rung += 1
+
+    @hf.on(Tie)
+    def tie(self, message: Tie) -> bool:
+        self.ctx.trap_exits = True
+        self.ctx.link(message.other)
+        return True
+
+    def on_exit(self, source: hf.ActorRef[Any], reason: hf.ExitReason) -> None:
+        self.ends.append(source.path)
+
+    @hf.on(Seen)
+    def seen(self, message: Seen) -> dict[str, Any]:
+        return {"total": self.total, "added": self.added, "rung": self.rung, "ends": self.ends}
+
+
+class Neighbour(hf.Actor):
+    """Somebody to be linked with."""
+
+    @hf.on(Open)
+    def end(self, message: Open) -> bool:
+        self.ctx.stop()
+        return True
+
+
+KINDS: dict[str, Any] = {
+    "plain": None,
+    "recorded": hf.hybrid(interval=3600.0),
+    "checkpoint_only": hf.checkpoint_only(interval=3600.0),
+}
+
+
+def tree(place: str, kind: str) -> hf.ChildSpec:
+    """The supervisor `/app/here`, with the traveller `one` at that place below it; its mailbox is bounded."""
+    where: dict[str, Any] = {"mailbox": hf.bounded(100_000)}
+    if place == "a process":
+        where["isolation"] = "process"
+    if place == "replicas":
+        where["mechanism"] = hf.PBR()
+    if KINDS[kind] is not None:
+        where["recovery"] = KINDS[kind]
+    one = hf.child("one", hf.start(Traveller), **where)
+    if place == "a process, below its supervisor":
+        return hf.supervisor("here", children=[one], isolation="process", intensity=1000)
+    if place == "a process, two deep":
+        inner = hf.supervisor("inner", children=[one], intensity=1000)
+        return hf.supervisor("here", children=[inner], isolation="process", intensity=1000)
+    return hf.supervisor("here", children=[one], intensity=1000)
+
+
+def path(place: str) -> str:
+    """The address of the traveller."""
+    return "/app/here/inner/one" if place == "a process, two deep" else "/app/here/one"
+
+
+async def take(system: hf.ActorSystem, ref: hf.ActorRef[Any], step: str) -> None:
+    """Take one step with the traveller."""
+    match step:
+        case "task" | "process":
+            await system.set_isolation(ref, step, timeout=60.0)
+        case "protect":
+            async with system.transaction(timeout=60.0) as change:
+                change.attach(ref, hf.PBR())
+        case "unprotect":
+            async with system.transaction(timeout=60.0) as change:
+                change.detach(ref)
+        case "move":
+            async with system.transaction(timeout=60.0) as change:
+                change.move(ref, "/app/there")
+        case _:
+            raise AssertionError(step)
+
+
+class Stream:
+    """Asks one after another, and tells, until it is stopped; then judges what the traveller has seen.
+
+    The traveller's own list is the one order of events: each sender's additions stand in it once and in the order in
+    which they were sent, and each answer is the sum of all that stands before it. So the history is linearizable.
+    """
+
+    def __init__(self, ref: hf.ActorRef[Any]) -> None:
+        self._ref, self._stopping = ref, False
+        self._answers: list[int] = []
+        self.told = 0
+        self._task = asyncio.create_task(self._send())
+
+    async def _send(self) -> None:
+        while not self._stopping:
+            self._ref.tell(Add(TOLD + self.told))
+            self.told += 1
+            self._answers.append(await self._ref.ask(Add(len(self._answers) + 1), timeout=120.0))
+
+    async def reached(self, more: int) -> None:
+        """Wait for so many answers more."""
+        wanted = len(self._answers) + more
+        while len(self._answers) < wanted:
+            if self._task.done():
+                self._task.result()
+            await asyncio.sleep(0)
+
+    async def stop(self) -> None:
+        self._stopping = True
+        await self._task
+
+    def judge(self, added: list[int]) -> None:
+        """Each addition once, in the order of its sender; each answer the sum of what stands before it."""
+        asked = [n for n in added if 0 < n < TOLD]
+        assert asked == list(range(1, len(self._answers) + 1))
+        assert [n for n in added if n >= TOLD] == list(range(TOLD, TOLD + self.told))
+        sums = dict(zip(added, itertools.accumulate(added), strict=True))
+        assert [sums[n] for n in asked] == self._answers
+
+
+TOLD = 1_000_000
+
+
+class Luggage:
+    """What the traveller has on it: something stashed, a promised reply, a timer, a link."""
+
+    def __init__(self, system: hf.ActorSystem, ref: hf.ActorRef[Any], *, owes: bool) -> None:
+        self._system, self._ref, self._owes = system, ref, owes
+
+    async def pack(self) -> None:
+        self._neighbour = await self._system.start(hf.child("neighbour", hf.start(Neighbour)))
+        assert await self._ref.ask(Tie(self._neighbour))
+        self._ref.tell(Keep(STASHED))
+        if self._owes:
+            self._reply = self._ref.ask(Later(), timeout=120.0)
+        assert await self._ref.ask(Remind(0.3))
+
+    async def unpack(self) -> dict[str, Any]:
+        """Use all of it; what the traveller has seen in the end."""
+        ref = self._ref
+        if self._owes:
+            assert await ref.ask(Give(9))
+            assert await self._reply == 9
+        assert await ref.ask(Open())
+        assert await self._neighbour.ask(Open())
+        seen: dict[str, Any] = {}
+        try:
+            async with asyncio.timeout(60.0):
+                while not (seen and seen["rung"] and seen["ends"] and STASHED in seen["added"]):
+                    await asyncio.sleep(0.005)
+                    seen = await ref.ask(Seen(), timeout=60.0)
+        except TimeoutError:
+            missing = {"stashed": STASHED in seen["added"], "rung": seen["rung"], "ends": seen["ends"]}
+            raise AssertionError(f"something of its luggage is lost: {missing}") from None
+        assert seen["rung"] == 1
+        assert seen["ends"] == ["/app/neighbour"]
+        assert seen["added"].count(STASHED) == 1
+        return {**seen, "added": [n for n in seen["added"] if n != STASHED]}
+
+
+STASHED = -7

@@ -1,0 +1,141 @@
+"""What is not promised: "Limits" in docs/guarantees.md. When one of these is lifted, its line there goes too."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.actors.codec import Packed
+from holdfast.ftm.mechanisms.pbr import PBR
+
+# These actors are imported by other processes: by name, so the root has to be on the path.
+ROOT = str(Path(__file__).parents[1])
+if ROOT not in sys.path:
+    sys.path.append(ROOT)
+
+
+class Do(hf.Message[int]):
+    what: str
+
+
+class Keeper(hf.Actor):
+    """Puts aside, tells itself, and has whoever waits be told."""
+
+    def __init__(self) -> None:
+        self.done: list[str] = []
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> int:
+        match message.what:
+            case "stash" if not self.done:
+                self.ctx.stash()
+            case "unstash":
+                self.done.append("unstash")
+                self.ctx.unstash()
+            case "tell itself":
+                self.ctx.ref.tell(Do("told"))
+                os.kill(os.getpid(), signal.SIGKILL)
+            case "publish":
+                self.ctx.ref.tell(Do("full"))
+                await self.ctx.publish("/limits", Do("heard"))
+            case what:
+                self.done.append(what)
+        return len(self.done)
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.subscribe("/limits")
+
+    def on_undelivered(self, message: hf.Message[Any]) -> None:
+        raise AssertionError("it is called in a task only")
+
+
+class Acquainted(hf.Actor):
+    def __init__(self, friend: hf.ActorRef[Any]) -> None:
+        self.friend = friend
+
+
+async def died(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    """Kill its process, and wait until the next one answers."""
+    with system.events() as events:
+        os.kill(system.pid_of(ref), signal.SIGKILL)
+        async for event in events:
+            if isinstance(event, hf.ActorStarted) and event.address == ref.path:
+                return
+
+
+async def test_a_supervisor_cannot_be_protected() -> None:
+    with pytest.raises(hf.SpecError, match="a supervisor cannot be protected by a mechanism: protect its children"):
+        hf.child("top", hf.start(hf.Supervisor), mechanism=PBR())
+
+
+async def test_a_child_without_mechanisms_leaves_them_out() -> None:
+    with pytest.raises(hf.SpecError, match="mechanism must not be empty: leave it out"):
+        hf.child("one", hf.start(Keeper), mechanism=())
+
+
+async def test_a_ref_cannot_be_a_key_variable() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        friend = await system.start(hf.child("friend", hf.start(Keeper)))
+        spec = hf.child("one", hf.start(Acquainted, friend), recovery=hf.hybrid())
+        with pytest.raises(hf.HoldfastError, match=r"friend: a value of type .*ActorRef cannot be saved"):
+            await system.start(spec)
+
+
+async def test_without_recovery_what_was_put_aside_dies_with_its_process() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("one", hf.start(Keeper), isolation="process"))
+        aside = ref.ask(Do("stash"), timeout=60.0)
+        assert await ref.ask(Do("counted"), timeout=60.0) == 1  # It is aside by now.
+        await died(system, ref)
+        with pytest.raises(hf.AskFailed):
+            await aside
+        assert await ref.ask(Do("unstash"), timeout=60.0) == 1
+        assert await ref.ask(Do("after"), timeout=60.0) == 2
+
+
+async def test_without_recovery_what_it_tells_itself_dies_with_its_process() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("one", hf.start(Keeper), isolation="process"))
+        with pytest.raises(hf.AskFailed):
+            await ref.ask(Do("tell itself"), timeout=60.0)
+        assert await ref.ask(Do("after"), timeout=60.0) == 1
+
+
+async def test_on_undelivered_is_not_called_in_a_process() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("one", hf.start(Keeper), isolation="process", restart="temporary")
+        ref = await system.start(spec)
+        await system.suspend(ref, timeout=60.0)
+        ref.tell(Do("never"))
+        before = system.dead_letters
+        await system.stop(ref)
+        assert system.dead_letters == before + 1  # And nothing was raised.
+
+
+async def test_the_spec_of_a_child_comes_packed_from_another_process() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        child = hf.child("one", hf.start(Keeper))
+        top = await system.start(hf.supervisor("top", children=[child], isolation="process"))
+        spec = await top.ask(hf.GetChildSpec("one"), timeout=60.0)
+        assert isinstance(spec, Packed), spec
+
+
+async def test_who_publishes_to_its_own_full_mailbox_waits_for_itself() -> None:
+    """Until its life is ended. A tell would be refused, as long as there is no room."""
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("one", hf.start(Keeper), mailbox=hf.bounded(1), shutdown="brutal_kill")
+        ref = await system.start(spec)
+        waits = ref.ask(Do("publish"), timeout=60.0)
+        while (await system.get_status(ref, timeout=60.0)).turn is None:
+            await asyncio.sleep(0)
+        assert not waits.done()
+        await system.stop(ref)
+        with pytest.raises(hf.AskFailed):
+            await waits

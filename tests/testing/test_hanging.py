@@ -1,0 +1,57 @@
+"""A test or a teardown that hangs ends the run, and says where everything waits."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SECONDS = 120.0  # far more than it takes
+
+HANGS = """
+import asyncio
+import holdfast as hf
+import pytest
+import pytest_asyncio
+
+class Wait(hf.Message): ...
+
+class Waits(hf.Actor):
+    @hf.on(Wait)
+    async def wait_in_turn(self, message):
+        await asyncio.Event().wait()
+
+@pytest_asyncio.fixture
+async def system():
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("waits", hf.start(Waits), shutdown="infinity"))
+        ref.tell(Wait())
+        yield system
+
+async def hang_in_task():
+    await asyncio.Event().wait()
+
+async def test_it(system):
+    task = asyncio.create_task(hang_in_task(), name="forgotten")
+    await asyncio.sleep(0)
+    if HOW == "the test":
+        await task
+    task.cancel()
+    assert HOW != "a teardown behind a failure"
+"""
+
+
+@pytest.mark.parametrize("how", ["the test", "the teardown", "a teardown behind a failure"])
+def test_what_hangs_is_told_and_ended(how: str, tmp_path: Path) -> None:
+    (tmp_path / "test_hangs.py").write_text(f"HOW = {how!r}\n{HANGS}", "utf-8")
+    options = ["-o", "faulthandler_timeout=2", "-o", "faulthandler_exit_on_timeout=true", "-o", "asyncio_mode=auto"]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "holdfast.testing.hanging", *options, "--rootdir", "."]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=SECONDS, check=False)
+    assert run.returncode == 1
+    what = "the test" if how == "the test" else "the teardown"
+    assert f"test_hangs.py::test_it: {what} hangs" in run.stderr
+    assert "/app/waits (running) has been in the turn of Wait" in run.stderr
+    assert "in Waits.wait_in_turn" in run.stderr
+    assert ("task forgotten:" in run.stderr) is (how == "the test")
+    assert "in hang_in_task" in run.stderr or how != "the test"
+    assert "Timeout (0:00:02)!" in run.stderr
