@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..actors.errors import HoldfastError
 from ..actors.events import SnapshotTaken
+from ..actors.message import message_name
 from .records import Snapshot, SnapshotNow
 from .saved import cut
 
@@ -41,6 +42,10 @@ class Arrival:
         except HoldfastError as error:
             self._refused(record, error)
             return
+        becomes = home.becomes
+        if record.is_replaced and becomes is not None and record.kind == message_name(becomes.kind):
+            if home.cell is not None:  # Now: the answer to whoever has replaced the code may never come.
+                home.node.respec(home.cell, becomes)
         home.limit.cut()
         home.due.kept(record.turn)
         if home.node.watched:
