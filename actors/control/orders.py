@@ -167,8 +167,8 @@ def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[A
     """
     old = cell.more.start if cell.more is not None else None
     start = Start(new.kind, old.args, old.kwargs) if keeps_arguments and old is not None else new
-    if cell.spec is None:
-        return start  # It is never started again.
+    if not dataclasses.is_dataclass(cell.spec):
+        return start  # It is never started again, or by a supervisor in another process: there this is asked again.
     try:
         start.check()
     except TypeError as error:
