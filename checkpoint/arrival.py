@@ -43,9 +43,9 @@ class Arrival:
             self._refused(record, error)
             return
         becomes = home.becomes
-        if record.is_replaced and becomes is not None and record.kind == message_name(becomes.kind):
-            if home.cell is not None:  # Now: the answer to whoever has replaced the code may never come.
-                home.node.respec(home.cell, becomes)
+        kind = "" if becomes is None or not record.is_replaced else message_name(becomes.kind)
+        if becomes is not None and home.cell is not None and record.kind == kind:
+            home.node.respec(home.cell, becomes)  # Now: the answer to whoever has replaced the code may never come.
         home.limit.cut()
         home.due.kept(record.turn)
         if home.node.watched:
