@@ -110,3 +110,16 @@ async def test_a_process_that_dies_before_it_has_answered_comes_back_with_its_ne
     assert (await system.get_status(one)).kind == "tests.control.players.Cents"
     one.kill()
     assert await one.ask(Add(1), timeout=30.0) == 200
+
+
+async def test_code_of_a_recorded_actor_below_a_process_is_replaced(system: hf.ActorSystem) -> None:
+    spec = hf.child("one", hf.start(Account), recovery=hf.hybrid(interval=3600.0))
+    await system.start(hf.supervisor("top", children=[spec], intensity=1000, isolation="process"))
+    one = system.ref("/app/top/one", Account)
+    assert await one.ask(Add(1), timeout=30.0) == 1
+    await system.suspend(one)
+    await system.replace_code(one, Cents)
+    await system.resume(one)
+    assert await one.ask(Add(1), timeout=30.0) == 200
+    one.kill()
+    assert await one.ask(Add(1), timeout=30.0) == 300
