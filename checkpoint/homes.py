@@ -472,7 +472,9 @@ class HomeHost:
         try:
             restore_seconds = await live
             if switch.port is None:  # It was over before anybody came to look.
-                raise StartFailed(cell.path, ENDED)
+                if switch.waits_for_release:
+                    raise StartFailed(cell.path, ENDED)
+                return  # It was up, and has ended in a turn: that is told by its end, and no start has failed.
             clock.mark("replay", switch.live_at)
             await self._let_at(switch, clock, restore_seconds)
         except HoldfastError as error:

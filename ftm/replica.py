@@ -543,7 +543,7 @@ class Replica(Supervisor):
         except HoldfastError as error:
             await self._drop_prepared()
             return error
-        except Exception as error:  # Importing a module, and making a mechanism of its settings, raise anything.
+        except (Exception, SystemExit, KeyboardInterrupt) as error:  # Importing a module, and making a mechanism of its settings, raise anything.
             await self._drop_prepared()
             return MechanismRefused(self.ctx.path, f"{type_name(type(error))}: {error}")
         return None

@@ -41,6 +41,7 @@ from .children import (
     Retry,
     Row,
     StartLimit,
+    begin_start,
     complete,
     new_cell,
 )
@@ -189,7 +190,8 @@ class Supervisor(Inquiries):
             turn = self.ctx.cell.extra().turn
             if turn is not None and turn.killed:
                 raise  # It is our own turn that is killed.
-            raise StartFailed(self._path_of(one), "it was killed while it started") from error
+            why = limit.told if limit.is_over else "it was killed while it started"
+            raise StartFailed(self._path_of(one), why) from error
         except StartFailed as error:
             if limit.is_over:
                 raise StartFailed(self._path_of(one), limit.told) from error
@@ -213,7 +215,14 @@ class Supervisor(Inquiries):
         if cell is None or cell.state is GONE:
             cell = one.cell = new_cell(self.ctx.cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
-        return cell.host.start(cell)
+        seconds = one.spec.start_timeout or "infinity"
+        if isinstance(seconds, str):
+            return cell.host.start(cell)
+        void = begin_start(cell, seconds)
+        try:
+            return cell.host.start(cell)  # `__init__` may block already.
+        finally:
+            void()
 
     def _is_up(self, one: Child) -> None:
         one.state = UP
