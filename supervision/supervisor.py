@@ -111,7 +111,7 @@ class Supervisor(Inquiries):
         """
         self.ctx.trap_exits = True  # Only our own parent can end us: the end of a stranger that is linked is no order.
         self._begin(new_plan(self))
-        self._first = self._errand(self._start_all(), self.ctx.item)
+        self._first = self._errand(self._come_all_up(), self.ctx.item)
 
     def _begin(self, plan: Plan) -> None:
         """Take up the plan of this start."""
@@ -124,8 +124,15 @@ class Supervisor(Inquiries):
     def _is_starting(self) -> bool:
         return self._first is not None and not self._first.is_over
 
-    async def _start_all(self) -> None:
+    async def _come_all_up(self) -> None:
         """The errand of our own start."""
+        await self._start_all()
+        for early in self._early:
+            self.ctx.cell.push(early)
+        self._early.clear()
+
+    async def _start_all(self) -> None:
+        """Start the children of the plan."""
         row = Row(self._children.values(), STARTING)
         while (one := row.next()) is not None:
             try:
@@ -133,9 +140,6 @@ class Supervisor(Inquiries):
             except HoldfastError:
                 self._blame(one)
                 raise
-        for early in self._early:
-            self.ctx.cell.push(early)
-        self._early.clear()
 
     async def _start(self, one: Child) -> bool:
         """Start a child and wait until it is up. False: it did not want to be.

@@ -347,7 +347,9 @@ class Guest(Peer):
                 up: asyncio.Future[None] | None = self.moves.begin(cell, unpack_recipe(frame.recipe))
             else:
                 up = self._launcher(self, cell, frame)
-        except BaseException as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
+        except (
+            BaseException
+        ) as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
             self._launched(frame.id, error)
             return
         if up is None:

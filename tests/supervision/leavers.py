@@ -7,9 +7,7 @@ from typing import Any
 
 import holdfast as hf
 
-LEAVING = {
-    kind.__name__: kind for kind in (KeyboardInterrupt, SystemExit, GeneratorExit, asyncio.CancelledError)
-}
+LEAVING = {kind.__name__: kind for kind in (KeyboardInterrupt, SystemExit, GeneratorExit, asyncio.CancelledError)}
 PHASES = ("__init__", "on_start", "on_start later", "turn", "turn later", "def turn", "on_stop", "task", "pipe")
 
 
