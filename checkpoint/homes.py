@@ -239,7 +239,7 @@ class Homes:
             switch.ends.erased(ERASED)
 
     def _tell_stored(self, path: str, why: str) -> None:
-        """Whoever waits at an address that nobody has been started at since the root began is told, before it is erased."""
+        """Tell whoever waits at an address where nobody has been started since the root began: it is erased."""
         cell = self.node.cell_at(path)
         try:
             switch = self.made(cell, hybrid())

@@ -393,7 +393,7 @@ class Server(Reports):
         self.previous = previous
         return ends, state
 
-    def fail(self, request: Request, end: TurnEnd, error: Exception) -> None:
+    def fail(self, request: Request, end: TurnEnd, error: BaseException) -> None:
         """This turn has left what is no state: run again, it fails."""
         codec = self.standing.node.codec
         answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()

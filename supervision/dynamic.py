@@ -27,7 +27,6 @@ from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
 
-
 MADE_UP = b""
 """What is noted of a child whose id nobody knows when its supervisor is started again."""
 
