@@ -367,7 +367,7 @@ class Cell(_Hot):
             return
         try:
             last.on_undelivered(message)
-        except Exception as error:
+        except BaseException as error:
             self.node.dead_letter(self, message, f"{reason}; on_undelivered raised {type_name(type(error))}: {error}")
 
     def __repr__(self) -> str:

@@ -420,7 +420,8 @@ class ActorContext:
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         self.cell.extra().tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
-            self.cell.push(Piped(None, error.__cause__ if isinstance(error.__cause__, SystemExit) else error))
+            cause = error.__cause__
+            self.cell.push(Piped(None, cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error))
 
 
 async def contained(work: Coroutine[Any, Any, T]) -> T:
@@ -455,8 +456,6 @@ class Piped(Item):
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         if item.message is None:
-            if isinstance(item.error, KeyboardInterrupt):
-                raise remote_crash(item.error) from item.error
             raise item.error
         return actor._table[type(item.message)](actor, item.message)
 

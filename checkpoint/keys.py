@@ -237,5 +237,5 @@ def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
         raise StateMismatch(where, f"{known}, whose migrate is `async def`: it must be plain")
     try:
         return migrate(state, version)
-    except Exception as error:
+    except BaseException as error:
         raise StateMismatch(where, f"{known}, and its migrate failed: {type(error).__name__}: {error}") from error

@@ -71,7 +71,7 @@ class Take(Item):
                 )
             state = ctx.depart(take._owe)
             take._taken(actor, state)
-        except Exception as error:  # The user's own code, such as `get_state`: no reason to end the actor.
+        except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.
             take._refused(str(error) if isinstance(error, HoldfastError) else error_text(error))
             return None
         take.is_done = True

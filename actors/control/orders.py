@@ -315,7 +315,7 @@ def unpack_function(packed: Any) -> Callable[..., Any]:
     name, args, kwargs = packed
     try:
         function = _found(name)
-    except Exception as error:  # Importing a module runs it: it may raise anything.
+    except BaseException as error:  # Importing a module runs it: it may raise anything.
         raise SpecError("control", f"{name} cannot be imported: {error_text(error)}") from error
     return functools.partial(function, *args, **kwargs) if args or kwargs else function
 
