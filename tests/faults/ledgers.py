@@ -1,4 +1,4 @@
-"""A program whose system calls are made to fail: two recorded ledgers, one of them in a process, are asked again and again.
+"""A program whose system calls are made to fail: two recorded ledgers are asked, one of them in a process.
 
 It notes what was acknowledged in memory that it shares with whoever looks, since a file could not be written to either.
 """

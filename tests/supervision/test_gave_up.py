@@ -39,10 +39,14 @@ async def test_the_process_that_cannot_be_had_is_named() -> None:
 async def test_so_it_is_at_the_end_of_the_system() -> None:
     """Also of a child that crashed at first: the start that fails is what it ends of."""
     plan = Plan()
-    with pytest.raises(hf.TreeFailed, match="the last to end was /app/a: .*StartFailed.*/app/a could not be started"):
+
+    async def body() -> None:
         async with hf.ActorSystem("app", log=False, intensity=2) as system:
             kid = await system.start(hf.child("a", hf.start(Kid, plan)))
             plan.todo["a"] = ["fail"] * 9
             kid.kill()
             await asyncio.Event().wait()
+
+    with pytest.raises(hf.TreeFailed, match=r"the last to end was /app/a: .*StartFailed.*/app/a could not be started"):
+        await body()
     assert plan.take() == "+a !a !a"
