@@ -77,7 +77,7 @@ ALWAYS = [
     Fault("sync", "EIO", 9, lasts=False),
     Fault("write a file", "EIO", 47, lasts=True),  # while the store is made
     Fault("socket", "EMFILE", 4, lasts=True),
-    Fault("message", "ENOMEM", 2, lasts=False, loop="asyncio"),
+    Fault("signal", "EPERM", 1, lasts=False, loop="asyncio"),
 ]
 
 
