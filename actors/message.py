@@ -122,7 +122,6 @@ def _resolve(declared: Any, kind: type) -> Any:
     return declared
 
 
-@dataclass_transform()
 class Refusal(HoldfastError):
     """A typed "no": raised in a handler it is the reply, and the actor lives on.
 
@@ -136,17 +135,6 @@ class Refusal(HoldfastError):
 
     _schema: typing.ClassVar[type[msgspec.Struct] | None] = None
 
-    def __init__(self, *args: Any, **fields: Any) -> None:
-        values = type(self)._fields(*args, **fields)
-        super().__init__(*(getattr(values, name) for name in values.__struct_fields__))
-        for name in values.__struct_fields__:
-            setattr(self, name, getattr(values, name))
-
-    @classmethod
-    def _fields(cls, *args: Any, **fields: Any) -> msgspec.Struct:
-        """The fields, checked by name and number (not by type: the checkers and the codec do that)."""
-        return cls.schema()(*args, **fields)
-
     @classmethod
     def schema(cls) -> type[msgspec.Struct]:
         """The struct that codes this refusal's fields; made with the first use, when all names are known."""
@@ -159,6 +147,8 @@ class Refusal(HoldfastError):
         return cls._schema
 
     def __str__(self) -> str:
+        if self._text:
+            return super().__str__()
         names = type(self).schema().__struct_fields__
         inner = ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
         return f"{type(self).__name__}({inner})"

@@ -56,15 +56,11 @@ NAMED = {"compose": ("outside",), "transition": ("whole",), "update": ("mechanis
 """What comes last is named."""
 
 
-class EndpointInUse(HoldfastError):
+class EndpointInUse(HoldfastError, text="control endpoint {path}: {why}"):
     """A live process listens at this socket, or it is no socket."""
 
-    def __init__(self, path: str, why: str) -> None:
-        super().__init__(path, why)
-        self.path, self.why = path, why
-
-    def __str__(self) -> str:
-        return f"control endpoint {self.path}: {self.why}"
+    path: str
+    why: str
 
 
 @contextlib.asynccontextmanager

@@ -62,15 +62,11 @@ STEPS = ("try", "start", "prepare", "rest", "quiesce", "commit", "switch", "tidy
 """Where the engine may be struck by a test; undoing has `abort` instead of the last three."""
 
 
-class CannotAdapt(HoldfastError):
+class CannotAdapt(HoldfastError, text="{actor} keeps its mechanism: {why}"):
     """The mechanism stays as it was."""
 
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return f"{self.actor} keeps its mechanism: {self.why}"
+    actor: str
+    why: str
 
 
 class Reconfiguration:

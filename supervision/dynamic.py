@@ -173,7 +173,15 @@ class DynamicSupervisor(Supervisor):
 
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
-        """A stopped child is forgotten here."""
+        """A stopped child is forgotten here by itself; what was recorded of it is forgotten now."""
+        path, keeper = f"{self.ctx.path}/{message.id}", self.ctx.cell.node.keeper
+        is_there = message.id in self._children or message.id in (self.ctx.cell.children or ())
+        if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
+            try:
+                keeper.erase(path, below=True)
+            except HoldfastError as error:  # It can be deleted again.
+                return self._fail(error)
+            return None
         self._child(message.id)
         raise NotSupported("a dynamic supervisor forgets stopped children by itself: use TerminateChild")
 

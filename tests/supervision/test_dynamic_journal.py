@@ -149,6 +149,24 @@ async def test_a_made_up_id_is_not_given_twice_for_whoever_had_it_is_recorded(
         assert await anew.ask(Seen()) == ["Bob of nowhere"]
 
 
+async def test_what_was_recorded_of_one_that_has_ended_can_be_erased(store: str | None, isolation: Any) -> None:
+    async with running(store) as system:
+        top = await system.start(school(PUPIL, isolation=isolation))
+        bob = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
+        await bob.ask(Note("secret"))
+        with pytest.raises(hf.NotSupported):
+            await top.ask(hf.DeleteChild("bob"))
+        await top.ask(hf.TerminateChild("bob"))
+        with pytest.raises(hf.NoSuchChild):
+            await top.ask(hf.DeleteChild("bob", erase=False))
+        await top.ask(hf.DeleteChild("bob"))
+        with pytest.raises(hf.NoSuchChild):
+            await top.ask(hf.DeleteChild("bob"))
+        await restarted(system)
+        again = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
+        assert await again.ask(Seen()) == ["Bob of nowhere"]
+
+
 async def test_a_start_that_fails_or_is_refused_leaves_nothing_in_the_journal(
     store: str | None, isolation: Any, tmp_path: Path
 ) -> None:
