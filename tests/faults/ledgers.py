@@ -76,7 +76,7 @@ async def work(folder: Path, acknowledged: mmap.mmap) -> None:
                 try:
                     await system.checkpoint(ledgers[0])
                     os.kill(system.pid_of(ledgers[1]), signal.SIGKILL)
-                except (hf.HoldfastError, ProcessLookupError) as error:
+                except (hf.HoldfastError, OSError) as error:
                     print(f"{type(error).__name__}: {error}", flush=True)
 
 
