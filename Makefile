@@ -30,6 +30,8 @@ campaign: $(VENV)/.dev
 	HOLDFAST_MATRIX=500 HOLDFAST_BAD_CHANGES=1 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
 	    tests/migration tests/ftm/test_bad_changes.py
 	HOLDFAST_SIGNALS=100 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 tests/system/test_signals.py
+	HOLDFAST_SYSCALLS=500 HOLDFAST_FUZZ=5000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
+	    tests/faults tests/actors/process/hostile/test_fuzz.py
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 
 # Memory, descriptors, processes, threads and the store stay as they are under kills, for so many hours. See docs/testing.md.

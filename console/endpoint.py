@@ -105,7 +105,7 @@ def claimed(path: Path) -> Generator[None, None, None]:
     try:
         yield
     finally:
-        os.unlink(beside)  # Ours, as long as we hold it.
+        remove(beside, os.fstat(file).st_ino)
         os.close(file)
 
 
@@ -125,9 +125,9 @@ def _locked(beside: Path, path: str) -> int:
             os.close(file)
             raise
         if (ours.st_dev, ours.st_ino) == (there.st_dev, there.st_ino):
-            if ours.st_uid != os.geteuid():
+            if not stat.S_ISREG(ours.st_mode) or ours.st_uid != os.geteuid() or ours.st_nlink != 1 or ours.st_size:
                 os.close(file)
-                raise EndpointInUse(path, "somebody else's lock lies beside it")
+                raise EndpointInUse(path, f"{beside} is no lock of ours: an empty file of this user, with one name")
             return file
         os.close(file)
 
@@ -138,7 +138,7 @@ def absolute(path: str | os.PathLike[str]) -> Path:
 
 
 def remove(path: Path, inode: int) -> None:
-    """Remove our socket, unless another's is there by now."""
+    """Remove what we have made, unless something else is there by now."""
     try:
         if os.lstat(path).st_ino == inode:
             os.unlink(path)
@@ -177,8 +177,7 @@ def clear(path: Path) -> None:
         code = probe.connect_ex(str(path))
     if code != errno.ECONNREFUSED:
         raise EndpointInUse(str(path), "a live process listens there")
-    if os.lstat(path).st_ino == found.st_ino:
-        os.unlink(path)
+    remove(path, found.st_ino)
 
 
 class Endpoint:

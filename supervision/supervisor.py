@@ -15,7 +15,7 @@ from ..actors.actor import Start, on
 from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
-from ..actors.exits import SHUTDOWN, ExitReason, unpack_exit
+from ..actors.exits import SHUTDOWN, ExitReason, crash, unpack_exit
 from ..actors.mail import Item, ReplyHandle
 from .admin import (
     AlreadyPresent,
@@ -395,9 +395,9 @@ class Supervisor(Inquiries):
                 continue
             try:
                 await self._come_up_in(row, other)
-            except HoldfastError:
+            except HoldfastError as error:
                 row.leave()
-                self._again(other, reason)  # The others stay up, or are stopped, until it is tried again.
+                self._again(other, crash(error))  # The others stay up, or are stopped, until it is tried again.
 
     def _again(self, one: Child, reason: ExitReason) -> None:
         """A start has failed: try once more, which counts."""

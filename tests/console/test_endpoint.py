@@ -119,6 +119,27 @@ async def test_what_is_no_socket_is_left_alone(system: hf.ActorSystem, tmp_path:
     assert where.read_text() == "mine"
 
 
+@pytest.mark.parametrize("what", ["content", "hard link", "link", "fifo"])
+async def test_a_lock_that_is_not_ours_is_left_alone(system: hf.ActorSystem, tmp_path: Path, what: str) -> None:
+    where, lock, foreign = tmp_path / "app.sock", tmp_path / "app.sock.lock", tmp_path / "foreign"
+    foreign.write_text("mine" if what == "content" else "")
+    match what:
+        case "content":
+            foreign.rename(lock)
+        case "hard link":
+            os.link(foreign, lock)
+        case "link":
+            lock.symlink_to(foreign)
+        case _:
+            os.mkfifo(lock)
+    before = os.lstat(lock)
+    with pytest.raises(EndpointInUse, match=r"no lock of ours|symbolic links"):
+        async with control_endpoint(system, where):
+            pass
+    assert os.path.samestat(os.lstat(lock), before)
+    assert not where.exists()
+
+
 async def test_another_user_is_not_served(system: hf.ActorSystem, tmp_path: Path) -> None:
     """The check asks the kernel who is there; here the endpoint serves a user that we are not."""
     endpoint = Endpoint(system, os.geteuid() + 1)
