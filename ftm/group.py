@@ -79,7 +79,7 @@ class Group(Members):
         self.inside: set[int] = set()  # inputs that a replica had that does not lead any more, not ended since
         self.out: Work | None = None
         self.number = 0
-        self.is_again = False
+        self.is_again = False  # another leader has not been sent all there is
         self.is_live = self.has_gone = False
         self.is_held = False  # nothing new goes in: nobody could take over yet
         self.is_suspended = self.is_stopping = False
@@ -157,15 +157,19 @@ class Group(Members):
         return Inward(self.epoch, records) if records else None
 
     def next_work(self) -> Work | None:
-        """The next batch, if there is something, and none is out. What was inside once is ended in any case."""
+        """The next batch, if there is something, and none is out. What was inside once is ended in any case.
+
+        Another leader is sent one even if it is empty: what it has to say of the time before waits for that.
+        """
         if self._quiet:
             self._ended(set())  # Another one may lead now, and nothing was inside the last one.
-        if self.out is not None or self.primary is None or not self.waiting or (self.has_gone and self.is_held):
+        if self.out is not None or self.primary is None:
             return None
+        is_open = not (self.has_gone and self.is_held)
         takes_new = not (self.is_suspended or self.is_stopping or self.is_resting)
         requests, go, size = list[Request](), None, 0
         lives: dict[str, int] = {}
-        while self.waiting and len(requests) < MOST_REQUESTS and size < MOST_BYTES:
+        while is_open and self.waiting and len(requests) < MOST_REQUESTS and size < MOST_BYTES:
             first = self.waiting[0]
             if not takes_new and (isinstance(first, Go) or first.id not in self.inside):
                 break
@@ -186,11 +190,11 @@ class Group(Members):
             size += len(first.body)
             if is_alone:
                 break
-        if not requests and go is None:
+        if not requests and go is None and not self.is_again:
             return None
         self.number += 1
         self.out = Work(self.epoch, self.config, self.number, requests, go, self.is_again)
-        if not self.waiting:
+        if not self.waiting or not requests:
             self.is_again = False
         return self.out
 
