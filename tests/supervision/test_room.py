@@ -180,6 +180,25 @@ async def test_a_publisher_waits_for_room(isolation: Any, recovery: Any, listene
         assert (taken, system.dead_letters) == (list(range(25)), 0)
 
 
+@everywhere
+async def test_a_full_recorded_subscriber_holds_the_publisher_back(isolation: Any, recovery: Any) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        full = await system.start(
+            hf.child("full", hf.start(Listener), recovery=hf.hybrid(), mailbox=hf.bounded(1)),
+        )
+        other = await system.start(hf.child("other", hf.start(Listener)))
+        writer = await system.start(hf.child("writer", hf.start(Writer), isolation=isolation, recovery=recovery))
+        await system.suspend(full)
+        published = writer.ask(Publish(0, 9), 60)
+        while 1 not in await other.ask(Taken(), 60):
+            assert not published.done()
+        for _ in range(50):
+            assert max(await other.ask(Taken(), 60)) < 5, "it has room for one, and one is on its way"
+        await system.resume(full)
+        await published
+        assert await full.ask(Taken(), 60) == list(range(9))
+
+
 @pytest.mark.parametrize("publisher", ["system", *NAMES])
 async def test_one_full_subscriber_holds_back_the_publisher_and_no_other_subscriber(publisher: str) -> None:
     """And who has left the topic meanwhile, or has begun a life that never was there, does not get it."""
