@@ -15,7 +15,7 @@ from typing import Any, Generic, get_args, get_origin
 import msgspec
 from typing_extensions import TypeVar, dataclass_transform
 
-from .errors import HoldfastError, type_name
+from .errors import BadMessage, HoldfastError, type_name
 
 R = TypeVar("R", default=None, covariant=True)
 
@@ -55,6 +55,16 @@ def why_no_message(value: object) -> str:
         "messages are instances of a class of their own: class MyMessage(hf.Message[...]), "
         "and a handler with @on(MyMessage)"
     )
+
+
+def require_message(to: str, value: object) -> None:
+    """Refuse what is no message.
+
+    Raises:
+        BadMessage: it is none; what to send instead.
+    """
+    if problem := why_no_message(value):
+        raise BadMessage(to, type_name(type(value)), problem)
 
 
 def message_of(item: object) -> Message[Any] | None:

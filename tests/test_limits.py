@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import sys
@@ -42,9 +41,6 @@ class Keeper(hf.Actor):
             case "tell itself":
                 self.ctx.ref.tell(Do("told"))
                 os.kill(os.getpid(), signal.SIGKILL)
-            case "publish":
-                self.ctx.ref.tell(Do("full"))
-                await self.ctx.publish("/limits", Do("heard"))
             case what:
                 self.done.append(what)
         return len(self.done)
@@ -148,20 +144,6 @@ async def test_the_spec_of_a_child_comes_packed_from_another_process() -> None:
         top = await system.start(hf.supervisor("top", children=[child], isolation="process"))
         spec = await top.ask(hf.GetChildSpec("one"), timeout=60.0)
         assert isinstance(spec, Packed), spec
-
-
-async def test_who_publishes_to_its_own_full_mailbox_waits_for_itself() -> None:
-    """Until its life is ended. A tell would be refused, as long as there is no room."""
-    async with hf.ActorSystem("app", log=False) as system:
-        spec = hf.child("one", hf.start(Keeper), mailbox=hf.bounded(1), shutdown="brutal_kill")
-        ref = await system.start(spec)
-        waits = ref.ask(Do("publish"), timeout=60.0)
-        while (await system.get_status(ref, timeout=60.0)).turn is None:
-            await asyncio.sleep(0)
-        assert not waits.done()
-        await system.stop(ref)
-        with pytest.raises(hf.AskFailed):
-            await waits
 
 
 async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:

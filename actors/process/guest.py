@@ -21,7 +21,7 @@ from ..events import ActorStarted, Event, event_data
 from ..exits import ExitReason, pack_exit
 from ..fast_loop import new_event_loop
 from ..mail import AnyTable
-from ..message import Order, message_name
+from ..message import Message, Order, message_name
 from ..node import Node
 from ..overdue import Overdue
 from ..ref import current
@@ -106,7 +106,10 @@ class OutsideTable(AnyTable):
     """The table of an actor that is not in this process: whether an order may be given there is looked at each time."""
 
     def __contains__(self, kind: object) -> bool:
-        return not issubclass(kind, Order)  # type: ignore[arg-type]  # a message's type
+        return self.knows(kind) and not issubclass(kind, Order)  # type: ignore[arg-type]  # a message's type
+
+    def knows(self, kind: type) -> bool:
+        return issubclass(kind, Message)
 
 
 OUTSIDE = OutsideTable()
