@@ -19,6 +19,7 @@ from .events import ReplicaLost, WrongSuspicion
 from .securing import Securing
 
 if TYPE_CHECKING:
+    from ..actors.ref import ActorRef
     from .detector import Detection
     from .stuck import Stuck
 
@@ -106,6 +107,15 @@ class Members(Securing):
         """The number of the life that a replica lives now; 0 if none."""
         cell = self.cell_of(name)
         return cell.life if cell is not None and cell.state is RUNNING else 0
+
+    def is_from(self, name: str, sender: ActorRef[Any] | None) -> bool:
+        """Whether a replica, or what is below it, has said this."""
+        place = self.place(name)
+        return sender is not None and (sender.path == place or sender.path.startswith(f"{place}/"))
+
+    def is_from_leader(self, sender: ActorRef[Any] | None) -> bool:
+        """Whether whoever leads, or is told to, has said this."""
+        return any(name is not None and self.is_from(name, sender) for name in (self.primary, self.leading))
 
     def is_well(self, name: str) -> bool:
         """Whether a member is the one that was taken in, and nobody suspects it."""
