@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, ClassVar
 from ..actors.actor import Actor, on
 from ..actors.errors import SpecError
 from ..actors.own_clock import OwnClock
+from .members import is_within
 from .orders import Beat, Broken
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ class Detector(Actor):
         """A replica is alive."""
         group = self._group
         life = group.life_of(beat.name)
-        if not life or not group.is_from(beat.name, self.ctx.sender):
+        if not life or not is_within(group.place(beat.name), self.ctx.sender):
             return  # It has died since it said so; or another one has said it.
         accrual = self._known.get((beat.name, life))
         now = self._clock.at(self.ctx.cell.node.loop.time())
@@ -148,7 +149,7 @@ class Detector(Actor):
     def broken(self, message: Broken) -> None:
         """A replica is ending: nobody needs to wait for that."""
         group = self._group
-        if group.life_of(message.name) == message.life and group.is_from(message.name, self.ctx.sender):
+        if group.life_of(message.name) == message.life and is_within(group.place(message.name), self.ctx.sender):
             group.broken(message.name, message.life, message.why)
 
     def _look(self) -> None:

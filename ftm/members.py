@@ -58,6 +58,11 @@ def is_blocked(pid: int) -> bool:
     return state == "S" or (state == "R" and os.getloadavg()[0] <= (os.cpu_count() or 1))
 
 
+def is_within(place: str, sender: ActorRef[Any] | None) -> bool:
+    """Whether a replica, or what is below it, has said this."""
+    return sender is not None and f"{sender.path}/".startswith(f"{place}/")
+
+
 class Look(Message):
     """Something has happened to the group: see what is to be done."""
 
@@ -108,14 +113,10 @@ class Members(Securing):
         cell = self.cell_of(name)
         return cell.life if cell is not None and cell.state is RUNNING else 0
 
-    def is_from(self, name: str, sender: ActorRef[Any] | None) -> bool:
-        """Whether a replica, or what is below it, has said this."""
-        place = self.place(name)
-        return sender is not None and (sender.path == place or sender.path.startswith(f"{place}/"))
-
     def is_from_leader(self, sender: ActorRef[Any] | None) -> bool:
         """Whether whoever leads, or is told to, has said this."""
-        return any(name is not None and self.is_from(name, sender) for name in (self.primary, self.leading))
+        names = self.primary, self.leading
+        return any(name is not None and is_within(self.place(name), sender) for name in names)
 
     def is_well(self, name: str) -> bool:
         """Whether a member is the one that was taken in, and nobody suspects it."""

@@ -9,6 +9,7 @@ from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.message import Message, message_name
 from .group import Flush
+from .members import is_within
 from .messages import Done, Outward
 from .orders import Stalled
 from .sealed import Agree, Back, Call, Greet, Refused, Sealed
@@ -76,7 +77,7 @@ class Proxy(Actor):
     def stalled(self, stalled: Stalled) -> None:
         """A turn takes too long."""
         group = self._group
-        if group.is_plain() and group.is_from(stalled.name, self.ctx.sender):
+        if group.is_plain() and is_within(group.place(stalled.name), self.ctx.sender):
             group.stuck.told(stalled)
 
     @on(Greet)
