@@ -6,7 +6,6 @@ before it is mapped: from then on nobody can make it shorter, not even a process
 
 from __future__ import annotations
 
-import fcntl
 import os
 
 
@@ -21,6 +20,8 @@ def keep_size(file: int) -> None:
     Raises:
         OSError: it is no such file.
     """
+    import fcntl  # not everywhere; where it is not, there is no such memory either
+
     wanted = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW
     if fcntl.fcntl(file, fcntl.F_GET_SEALS) & wanted != wanted:
         fcntl.fcntl(file, fcntl.F_ADD_SEALS, wanted)

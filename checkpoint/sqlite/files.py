@@ -89,6 +89,8 @@ class Word:
 def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
     """Create the file so that it exists after a power loss completely or not at all."""
     temporary = f"{path}.tmp"
+    with contextlib.suppress(FileNotFoundError):
+        os.unlink(temporary)  # Whoever had begun it was killed.
     try:
         with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
             file.writelines(parts)

@@ -144,8 +144,8 @@ CHECKS = {
     ),
     "log: it does not count when the store was closed": Check(
         "checkpoint/sqlite/store.py",
-        "        if left and version == VERSION:",
-        "        if False:",
+        "        stale, left = (log.left(), []) if version == VERSION else ([], log.left())",
+        "        stale, left = [], log.left()",
         "tests/checkpoint/sqlite/test_log.py",
         "test_a_log_of_a_closed_store",
     ),

@@ -197,8 +197,8 @@ def test_a_store_of_before_gets_an_identity_and_what_was_begun_of_that_is_finish
         assert reopened(path).snapshot == LARGE
         first, second = (one.read_text() for one in ids)
         assert first == second
-        if not step:  # As if its owner had been killed between the two folders, the database saying "pending".
-            ids[1].unlink()
+        if not step:  # As if its owner had been killed while it made the second one, the database saying "pending".
+            ids[1].rename(f"{ids[1]}.tmp")
             with closing(sqlite3.connect(path, isolation_level=None)) as db:
                 value, crc = db.execute("SELECT value, crc FROM notes WHERE name = ?", (NOTE,)).fetchone()
                 pending = b"~" + value[1:]
