@@ -20,6 +20,7 @@ from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
 from holdfast.ftm.messages import Change, Done, NotFollowing, ReplyEvicted, Request, State, Work
 from holdfast.ftm.orders import Broken
 from holdfast.ftm.points import checksum
+from holdfast.ftm.proxy import Settle
 from holdfast.ftm.replylog import ReplyLog
 from holdfast.ftm.state import MISFIT, Apply
 from tests.ftm import accounts
@@ -204,7 +205,6 @@ async def test_nobody_speaks_for_a_replica(system: hf.ActorSystem) -> None:
     detector.tell(Broken(group.primary, group.life_of(group.primary), "forged"))
     end = TurnEnd(group.switch.turn + 1, 1, OK, [], Answer(REPLY, "", b"\x63"))
     proxy.tell(Done(group.epoch, group.config, -1, [end], False))
-    for one in (detector, proxy):
-        await system.get_status(one)
+    await proxy.ask(Settle())
     assert (group.suspects, group.ending, group.stale, group.epoch) == ({}, {}, 1, 1)
     assert await ref.ask(accounts.Add(1)) == 2
