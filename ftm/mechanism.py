@@ -162,6 +162,16 @@ class Mechanism:
         return Description(code.kind, settings, code.file, code.sha256, bricks)
 
 
+@dataclasses.dataclass(frozen=True)
+class Unprotected(Mechanism):
+    """One replica that does nothing else: on the way back from a mechanism to none."""
+
+    name: ClassVar[str] = "unprotected"
+
+
+NOTHING = (Unprotected(),)
+
+
 def code_of(kind: type[Any]) -> Code:
     """How another process finds a class."""
     module = sys.modules.get(kind.__module__)

@@ -196,6 +196,7 @@ class ToGroup(Move):
         self.transit.over(cell, host)
         if suspended:
             group.is_suspended = more.suspended = True
+        host.attached(cell, group)
         switch.from_life(live)  # What waits is fed.
         group.go_on()
         self.gone_on_at = now()

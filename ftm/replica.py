@@ -220,7 +220,7 @@ class Replica(Supervisor):
         why, setting, cell = f"its {one.spec.id} has ended: {reason}", self._setting, self.ctx.cell
         super()._give_up(one, reason, Shutdown(why))
         with suppress(HoldfastError):  # It is between two lives: then it hears of our end.
-            cell.node.cell_at(f"{setting.address}/ftm/detector").ref.tell(Broken(setting.name, cell.life, why))
+            self.ctx.tell(cell.node.cell_at(f"{setting.address}/ftm/detector"), Broken(setting.name, cell.life, why))
 
     def _cell(self, name: str) -> Cell:
         cell = self._children[name].cell
