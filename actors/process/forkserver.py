@@ -166,8 +166,8 @@ class ForkServer:
     def _on_death(self) -> None:
         """The server's pidfd is readable: it has ended."""
         assert self._process is not None
+        self._loop.remove_reader(self._pidfd)  # First: whatever fails below must not bring us here again for ever.
         self._read_packets(limit=None)  # deaths it had still reported
-        self._loop.remove_reader(self._pidfd)
         os.close(self._pidfd)
         self._pidfd = -1
         self._process.poll()  # reaps exactly this process; somebody else's waitpid(-1) may have been first
@@ -310,7 +310,7 @@ class ForkServer:
                 return
             except ConnectionError:
                 data, fds = b"", []
-            except OSError as error:
+            except (OSError, MemoryError) as error:
                 self._pause_reading(error)
                 return
             if not data:  # its end; what that means is told by the pidfd
@@ -320,14 +320,14 @@ class ForkServer:
             kind, number, value = HEADER.unpack_from(data)
             self._on_packet(Kind(kind), number, value, data[HEADER.size :].decode(), fds)
 
-    def _pause_reading(self, error: OSError) -> None:
+    def _pause_reading(self, error: OSError | MemoryError) -> None:
         """Nothing can be taken from the socket now; what is in it stays there. At once it would be as bad."""
         control = self._control
         assert control is not None
         self._loop.remove_reader(control.fileno())
         for request in list(self._requests.values()):
             if not request.outcome.done():
-                request.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be heard: {error}"))
+                request.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be heard: {error!r}"))
         self._loop.call_later(AGAIN_AFTER, self._read_again, control)
 
     def _read_again(self, control: socket.socket) -> None:

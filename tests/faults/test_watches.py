@@ -36,18 +36,18 @@ def say(program: subprocess.Popen[bytes]) -> None:
     program.stdin.flush()
 
 
-@pytest.mark.parametrize("loop", ["asyncio", "uvloop"])
-@pytest.mark.parametrize("error", ["ENOMEM", "ENOSPC"])
-def test_nothing_more_can_be_watched(error: str, loop: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("process", ["first", "further"])
+@pytest.mark.parametrize(("loop", "error"), [("asyncio", "ENOMEM"), ("uvloop", "ENOSPC")])
+def test_nothing_more_can_be_watched(error: str, loop: str, process: str, tmp_path: Path) -> None:
     with open(tmp_path / "errors", "wb") as errors:
         program = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, loop, str(ROOT)],
+            [sys.executable, "-c", PROGRAM, loop, process, str(ROOT)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=tmp_path,
         )  # fmt: skip
     tracer: subprocess.Popen[bytes] | None = None
     try:
         said_until_ready(program)
-        option = f"inject=epoll_ctl:error={error}:when=1+"
+        option = f"inject=epoll_ctl:error={error}:when=2+"  # one has room, and then none
         tracer = subprocess.Popen(
             ["strace", "-p", str(program.pid), "-o", "/dev/null", "-e", "trace=epoll_ctl", "-e", option],
             stderr=subprocess.PIPE,
