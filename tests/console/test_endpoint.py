@@ -192,7 +192,7 @@ BAD = {
         (Transact([("update", [Plain("/app/left")])], dry_run=False, timeout=1.0), "update lacks role"),
         (
             Control("replace_state", "/app/left", [Packed("function", encode_value("os:system"))], 1.0),
-            r"is no function \(name, arguments",
+            "is no function: a name, its arguments",
         ),
     ],
 )
