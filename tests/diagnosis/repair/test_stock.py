@@ -3,7 +3,7 @@
 import asyncio
 import sys
 from collections.abc import AsyncIterator, Callable, Coroutine
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 
@@ -162,7 +162,7 @@ class Slow(hf.Actor):
 RESTARTS = pytest.mark.parametrize("restart", [restart_child, roll_back])
 
 
-async def start_slow(system: hf.ActorSystem, ending: list[asyncio.Event], **flags: int) -> str:
+async def start_slow(system: hf.ActorSystem, ending: list[asyncio.Event], intensity: int = 3) -> str:
     """A recorded actor with two snapshots, and another one, below a supervisor below another one."""
 
     class SlowNotes(Notes):
@@ -172,7 +172,7 @@ async def start_slow(system: hf.ActorSystem, ending: list[asyncio.Event], **flag
             await ends.wait()
 
     slow = hf.child("a", hf.start(SlowNotes), recovery=hf.hybrid(interval=1000.0), shutdown=LONG)
-    low = hf.supervisor("low", children=[slow, hf.child("b", hf.start(Node))], **flags)
+    low = hf.supervisor("low", children=[slow, hf.child("b", hf.start(Node))], intensity=intensity)
     await system.start(hf.supervisor("s", children=[low]))
     notes = system.ref("/t/s/low/a", Notes)
     for text in ("a", "b"):
@@ -232,10 +232,11 @@ async def test_a_supervisor_that_gives_up_in_the_middle_of_a_restart_leaves_nobo
             ending[1].set()
             await restarting
             async for event in events:
-                if isinstance(event, hf.ActorStarted) and event.address == "/t/s/low":
+                if isinstance(event, hf.ActorStarted) and event.address == "/t/s/low/b":
                     break
-        assert await states(system) == {"a": "running", "b": "running"}
         assert await system.ref(path, Notes).ask(Read()) == ["a", "b", "c"]
+        assert await life(system, "/t/s/low/b") == 1
+        assert await states(system) == {"a": "running", "b": "running"}
         arbiter_of(system.node).release(arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else"))
 
 
@@ -299,7 +300,9 @@ async def test_repair_leaves_those_alone_that_an_operator_has_stopped_and_that_a
 
     top = await system.start(hf.supervisor("s", children=[hf.child("b", hf.start(Node))]))
     dynamic = await system.start(hf.dynamic("d"))
-    for keeper, restart in ((top, "temporary"), (dynamic, "permanent")):
+    cases: list[tuple[hf.ActorRef[Any], Literal["temporary", "permanent"]]]
+    cases = [(top, "temporary"), (dynamic, "permanent")]
+    for keeper, restart in cases:
         for name in ("x", "y", "z"):
             await keeper.ask(hf.StartChild(hf.child(name, hf.start(Node), restart=restart)))
             await keeper.ask(hf.TerminateChild(name, parks=name != "y"))
