@@ -137,10 +137,14 @@ class Actor:
         if inspect.iscoroutinefunction(cls.__init__):
             raise TypeError(f"{type_name(cls)}.__init__ cannot be async: what has to be awaited goes into on_start")
         table, declared, topics = Table(), dict[type, Handles](), list[str]()
-        for name in dir(cls):
-            handler = inspect.getattr_static(cls, name)
+        members = dict[str, Any]()
+        for one in reversed(cls.__mro__):
+            members.update(vars(one))
+        for name in sorted(members):
+            handler = members[name]
             for handles in getattr(handler, "__handles__", ()):
-                _check(cls, name, handler, handles.kind)
+                if not any(vars(one).get(name) is handler for one in cls.__mro__[1:] if issubclass(one, Actor)):
+                    _check(cls, name, handler, handles.kind)  # Else it was when the base was made; this is slow.
                 if handles.kind in table:
                     raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
                 table[handles.kind] = in_thread(handler) if handles.to_thread else handler

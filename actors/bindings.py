@@ -13,15 +13,11 @@ if TYPE_CHECKING:
 A_co = TypeVar("A_co", bound="Actor", covariant=True)
 
 
-class Unbound(HoldfastError):
+class Unbound(HoldfastError, text="{actor}.{port} is not bound; bind it in the child spec or with system.bind()"):
     """A binding was used before anything was bound to it."""
 
-    def __init__(self, actor: str, port: str) -> None:
-        super().__init__(actor, port)
-        self.actor, self.port = actor, port
-
-    def __str__(self) -> str:
-        return f"{self.actor}.{self.port} is not bound; bind it in the child spec or with system.bind()"
+    actor: str
+    port: str
 
 
 class Binding(Generic[A_co]):

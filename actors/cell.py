@@ -9,10 +9,10 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, Protocol
 
 from . import mailbox
-from .errors import ActorStopped, BadMessage, UnknownMessage, type_name
+from .errors import ActorStopped, UnknownMessage, type_name
 from .exits import SHUTDOWN, ExitReason
 from .mail import AnyTable, Ask, Item, Table
-from .message import Message, Order, why_no_message
+from .message import Message, Order, require_message
 from .ref import ActorRef
 
 if TYPE_CHECKING:
@@ -259,9 +259,7 @@ class Cell(_Hot):
         if isinstance(message, Order) and self.node.uplink is not None:
             self.node.uplink.require_granted(self.path, type_name(type(message)))
         if not self.table.knows(type(message)):
-            problem = why_no_message(message)
-            if problem:
-                raise BadMessage(self.path, type_name(type(message)), problem)
+            require_message(self.path, message)
             raise UnknownMessage(self.path, type_name(type(message)))
 
     def push(self, item: Item) -> None:
@@ -367,7 +365,7 @@ class Cell(_Hot):
             return
         try:
             last.on_undelivered(message)
-        except Exception as error:
+        except BaseException as error:
             self.node.dead_letter(self, message, f"{reason}; on_undelivered raised {type_name(type(error))}: {error}")
 
     def __repr__(self) -> str:

@@ -218,7 +218,7 @@ class Codec:
                 return UnknownRefusal(type_name=name, fields=self.decode(list[Any], body))
             fields = self.decode(found.schema(), body)
             return found(*(getattr(fields, field) for field in fields.__struct_fields__))
-        args = tuple(self.decode(list[Any], body))
+        args: tuple[Any, ...] = tuple(tuple(a) if type(a) is list else a for a in self.decode(list[Any], body))
         if kind == "crash":
             return RemoteCrash(*args)
         return rebuild_error(name, args) or AskFailed(name, ", ".join(map(str, args)))

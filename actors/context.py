@@ -14,7 +14,7 @@ from .errors import ActorStopped, AskDeadlock, HoldfastError, remote_crash
 from .exits import NORMAL, ExitReason
 from .links import Monitor
 from .mail import Ask, Chain, Envelope, Item, ReplyHandle
-from .message import Message
+from .message import Message, require_message
 from .timers import Timer
 from .topics import NOT_TAKEN, publish
 
@@ -101,9 +101,9 @@ class ActorContext:
         cell.admit(cell, Envelope(message, self.cell))
 
     async def send(self, cell: Cell, message: Message[Any]) -> None:
-        """Send and wait until it is accepted."""
+        """Send and wait until it is accepted. Nobody waits for room at itself: that raises MailboxFull, as a tell."""
         self._alive()
-        while (room := cell.room()) is not None:
+        while cell is not self.cell and (room := cell.room()) is not None:
             await room
             self._alive()
         if type(message) not in cell.table:
@@ -193,10 +193,15 @@ class ActorContext:
         self._promised = None
 
     async def publish(self, topic: str, message: Message[Any]) -> None:
-        """Publish from this actor, and return when every subscriber has accepted; it waits for room at bounded ones."""
+        """Publish from this actor, and return when every subscriber has accepted; it waits for room at bounded ones.
+
+        Not at itself, for it would wait for its own turn: without recovery what finds its own mailbox full is a dead
+        letter there.
+        """
         uplink = self.cell.node.uplink
         if uplink is not None:  # The subscribers are known to the root only.
             self._alive()
+            require_message(topic, message)
             await uplink.publish(topic, message, self.cell)
             return
 
@@ -207,7 +212,7 @@ class ActorContext:
                 self._alive()  # Else it is this life that is over, and no fault of the subscriber's.
                 raise
 
-        await publish(self.cell.node, topic, message, send)
+        await publish(self.cell.node, topic, message, send, self.cell)
 
     async def flush(self) -> None:
         """Release what this turn has sent so far (a journaled actor otherwise releases at the end of the turn)."""
@@ -420,7 +425,8 @@ class ActorContext:
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         self.cell.extra().tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
-            self.cell.push(Piped(None, error.__cause__ if isinstance(error.__cause__, SystemExit) else error))
+            cause = error.__cause__
+            self.cell.push(Piped(None, cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error))
 
 
 async def contained(work: Coroutine[Any, Any, T]) -> T:
@@ -455,8 +461,6 @@ class Piped(Item):
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         if item.message is None:
-            if isinstance(item.error, KeyboardInterrupt):
-                raise remote_crash(item.error) from item.error
             raise item.error
         return actor._table[type(item.message)](actor, item.message)
 

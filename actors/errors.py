@@ -32,20 +32,67 @@ HoldfastError
 ├── TreeFailed           the root supervisor gave up
 └── Refusal              a handler's typed "no" (`message.py`)
 
-Arguments equal parameters in each class, so the codec can rebuild an error in another process.
+Arguments equal fields in each class, so the codec can rebuild an error in another process.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
-from typing import Any
+from copy import copy
+from typing import Any, ClassVar
+
+from typing_extensions import dataclass_transform
 
 LONGEST_TEXT = 64 * 1024
 """Characters of an error's text or traceback that are kept."""
 
 
+@dataclass_transform(eq_default=False)
 class HoldfastError(Exception):
-    """Base of every error holdfast raises."""
+    """Base of every error holdfast raises.
+
+    A subclass declares its fields as a dataclass does, and what it says as `text`, a format string of them. The fields
+    are its arguments (`args`), all of them, so that it can be made again in another process. A class without fields
+    takes what an exception takes.
+
+    >>> class TooHot(HoldfastError, text="{room} has {degrees:.0f} degrees"):
+    ...     room: str
+    ...     degrees: float = 40.0
+    >>> str(TooHot("the kitchen")), TooHot(room="the bath", degrees=45.2).args
+    ('the kitchen has 40 degrees', ('the bath', 45.2))
+    """
+
+    _text: ClassVar[str] = ""
+    _fields: ClassVar[tuple[str, ...]] = ()
+
+    def __init_subclass__(cls, *, text: str = "", **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls._text = text or cls._text
+        own = (name for name, kind in inspect.get_annotations(cls).items() if "ClassVar" not in str(kind))
+        cls._fields = tuple(dict.fromkeys((*cls._fields, *own)))
+
+    def __init__(self, *args: Any, **named: Any) -> None:
+        names = self._fields
+        if named or (names and len(args) != len(names)):
+            args = self._bound(args, named)
+        super().__init__(*args)
+        self.__dict__.update(zip(names, args, strict=False))
+
+    def _bound(self, args: tuple[Any, ...], named: dict[str, Any]) -> tuple[Any, ...]:
+        """All values, in the order of the fields; TypeError as a function that takes them would raise it."""
+        kind, names = type(self), self._fields
+        given = dict(zip(names, args, strict=False))
+        wrong = [f"{name!r} twice" for name in named if name in given]
+        wrong += [f"an unknown {name!r}" for name in named if name not in names]
+        given |= named
+        wrong += [f"no {name!r}" for name in names if name not in given and not hasattr(kind, name)]
+        if len(args) > len(names) or wrong:
+            raise TypeError(f"{kind.__name__}({', '.join(names)}) got {'; '.join(wrong) or f'{len(args)} arguments'}")
+        return tuple(given[name] if name in given else copy(getattr(kind, name)) for name in names)
+
+    def __str__(self) -> str:
+        return self._text.format_map(vars(self)) if self._text else super().__str__()
 
 
 class SendError(HoldfastError):
@@ -55,83 +102,65 @@ class SendError(HoldfastError):
 class ActorStopped(SendError):
     """The address has ended for good: start the actor again, or send elsewhere."""
 
-    def __init__(self, actor: str, reason: str = "") -> None:
-        super().__init__(actor, reason)
-        self.actor, self.reason = actor, reason
+    actor: str
+    reason: str = ""
 
     def __str__(self) -> str:
         why = f" ({self.reason})" if self.reason else ""
         return f"{self.actor} has stopped{why}; the message was not handled"
 
 
-class MailboxFull(SendError):
+class MailboxFull(SendError, text="mailbox of {actor} is full (capacity {capacity} messages)"):
     """The mailbox is at capacity: wait, shed load, or raise the capacity."""
 
-    def __init__(self, actor: str, capacity: int) -> None:
-        super().__init__(actor, capacity)
-        self.actor, self.capacity = actor, capacity
-
-    def __str__(self) -> str:
-        return f"mailbox of {self.actor} is full (capacity {self.capacity} messages)"
+    actor: str
+    capacity: int
 
 
 class UnknownMessage(SendError):
     """The receiver's class has no handler for this message type."""
 
-    def __init__(self, actor: str, message: str) -> None:
-        super().__init__(actor, message)
-        self.actor, self.message = actor, message
+    actor: str
+    message: str
 
     def __str__(self) -> str:
         return f"{self.actor} has no handler for {self.message}; add one with @on({self.message.rpartition('.')[2]})"
 
 
-class BadMessage(SendError):
+class BadMessage(SendError, text="{message} to {actor}: {problem}"):
     """The message cannot be coded as its type says."""
 
-    def __init__(self, actor: str, message: str, problem: str) -> None:
-        super().__init__(actor, message, problem)
-        self.actor, self.message, self.problem = actor, message, problem
-
-    def __str__(self) -> str:
-        return f"{self.message} to {self.actor}: {self.problem}"
+    actor: str
+    message: str
+    problem: str
 
 
 class AskDeadlock(SendError):
     """The receiver is itself waiting, directly or through others, for the asker."""
 
-    def __init__(self, actor: str, chain: tuple[str, ...]) -> None:
-        super().__init__(actor, tuple(chain))
-        self.actor, self.chain = actor, tuple(chain)
+    actor: str
+    chain: tuple[str, ...]
 
     def __str__(self) -> str:
         way = " -> ".join((*reversed(self.chain), self.actor))
         return f"ask to {self.actor} would wait for itself ({way}); use tell, or ask from outside the turn"
 
 
-class ActorRestarting(SendError):
+class ActorRestarting(SendError, text="{actor} is being restarted; the message was not sent, try again"):
     """The receiver is between two lives, or being recovered, and the asker said `restarting="fail"`."""
 
-    def __init__(self, actor: str) -> None:
-        super().__init__(actor)
-        self.actor = actor
-
-    def __str__(self) -> str:
-        return f"{self.actor} is being restarted; the message was not sent, try again"
+    actor: str
 
 
-class WrongThread(SendError):
+class WrongThread(
+    SendError,
+    text="{actor} was called from thread {thread!r}, but its system runs in another one, and nothing was "
+    "sent: use a handle made by system.from_thread() in threads",
+):
     """An actor was called from another thread than its system's: nothing was sent. Use `system.from_thread()` there."""
 
-    def __init__(self, actor: str, thread: str) -> None:
-        super().__init__(actor, thread)
-        self.actor, self.thread = actor, thread
-
-    def __str__(self) -> str:
-        return (
-            f"{self.actor} was called from thread {self.thread!r}, but its system runs in another one, and nothing was "
-            "sent: use a handle made by system.from_thread() in threads"
-        )
+    actor: str
+    thread: str
 
 
 class AskTimeout(HoldfastError):
@@ -140,24 +169,20 @@ class AskTimeout(HoldfastError):
     `handled` is False when the turn never started (safe to send again), None when that is unknown.
     """
 
-    def __init__(self, actor: str, seconds: float, handled: bool | None = None) -> None:
-        super().__init__(actor, seconds, handled)
-        self.actor, self.seconds, self.handled = actor, seconds, handled
+    actor: str
+    seconds: float
+    handled: bool | None = None
 
     def __str__(self) -> str:
         known = "it was not handled" if self.handled is False else "it may have been handled"
         return f"{self.actor} did not reply within {self.seconds:g} s; {known}"
 
 
-class AskFailed(HoldfastError):
+class AskFailed(HoldfastError, text="{actor} ended while it handled the message: {reason}"):
     """The receiver ended in the middle of the turn: whether it took effect is unknown."""
 
-    def __init__(self, actor: str, reason: str) -> None:
-        super().__init__(actor, reason)
-        self.actor, self.reason = actor, reason
-
-    def __str__(self) -> str:
-        return f"{self.actor} ended while it handled the message: {self.reason}"
+    actor: str
+    reason: str
 
 
 class RemoteCrash(HoldfastError):
@@ -192,9 +217,10 @@ class ReplayDiverged(HoldfastError):
     `cause` says what it did, where that is known; else its `output` differs, counted from 1.
     """
 
-    def __init__(self, actor: str, turn: int, output: int, cause: str = "") -> None:
-        super().__init__(actor, turn, output, cause)
-        self.actor, self.turn, self.output, self.cause = actor, turn, output, cause
+    actor: str
+    turn: int
+    output: int
+    cause: str = ""
 
     def __str__(self) -> str:
         where = f"replay of {self.actor} diverged at turn {self.turn}"
@@ -210,33 +236,27 @@ DIVERGES = (
 """Why a replay goes another way."""
 
 
-class Quarantined(HoldfastError):
+class Quarantined(
+    HoldfastError, text="{actor}'s process died {deliveries} times in a row while it handled this message"
+):
     """The message ended its actor's process again and again; it was put aside."""
 
-    def __init__(self, actor: str, deliveries: int) -> None:
-        super().__init__(actor, deliveries)
-        self.actor, self.deliveries = actor, deliveries
-
-    def __str__(self) -> str:
-        return f"{self.actor}'s process died {self.deliveries} times in a row while it handled this message"
+    actor: str
+    deliveries: int
 
 
-class StartFailed(HoldfastError):
+class StartFailed(HoldfastError, text="{actor} could not be started: {reason}"):
     """An actor could not be started; `reason` is its exit reason in words."""
 
-    def __init__(self, actor: str, reason: str) -> None:
-        super().__init__(actor, reason)
-        self.actor, self.reason = actor, reason
-
-    def __str__(self) -> str:
-        return f"{self.actor} could not be started: {self.reason}"
+    actor: str
+    reason: str
 
 
 class StartIgnored(StartFailed):
     """An actor did not want to be started (it raised `Ignore`): to a supervisor that is no failure."""
 
-    def __init__(self, actor: str, reason: str = "") -> None:
-        super().__init__(actor, reason)
+    actor: str
+    reason: str = ""
 
     def __str__(self) -> str:
         return f"{self.actor} does not want to be started{f': {self.reason}' if self.reason else ''}"
@@ -248,151 +268,104 @@ class Ignore(HoldfastError):
     Its supervisor keeps the spec of a permanent or transient child, without a life, and drops that of a temporary one.
     """
 
-    def __init__(self, why: str = "") -> None:
-        super().__init__(why)
-        self.why = why
+    why: str = ""
 
     def __str__(self) -> str:
         return self.why or "not to be started"
 
 
-class ControlFailed(HoldfastError):
+class ControlFailed(HoldfastError, text="{order} of {actor} failed: {problem}"):
     """An order to a live actor could not be carried out; the actor goes on as before."""
 
-    def __init__(self, actor: str, order: str, problem: str) -> None:
-        super().__init__(actor, order, problem)
-        self.actor, self.order, self.problem = actor, order, problem
-
-    def __str__(self) -> str:
-        return f"{self.order} of {self.actor} failed: {self.problem}"
+    actor: str
+    order: str
+    problem: str
 
 
 class NotSuspended(ControlFailed):
     """The order is for suspended actors only."""
 
-    def __init__(self, actor: str, order: str) -> None:
-        super().__init__(actor, order, "the actor must be suspended first")
-        self.args = (actor, order)
+    problem: str = "the actor must be suspended first"
 
 
-class CannotMove(HoldfastError):
+class CannotMove(HoldfastError, text="{actor} cannot be moved: {why}"):
     """An actor was not moved to where it was to live; it goes on where it was, as it was."""
 
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return f"{self.actor} cannot be moved: {self.why}"
+    actor: str
+    why: str
 
 
-class NotGranted(HoldfastError):
+class NotGranted(
+    HoldfastError,
+    text="{by} lives in a process and may not order {actor} ({order}): orders go to what it has started and "
+    "to what it is bound to, child(..., bindings={{'port': {actor!r}}})",
+):
     """An actor in a process gave an order (stop, start a child) to one it has not started: bind it to that one."""
 
-    def __init__(self, actor: str, order: str, by: str) -> None:
-        super().__init__(actor, order, by)
-        self.actor, self.order, self.by = actor, order, by
-
-    def __str__(self) -> str:
-        return (
-            f"{self.by} lives in a process and may not order {self.actor} ({self.order}): orders go to what it has "
-            f"started and to what it is bound to, child(..., bindings={{'port': {self.actor!r}}})"
-        )
+    actor: str
+    order: str
+    by: str
 
 
-class NameTaken(HoldfastError):
+class NameTaken(HoldfastError, text="{actor} exists already; choose another name or stop it first"):
     """A living actor has this name already."""
 
-    def __init__(self, actor: str) -> None:
-        super().__init__(actor)
-        self.actor = actor
-
-    def __str__(self) -> str:
-        return f"{self.actor} exists already; choose another name or stop it first"
+    actor: str
 
 
-class NoSuchActor(HoldfastError):
+class NoSuchActor(HoldfastError, text="there is no actor at {actor}"):
     """Nobody lives at this address."""
 
-    def __init__(self, actor: str) -> None:
-        super().__init__(actor)
-        self.actor = actor
-
-    def __str__(self) -> str:
-        return f"there is no actor at {self.actor}"
+    actor: str
 
 
-class WrongActor(HoldfastError):
+class WrongActor(HoldfastError, text="{actor} is a {found}, not a {expected}"):
     """An actor of another class lives at this address."""
 
-    def __init__(self, actor: str, expected: str, found: str) -> None:
-        super().__init__(actor, expected, found)
-        self.actor, self.expected, self.found = actor, expected, found
-
-    def __str__(self) -> str:
-        return f"{self.actor} is a {self.found}, not a {self.expected}"
+    actor: str
+    expected: str
+    found: str
 
 
-class SpecError(HoldfastError):
+class SpecError(HoldfastError, text="{where}: {problem}"):
     """A child specification or an option is not valid."""
 
-    def __init__(self, where: str, problem: str) -> None:
-        super().__init__(where, problem)
-        self.where, self.problem = where, problem
-
-    def __str__(self) -> str:
-        return f"{self.where}: {self.problem}"
+    where: str
+    problem: str
 
 
-class UnsavableValue(HoldfastError):
+class UnsavableValue(
+    HoldfastError,
+    text="{where}: {problem} cannot be saved; make it a key variable of a supported type, name it with a "
+    "leading underscore, or define get_state/set_state",
+):
     """A value that no snapshot can hold: `where` is the path to it, `problem` what sits there."""
 
-    def __init__(self, where: str, problem: str) -> None:
-        super().__init__(where, problem)
-        self.where, self.problem = where, problem
-
-    def __str__(self) -> str:
-        return (
-            f"{self.where}: {self.problem} cannot be saved; make it a key variable of a supported type, "
-            "name it with a leading underscore, or define get_state/set_state"
-        )
+    where: str
+    problem: str
 
 
-class DamagedValue(HoldfastError):
+class DamagedValue(HoldfastError, text="a saved value cannot be read: {problem}; use an older one"):
     """Saved bytes that cannot be read: cut short, altered, of another format, or of a class that is no longer there."""
 
-    def __init__(self, problem: str) -> None:
-        super().__init__(problem)
-        self.problem = problem
-
-    def __str__(self) -> str:
-        return f"a saved value cannot be read: {self.problem}; use an older one"
+    problem: str
 
 
 class StoreError(HoldfastError):
     """The store could not keep what must be kept, or not give it back; see `checkpoint/journal.py`."""
 
 
-class ProcessUnavailable(HoldfastError):
+class ProcessUnavailable(HoldfastError, text="{problem}"):
     """No OS process could be had for an actor."""
 
-    def __init__(self, problem: str) -> None:
-        super().__init__(problem)
-        self.problem = problem
-
-    def __str__(self) -> str:
-        return self.problem
+    problem: str
 
 
-class TreeFailed(HoldfastError):
+class TreeFailed(HoldfastError, text="the tree of {system} gave up: {reason}"):
     """The root supervisor reached its restart intensity and gave up."""
 
-    def __init__(self, system: str, reason: str) -> None:
-        super().__init__(system, reason)
-        self.system, self.reason = system, reason
-
-    def __str__(self) -> str:
-        return f"the tree of {self.system} gave up: {self.reason}"
+    system: str
+    reason: str
 
 
 def format_error(error: BaseException) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import signal
 from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
@@ -163,8 +164,7 @@ def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorCon
     try:
         actor.__init__(*start.args, **start.kwargs)
     except BaseException as error:
-        if isinstance(error, KeyboardInterrupt):
-            raise
+        pass_on(cell, error)
         ctx.close()
         _kill_orphans(cell)
         if cell.more is not None:
@@ -280,8 +280,23 @@ class Kill(Item):
         return LEAVE
 
 
+def pass_on(cell: Cell, error: BaseException) -> None:
+    """Let Ctrl+C end the program, too, where Python's own handler raises it wherever it strikes.
+
+    `run`, `asyncio.run` and processes of actors have handlers of their own: there, what is raised here was raised by
+    the actor, or is the second Ctrl+C of a program that stops already, and ends nothing but this life.
+    """
+    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        cell.node.loop.call_soon(_raise, error)  # Behind this slice: the run loop must be fit to stop all in order.
+
+
+def _raise(error: BaseException) -> None:
+    raise error
+
+
 def crash(cell: Cell, item: Any, error: BaseException) -> None:
     """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
+    pass_on(cell, error)
     if isinstance(error, Ignore) and hasattr(item, "ignored") and item.ignored(cell, error.why):
         finish(cell, NORMAL, is_orderly=False)  # No crash: it does not want to live.
         return

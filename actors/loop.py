@@ -335,8 +335,6 @@ def run_turns(cell: Cell, most: int) -> int:
         cell.node.refused(cell, item, no)
         return 1
     except BaseException as error:  # Whatever user code raises ends this life, and only this life.
-        if isinstance(error, KeyboardInterrupt):
-            raise
         lives.crash(cell, cell.item, error)  # Not `item`: that may have been forwarded or stashed.
         return 0
     return count or 1

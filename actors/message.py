@@ -15,7 +15,7 @@ from typing import Any, Generic, get_args, get_origin
 import msgspec
 from typing_extensions import TypeVar, dataclass_transform
 
-from .errors import HoldfastError, type_name
+from .errors import BadMessage, HoldfastError, type_name
 
 R = TypeVar("R", default=None, covariant=True)
 
@@ -55,6 +55,16 @@ def why_no_message(value: object) -> str:
         "messages are instances of a class of their own: class MyMessage(hf.Message[...]), "
         "and a handler with @on(MyMessage)"
     )
+
+
+def require_message(to: str, value: object) -> None:
+    """Refuse what is no message.
+
+    Raises:
+        BadMessage: it is none; what to send instead.
+    """
+    if problem := why_no_message(value):
+        raise BadMessage(to, type_name(type(value)), problem)
 
 
 def message_of(item: object) -> Message[Any] | None:
@@ -122,7 +132,6 @@ def _resolve(declared: Any, kind: type) -> Any:
     return declared
 
 
-@dataclass_transform()
 class Refusal(HoldfastError):
     """A typed "no": raised in a handler it is the reply, and the actor lives on.
 
@@ -136,17 +145,6 @@ class Refusal(HoldfastError):
 
     _schema: typing.ClassVar[type[msgspec.Struct] | None] = None
 
-    def __init__(self, *args: Any, **fields: Any) -> None:
-        values = type(self)._fields(*args, **fields)
-        super().__init__(*(getattr(values, name) for name in values.__struct_fields__))
-        for name in values.__struct_fields__:
-            setattr(self, name, getattr(values, name))
-
-    @classmethod
-    def _fields(cls, *args: Any, **fields: Any) -> msgspec.Struct:
-        """The fields, checked by name and number (not by type: the checkers and the codec do that)."""
-        return cls.schema()(*args, **fields)
-
     @classmethod
     def schema(cls) -> type[msgspec.Struct]:
         """The struct that codes this refusal's fields; made with the first use, when all names are known."""
@@ -159,6 +157,8 @@ class Refusal(HoldfastError):
         return cls._schema
 
     def __str__(self) -> str:
+        if self._text:
+            return super().__str__()
         names = type(self).schema().__struct_fields__
         inner = ", ".join(f"{name}={getattr(self, name)!r}" for name in names)
         return f"{type(self).__name__}({inner})"

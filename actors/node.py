@@ -28,6 +28,7 @@ from .topics import Topics
 
 if TYPE_CHECKING:
     from .actor import Actor, Start
+    from .overdue import Overdue
     from .ref import ActorRef
 
 A = TypeVar("A", bound="Actor")
@@ -69,6 +70,7 @@ class Node(RunLoop):
         self.root: Cell | None = None
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
+        self.overdue: Overdue | None = None  # in an actor process: who ends it when it is blocked
         self.here: Host = LOCAL  # lives in this very process
         self.awaited: dict[str, list[Callable[[], None]]] = {}  # what is done when somebody comes to live at a path
         self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
@@ -78,6 +80,13 @@ class Node(RunLoop):
         self._seeds = random.Random(seed)
         self._numbers = itertools.count(1)
         self._turns = itertools.count(1)
+
+    def begin_limit(self, what: str, seconds: float) -> Callable[[], None]:
+        """Somebody keeps a time limit by a timer here; what is returned is called when it is void.
+
+        In an actor process that has a thread of its own blocked beyond it ends; see `overdue.py`.
+        """
+        return self.overdue.begin(what, seconds) if self.overdue is not None else _void
 
     async def close(self) -> None:
         """End every runner, and what still waits for its time."""
@@ -263,6 +272,10 @@ class Node(RunLoop):
         else:  # One turn sees one target, also if it waits meanwhile.
             more.turn.rebinds = {**(more.turn.rebinds or {}), port: target}
         cell.host.told(cell, "bind", {"port": port, "target": target.path})
+
+
+def _void() -> None:
+    """Nobody watches."""
 
 
 def begin_with(cell: Cell, start: Start[Any]) -> None:

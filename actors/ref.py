@@ -77,6 +77,8 @@ class ActorRef(Generic[A_co]):
         cell.node.check_thread(cell.path)
         while (room := cell.room()) is not None:
             await room
+        if type(message) not in cell.table:
+            cell.require(message)
         accepted = cell.host.offer(cell, message)
         if accepted is not None:
             await accepted

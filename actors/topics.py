@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from .errors import ActorStopped, MailboxFull, StoreError, UnknownMessage
+from .message import require_message
 
 if TYPE_CHECKING:
     from .cell import Cell
@@ -53,7 +54,13 @@ class Topics:
         return sorted(self._cells)
 
 
-async def publish(node: Node, topic: str, message: Message[Any], send: Callable[[Cell], Awaitable[None]]) -> None:
+async def publish(
+    node: Node,
+    topic: str,
+    message: Message[Any],
+    send: Callable[[Cell], Awaitable[None]],
+    publisher: Cell | None = None,
+) -> None:
     """Send to every subscriber, and return when each has accepted.
 
     Each gets it as soon as it has room: one that is full holds the publisher back, not the others. Whoever does not
@@ -61,12 +68,18 @@ async def publish(node: Node, topic: str, message: Message[Any], send: Callable[
 
     Args:
         send: sends the message to one cell; raises one of `NOT_TAKEN` if that does not take it.
+        publisher: an actor that publishes in its turn, which makes no room while it waits: `send` decides at once.
+
+    Raises:
+        BadMessage: this is no message.
     """
+
+    require_message(topic, message)
 
     async def send_to(cell: Cell) -> None:
         try:
             while node.topics.has(topic, cell):
-                room = cell.room()
+                room = None if cell is publisher else cell.room()
                 if room is None:
                     await send(cell)
                     break
@@ -77,7 +90,7 @@ async def publish(node: Node, topic: str, message: Message[Any], send: Callable[
     waiting: list[asyncio.Task[None]] = []
     try:
         for cell in node.topics.subscribers(topic):
-            if cell.has_room:
+            if cell is publisher or cell.has_room:
                 await send_to(cell)
             else:
                 waiting.append(node.loop.create_task(send_to(cell), name=f"publish to {cell.path}"))

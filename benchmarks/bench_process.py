@@ -182,6 +182,35 @@ async def start(run: Run) -> None:
             await run.compare("a process spawned until its first answer", ours, limit, unit="ms", target=0.5)
 
 
+async def first(run: Run) -> None:
+    """What the first process of a program costs, its fork server included; both programs are new ones each time."""
+
+    def ours() -> float:
+        return run.fresh("first_ours", {"PYTHONDONTWRITEBYTECODE": ""})
+
+    def limit() -> float:
+        return run.fresh("first_limit")
+
+    await run.compare("the first process until its first answer", ours, limit, unit="ms", target=0.3)
+    run.bound(
+        "the first process until its first answer, absolute", min(ours() for _ in range(3)), unit="ms", target=300
+    )
+
+
+async def first_ours(run: Run) -> float:
+    """Milliseconds."""
+    async with hf.ActorSystem("bench", log=False) as system:
+        began = time.perf_counter()
+        ref = await start_process(system, "echo", hf.start(Echo))
+        await ref.ask(ECHO)
+        return (time.perf_counter() - began) * 1e3
+
+
+async def first_limit(run: Run) -> float:
+    """Milliseconds until a bare process of the fork server of `multiprocessing` has answered."""
+    return limits.first_process() * 1e3
+
+
 async def recover(run: Run) -> None:
     times, queued = 3 if run.quick else 10, 10
     vault = hf.supervisor(
@@ -230,6 +259,11 @@ async def recover(run: Run) -> None:
 
 if __name__ == "__main__":
     main(
-        [ask_one, ask_hundred, tell, ask_sibling, array, start, recover],
-        {"array_ours": array_ours, "array_limit": array_limit},
+        [ask_one, ask_hundred, tell, ask_sibling, array, start, first, recover],
+        {
+            "array_ours": array_ours,
+            "array_limit": array_limit,
+            "first_ours": first_ours,
+            "first_limit": first_limit,
+        },
     )

@@ -433,6 +433,24 @@ class ForkServer:
         return await self.start()
 
 
+FIRST: Final = """
+import multiprocessing, operator, time
+context = multiprocessing.get_context("forkserver")
+ours, theirs = context.Pipe()
+process = context.Process(target=operator.methodcaller("send_bytes", b"x"), args=(theirs,))
+began = time.perf_counter()
+process.start()
+ours.recv_bytes()
+print(time.perf_counter() - began)
+process.join()
+"""
+
+
+def first_process() -> float:
+    """Seconds until a first process of `multiprocessing` has answered, its fork server included; it imports nothing."""
+    return float(subprocess.run([sys.executable, "-c", FIRST], stdout=subprocess.PIPE, check=True).stdout)
+
+
 ROLES: Final[dict[str, Callable[[socket.socket], None]]] = {"echo": serve, "fork-server": serve_forks}
 
 if __name__ == "__main__":

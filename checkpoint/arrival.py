@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..actors.errors import HoldfastError
 from ..actors.events import SnapshotTaken
+from ..actors.message import message_name
 from .records import Snapshot, SnapshotNow
 from .saved import cut
 
@@ -41,6 +42,10 @@ class Arrival:
         except HoldfastError as error:
             self._refused(record, error)
             return
+        becomes = home.becomes
+        kind = "" if becomes is None or not record.is_replaced else message_name(becomes.kind)
+        if becomes is not None and home.cell is not None and record.kind == kind:
+            home.node.respec(home.cell, becomes)  # Now: the answer to whoever has replaced the code may never come.
         home.limit.cut()
         home.due.kept(record.turn)
         if home.node.watched:

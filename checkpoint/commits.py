@@ -301,7 +301,16 @@ class Commits:
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "holdfast-sync")
         written = self._written
-        self._syncing = self._loop.run_in_executor(self._thread, self.engine.sync)
+        try:
+            self._syncing = self._loop.run_in_executor(self._thread, self.engine.sync)
+        except RuntimeError:  # No thread can be started now: everybody waits for the disk, this once.
+            self._syncing = self._loop.create_future()
+            try:
+                self.engine.sync()
+            except Exception as error:
+                self._syncing.set_exception(error)
+            else:
+                self._syncing.set_result(None)
         self._syncing.add_done_callback(functools.partial(self._synced_to, written), context=self._context)
 
     def _synced_to(self, number: int, done: asyncio.Future[None]) -> None:

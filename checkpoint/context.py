@@ -16,7 +16,7 @@ from ..actors.errors import ControlFailed, HoldfastError, remote_crash
 from ..actors.exits import NORMAL, ExitReason
 from ..actors.links import Monitor
 from ..actors.mail import Ask, Item, ReplyHandle
-from ..actors.message import Message, message_name
+from ..actors.message import Message, message_name, require_message
 from ..actors.ref import ActorRef, current
 from .records import Feed, PipeDone
 from .turns import INIT, STARTED, Fed
@@ -185,6 +185,7 @@ class RecordedContext(ActorContext):
             self._outside()
             await super().publish(topic, message)
             return
+        require_message(topic, message)
         body = self.cell.node.codec.encode_alike(message, topic)
         k = self.recorded.put("publish", topic, message_name(type(message)), body)
         if self.waits_for_room(topic):

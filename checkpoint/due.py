@@ -18,15 +18,11 @@ FIRST_RETRY, LONGEST_RETRY = 0.25, 60.0
 """Seconds until a failed snapshot is tried again; doubled each time, and never more often than the interval."""
 
 
-class CheckpointFailed(HoldfastError):
+class CheckpointFailed(HoldfastError, text="{actor} could not be saved: {reason}"):
     """The snapshot that was asked for could not be made or kept; what was there before still is."""
 
-    def __init__(self, actor: str, reason: str) -> None:
-        super().__init__(actor, reason)
-        self.actor, self.reason = actor, reason
-
-    def __str__(self) -> str:
-        return f"{self.actor} could not be saved: {self.reason}"
+    actor: str
+    reason: str
 
 
 def retry_after(failures: int, interval: float) -> float:

@@ -26,15 +26,10 @@ RESTORING = "restoring group"
 """The fact that names the group whose homes are being replaced."""
 
 
-class NoSuchGroup(HoldfastError):
+class NoSuchGroup(HoldfastError, text="there is no group snapshot {name!r}; checkpoint_group() makes one"):
     """No snapshot of a group has this name."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
-        self.name = name
-
-    def __str__(self) -> str:
-        return f"there is no group snapshot {self.name!r}; checkpoint_group() makes one"
+    name: str
 
 
 class Image(msgspec.Struct, array_like=True, frozen=True):

@@ -363,6 +363,8 @@ class InnerLifeHost(LifeHost):
         self._say_closed(cell)
         if life is not None and life.ignored_why is not None:
             self._fail(cell, StartIgnored(cell.path, life.ignored_why))
+        elif life is not None and life.is_live and self._up is not None and not self._up.done():
+            self._up.set_result(None)  # It was up, and has ended in a turn before its home could say so.
         else:
             self._fail(cell, StartFailed(cell.path, str(cell.extra().reason)))
 

@@ -21,7 +21,7 @@ from .forgotten import forget_turns
 from .groups import Groups
 from .inputs import HomeJournal
 from .journal import Journal, Saved
-from .method import Durability, Method
+from .method import Durability, Method, hybrid
 from .quarantine import PLACE, Quarantine
 from .records import START
 from .recovery.held import hold, inlet, let_go
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from ..actors.node import Node
 
 ENDED = "it ended before it was live"
+ERASED = "what was recorded of it has been erased"
 ERASING = "erasing"
 """The fact that names the address whose tree is being erased."""
 
@@ -57,10 +58,10 @@ class Homes:
         self.planted: dict[str, Saved] = {}  # what the next life at an address begins with, whatever is recorded
         unfinished = journal.notes(ERASING).get(ERASING)
         self._stored = set(journal.addresses()) - {PLACE}
-        if unfinished is not None:  # This process's predecessor died in the middle of it.
-            self._erase_tree(unfinished.decode())
         self.groups = Groups(self)
         self.rejoin = Rejoin(self)
+        if unfinished is not None:  # This process's predecessor died in the middle of it.
+            self._erase_tree(unfinished.decode())
 
     def of(self, cell: Cell, method: Method) -> Switch:
         """The home of an address; taken up from the store when it is first asked for.
@@ -225,6 +226,8 @@ class Homes:
         self.journal.note(ERASING, None)
 
     def _erase(self, path: str) -> None:
+        if path in self._stored and path not in self._switches:
+            self._tell_stored(path, ERASED)
         self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
         self.quarantine.forget(path)
         self._stored.discard(path)
@@ -233,7 +236,20 @@ class Homes:
         self.planted.pop(path, None)
         switch = self._switches.pop(path, None)
         if switch is not None:
-            switch.ends.erased("what was recorded of it has been erased")
+            switch.ends.erased(ERASED)
+
+    def _tell_stored(self, path: str, why: str) -> None:
+        """Tell whoever waits at an address where nobody has been started since the root began: it is erased."""
+        cell = self.node.cell_at(path)
+        try:
+            switch = self.made(cell, hybrid())
+        except HoldfastError as error:
+            self.node.emit(RecoveryFailed(path, f"what waits there is not told that it has been erased: {error}"))
+            return
+        switch.rejoin = self.rejoin
+        self.rejoin.loaded(switch)
+        switch.ends.drop_all(why)
+        switch.images.close()
 
     def blame(self, path: str) -> None:
         """The supervisor above this address ends because of the actor there."""
@@ -472,7 +488,9 @@ class HomeHost:
         try:
             restore_seconds = await live
             if switch.port is None:  # It was over before anybody came to look.
-                raise StartFailed(cell.path, ENDED)
+                if switch.waits_for_release:
+                    raise StartFailed(cell.path, ENDED)
+                return  # It was up, and has ended in a turn: that is told by its end, and no start has failed.
             clock.mark("replay", switch.live_at)
             await self._let_at(switch, clock, restore_seconds)
         except HoldfastError as error:

@@ -31,9 +31,8 @@ Entry: TypeAlias = "tuple[Primitive, ...]"
 class StoreInUse(StoreError):
     """A live process has the store open: stop it, or open with `takeover=True`."""
 
-    def __init__(self, path: str, pid: int) -> None:
-        super().__init__(path, pid)
-        self.path, self.pid = path, pid
+    path: str
+    pid: int
 
     def __str__(self) -> str:
         if not self.pid:
@@ -41,26 +40,25 @@ class StoreInUse(StoreError):
         return f"store {self.path} is open in process {self.pid}: stop it, or open with takeover=True, which kills it"
 
 
-class StaleEpoch(StoreError):
+class StaleEpoch(
+    StoreError,
+    text="store {path} was opened with epoch {epoch} and now has epoch {current}: another opening owns it, "
+    "this one acknowledges nothing any more; stop it",
+):
     """The store was opened by somebody else since: nothing is acknowledged; stop, for you are no longer its owner."""
 
-    def __init__(self, path: str, epoch: int, current: int) -> None:
-        super().__init__(path, epoch, current)
-        self.path, self.epoch, self.current = path, epoch, current
-
-    def __str__(self) -> str:
-        return (
-            f"store {self.path} was opened with epoch {self.epoch} and now has epoch {self.current}: "
-            "another opening owns it, this one acknowledges nothing any more; stop it"
-        )
+    path: str
+    epoch: int
+    current: int
 
 
 class DamagedStore(StoreError):
     """What was stored cannot be trusted: `address` and `position` say where, when that is known."""
 
-    def __init__(self, path: str, address: str | None, position: int | None, reason: str) -> None:
-        super().__init__(path, address, position, reason)
-        self.path, self.address, self.position, self.reason = path, address, position, reason
+    path: str
+    address: str | None
+    position: int | None
+    reason: str
 
     def __str__(self) -> str:
         where = f"store {self.path}"
@@ -74,29 +72,22 @@ class DamagedStore(StoreError):
         return f"{where} is damaged: {self.reason}; {remedy}"
 
 
-class StoreFailed(StoreError):
+class StoreFailed(StoreError, text="store {path} failed: {reason}"):
     """The operating system or a lock refused the store: `reason` says whether trying again makes sense."""
 
-    def __init__(self, path: str, reason: str) -> None:
-        super().__init__(path, reason)
-        self.path, self.reason = path, reason
-
-    def __str__(self) -> str:
-        return f"store {self.path} failed: {self.reason}"
+    path: str
+    reason: str
 
 
-class ForeignStore(StoreError):
+class ForeignStore(
+    StoreError, text="store {path} is not opened, and nothing in it was changed: {part}: {problem}; {remedy}"
+):
     """The store was not opened, and nothing in it was changed: a part of it is another's, or open to others."""
 
-    def __init__(self, path: str, part: str, problem: str, remedy: str) -> None:
-        super().__init__(path, part, problem, remedy)
-        self.path, self.part, self.problem, self.remedy = path, part, problem, remedy
-
-    def __str__(self) -> str:
-        return (
-            f"store {self.path} is not opened, and nothing in it was changed: "
-            f"{self.part}: {self.problem}; {self.remedy}"
-        )
+    path: str
+    part: str
+    problem: str
+    remedy: str
 
 
 class Saved(NamedTuple):

@@ -14,15 +14,11 @@ from .image import is_image, read_image
 from .method import Method
 
 
-class StateMismatch(HoldfastError):
+class StateMismatch(HoldfastError, text="the state of {actor} does not fit: {problem}"):
     """A saved state does not fit the class that shall take it back."""
 
-    def __init__(self, actor: str, problem: str) -> None:
-        super().__init__(actor, problem)
-        self.actor, self.problem = actor, problem
-
-    def __str__(self) -> str:
-        return f"the state of {self.actor} does not fit: {self.problem}"
+    actor: str
+    problem: str
 
 
 class State(NamedTuple):
@@ -241,5 +237,5 @@ def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
         raise StateMismatch(where, f"{known}, whose migrate is `async def`: it must be plain")
     try:
         return migrate(state, version)
-    except Exception as error:
+    except BaseException as error:
         raise StateMismatch(where, f"{known}, and its migrate failed: {type(error).__name__}: {error}") from error

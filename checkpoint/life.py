@@ -145,7 +145,7 @@ class Life:
                 data = b"".join(self._state)
                 self.images.last_bytes = len(data)
                 restore_state(actor, data, (self._saved_variables, self.variables))
-            except Exception as error:
+            except BaseException as error:
                 self._context_made.close()
                 cell.actor = cell.ctx = None
                 raise StartFailed(cell.path, f"its state could not be restored: {error}") from error
@@ -396,7 +396,7 @@ class Life:
                 self.images.take()
                 return
             data = save_state(actor)
-        except Exception as error:  # What the user's own `get_state` raises is no reason to lose what it has.
+        except BaseException as error:  # What the user's own `get_state` raises is no reason to lose what it has.
             self.port.to_home(Unsaved(str(error)))
             return
         self._send_snapshot(data, begin)

@@ -28,15 +28,11 @@ MOST_ENTRIES = 200
 """Entries after which what is left is written anew."""
 
 
-class NotQuarantined(HoldfastError):
+class NotQuarantined(HoldfastError, text="message {id} of {actor} is not in quarantine (any more)"):
     """It was tried again, dropped or erased meanwhile: ask for the list again."""
 
-    def __init__(self, actor: str, id: int) -> None:
-        super().__init__(actor, id)
-        self.actor, self.id = actor, id
-
-    def __str__(self) -> str:
-        return f"message {self.id} of {self.actor} is not in quarantine (any more)"
+    actor: str
+    id: int
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -16,15 +16,14 @@ if TYPE_CHECKING:
     from .life import Life
 
 
-class NotReadonly(HoldfastError):
+class NotReadonly(
+    HoldfastError, text="{actor}: the handler of {message} is declared readonly and has changed {changed}"
+):
     """A handler that is declared readonly has changed something: take `readonly=True` away, or the change."""
 
-    def __init__(self, actor: str, message: str, changed: str) -> None:
-        super().__init__(actor, message, changed)
-        self.actor, self.message, self.changed = actor, message, changed
-
-    def __str__(self) -> str:
-        return f"{self.actor}: the handler of {self.message} is declared readonly and has changed {self.changed}"
+    actor: str
+    message: str
+    changed: str
 
 
 def check_readonly(actor: Actor, life: Life) -> None:

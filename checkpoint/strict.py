@@ -36,15 +36,14 @@ TRUSTED = sys.stdlib_module_names | {PACKAGE, "anyio", "msgpack", "msgspec", "nu
 """Top packages whose own calls are their own affair."""
 
 
-class NotDeterministic(HoldfastError):
+class NotDeterministic(
+    HoldfastError, text="{what} was called at {where}: its replay would go another way; use {instead} instead"
+):
     """A strict actor asked the world for what a replay could not get again."""
 
-    def __init__(self, what: str, where: str, instead: str) -> None:
-        super().__init__(what, where, instead)
-        self.what, self.where, self.instead = what, where, instead
-
-    def __str__(self) -> str:
-        return f"{self.what} was called at {self.where}: its replay would go another way; use {self.instead} instead"
+    what: str
+    where: str
+    instead: str
 
 
 def _builtins() -> dict[int, tuple[str, str]]:

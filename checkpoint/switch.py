@@ -73,6 +73,7 @@ from .ties import Ties
 from .timers import Timers
 
 if TYPE_CHECKING:
+    from ..actors.actor import Start
     from ..actors.node import Node
     from .recovery.register import Recoveries
     from .rejoin import Rejoin
@@ -122,6 +123,7 @@ class Switch:
         self.diverged: ReplayDiverged | None = None
         self.is_void = False  # a state that was put in place from outside could not be kept: this life does not count
         self.unsaved: list[str] = []  # why, for each of those
+        self.becomes: Start[Any] | None = None  # with what the next lives begin once its class's state has come
         self.arrival = Arrival(self)
         self.positions: dict[int, list[int]] = {}  # in the journal, of what belongs to a turn besides its input
         self.dropped: list[list[int]] = []  # the same of inputs that ended without a turn

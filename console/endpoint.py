@@ -56,15 +56,11 @@ NAMED = {"compose": ("outside",), "transition": ("whole",), "update": ("mechanis
 """What comes last is named."""
 
 
-class EndpointInUse(HoldfastError):
+class EndpointInUse(HoldfastError, text="control endpoint {path}: {why}"):
     """A live process listens at this socket, or it is no socket."""
 
-    def __init__(self, path: str, why: str) -> None:
-        super().__init__(path, why)
-        self.path, self.why = path, why
-
-    def __str__(self) -> str:
-        return f"control endpoint {self.path}: {self.why}"
+    path: str
+    why: str
 
 
 @contextlib.asynccontextmanager
@@ -109,7 +105,7 @@ def claimed(path: Path) -> Generator[None, None, None]:
     try:
         yield
     finally:
-        os.unlink(beside)  # Ours, as long as we hold it.
+        remove(beside, os.fstat(file).st_ino)
         os.close(file)
 
 
@@ -129,9 +125,9 @@ def _locked(beside: Path, path: str) -> int:
             os.close(file)
             raise
         if (ours.st_dev, ours.st_ino) == (there.st_dev, there.st_ino):
-            if ours.st_uid != os.geteuid():
+            if not stat.S_ISREG(ours.st_mode) or ours.st_uid != os.geteuid() or ours.st_nlink != 1 or ours.st_size:
                 os.close(file)
-                raise EndpointInUse(path, "somebody else's lock lies beside it")
+                raise EndpointInUse(path, f"{beside} is no lock of ours: an empty file of this user, with one name")
             return file
         os.close(file)
 
@@ -142,7 +138,7 @@ def absolute(path: str | os.PathLike[str]) -> Path:
 
 
 def remove(path: Path, inode: int) -> None:
-    """Remove our socket, unless another's is there by now."""
+    """Remove what we have made, unless something else is there by now."""
     try:
         if os.lstat(path).st_ino == inode:
             os.unlink(path)
@@ -181,8 +177,7 @@ def clear(path: Path) -> None:
         code = probe.connect_ex(str(path))
     if code != errno.ECONNREFUSED:
         raise EndpointInUse(str(path), "a live process listens there")
-    if os.lstat(path).st_ino == found.st_ino:
-        os.unlink(path)
+    remove(path, found.st_ino)
 
 
 class Endpoint:
@@ -302,6 +297,8 @@ class Endpoint:
                     raise BadRequest(f"there is no operation {verb!r}")
                 named = NAMED.get(verb, ())
                 at = len(args) - len(named)
+                if at < 0:
+                    raise BadRequest(f"{verb} lacks {', '.join(named[at:])}")
                 getattr(change, verb)(*args[:at], **dict(zip(named, args[at:], strict=True)))
         steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
         return {"steps": steps, "difference": list(change.difference)}

@@ -43,15 +43,13 @@ GRACE = 35.0
 """Seconds beyond its own time limit that a request is waited for: it may have to be undone."""
 
 
-class NotReached(HoldfastError):
+class NotReached(
+    HoldfastError, text="no system answers at {path}: {why}; is it running, with a control endpoint there?"
+):
     """No running system answers at this socket."""
 
-    def __init__(self, path: str, why: str) -> None:
-        super().__init__(path, why)
-        self.path, self.why = path, why
-
-    def __str__(self) -> str:
-        return f"no system answers at {self.path}: {self.why}; is it running, with a control endpoint there?"
+    path: str
+    why: str
 
 
 class RemoteRef:

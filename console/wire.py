@@ -25,26 +25,17 @@ LARGEST = 16 * 1024 * 1024
 CREDENTIALS = struct.Struct("3i")
 
 
-class BadRequest(HoldfastError):
+class BadRequest(HoldfastError, text="this is no request: {problem}"):
     """What came over the control endpoint is no request: the connection is closed."""
 
-    def __init__(self, problem: str) -> None:
-        super().__init__(problem)
-        self.problem = problem
-
-    def __str__(self) -> str:
-        return f"this is no request: {self.problem}"
+    problem: str
 
 
-class WrongUser(HoldfastError):
+class WrongUser(HoldfastError, text="the other end runs as the user with uid {uid}, and only uid {expected} is served"):
     """The other end of the control endpoint belongs to another user."""
 
-    def __init__(self, uid: int, expected: int) -> None:
-        super().__init__(uid, expected)
-        self.uid, self.expected = uid, expected
-
-    def __str__(self) -> str:
-        return f"the other end runs as the user with uid {self.uid}, and only uid {self.expected} is served"
+    uid: int
+    expected: int
 
 
 def peer_uid(sock: socket.socket) -> int:

@@ -30,15 +30,11 @@ _ARGUMENT: Final = re.compile(r"[^\s(),]+\Z")
 _OTHER_NEGATION: Final = re.compile(r"\s*(?:!|~|-|not_|no_|NOT)\s*\(?[A-Za-z_]")
 
 
-class BadLiteral(HoldfastError):
+class BadLiteral(HoldfastError, text="{text!r}: {problem}"):
     """A text that is no literal, or a literal with a name that the model does not declare."""
 
-    def __init__(self, text: str, problem: str) -> None:
-        super().__init__(text, problem)
-        self.text, self.problem = text, problem
-
-    def __str__(self) -> str:
-        return f"{self.text!r}: {self.problem}"
+    text: str
+    problem: str
 
 
 class Literal(msgspec.Struct, frozen=True, order=True, array_like=True, cache_hash=True, gc=False):

@@ -29,6 +29,7 @@ from .messages import ConfigMismatch, StaleEpoch
 from .orders import Abort, Commit, Prepare, Quiesce, Stand
 from .trial import TRIAL, TrialFailed, tried, until_given_up
 from .trial import ended as ended_trial
+from .unkept import is_unkept
 
 if TYPE_CHECKING:
     from .group import Group
@@ -62,15 +63,11 @@ STEPS = ("try", "start", "prepare", "rest", "quiesce", "commit", "switch", "tidy
 """Where the engine may be struck by a test; undoing has `abort` instead of the last three."""
 
 
-class CannotAdapt(HoldfastError):
+class CannotAdapt(HoldfastError, text="{actor} keeps its mechanism: {why}"):
     """The mechanism stays as it was."""
 
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return f"{self.actor} keeps its mechanism: {self.why}"
+    actor: str
+    why: str
 
 
 class Reconfiguration:
@@ -319,7 +316,8 @@ class AdaptationEngine(Actor):
             return False
         self._step("quiesce")
         # All at once, and behind the batch that is out: requests wait for one way there and back, not for one each.
-        order, seconds = Quiesce(group.epoch, group.config), change.rest_within + 1.0
+        wants_copy = not change.is_back and is_unkept(group.switch.method)
+        order, seconds = Quiesce(group.epoch, group.config, wants_copy), change.rest_within + 1.0
         asked = {name: group.protocol(name).ask(order, seconds) for name in change.prepared}
         for future in asked.values():
             future.add_done_callback(_heard)  # If this is given up, nobody looks at it.
@@ -332,7 +330,10 @@ class AdaptationEngine(Actor):
                 if isinstance(error, (ConfigMismatch, StaleEpoch)):
                     change.give_up(f"{name} stands elsewhere: {error}")
                 return False
-        self._check_stands(change, {name: future.result() for name, future in asked.items()}, primary)
+        stands: dict[str, Stand] = {name: future.result() for name, future in asked.items()}
+        self._check_stands(change, stands, primary)
+        if stands[primary].turn == group.switch.turn:
+            group.take_copy(stands[primary].copy)
         return not change.why and self._is_as_prepared(change)
 
     def _check_stands(self, change: Reconfiguration, stands: dict[str, Stand], primary: str) -> None:

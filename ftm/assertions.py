@@ -19,15 +19,11 @@ from .server import Server
 PARAMETERS = frozenset({"reply", "message", "state"})
 
 
-class AssertionFailed(HoldfastError):
+class AssertionFailed(HoldfastError, text="{actor}: {why}"):
     """What was computed for a request cannot be right, whoever computed it: nothing was changed."""
 
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return f"{self.actor}: {self.why}"
+    actor: str
+    why: str
 
 
 def name_of(value: Any) -> str:

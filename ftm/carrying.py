@@ -170,6 +170,7 @@ class OutOfProcess(ToGroup):
         self.transit.over(cell, host)
         more.start = self._spec.start
         group.is_suspended = more.suspended = bool(self._rest["suspended"])
+        host.attached(cell, group)
         switch.from_life(self._state)  # What waits is fed.
         group.go_on()
         self.gone_on_at = now()

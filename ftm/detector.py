@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, ClassVar
 from ..actors.actor import Actor, on
 from ..actors.errors import SpecError
 from ..actors.own_clock import OwnClock
+from .members import is_within
 from .orders import Beat, Broken
 
 if TYPE_CHECKING:
@@ -132,8 +133,8 @@ class Detector(Actor):
         """A replica is alive."""
         group = self._group
         life = group.life_of(beat.name)
-        if not life:
-            return  # It has died since it said so.
+        if not life or not is_within(group.place(beat.name), self.ctx.sender):
+            return  # It has died since it said so; or another one has said it.
         accrual = self._known.get((beat.name, life))
         now = self._clock.at(self.ctx.cell.node.loop.time())
         if accrual is None or group.up.get(beat.name) != life:  # Or it is another replica of that name.
@@ -147,8 +148,9 @@ class Detector(Actor):
     @on(Broken)
     def broken(self, message: Broken) -> None:
         """A replica is ending: nobody needs to wait for that."""
-        if self._group.life_of(message.name) == message.life:
-            self._group.broken(message.name, message.life, message.why)
+        group = self._group
+        if group.life_of(message.name) == message.life and is_within(group.place(message.name), self.ctx.sender):
+            group.broken(message.name, message.life, message.why)
 
     def _look(self) -> None:
         if self.ctx.closed:

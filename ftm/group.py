@@ -27,11 +27,12 @@ from ..checkpoint.records import (
     Outcome,
     PipeDone,
     Released,
+    Snapshot,
     SnapshotNow,
     ToLife,
     TurnEnd,
 )  # fmt: skip
-from ..checkpoint.saved import meta_now, put
+from ..checkpoint.saved import Meta, meta_now, put
 from .background import Background
 from .detector import Detection
 from .hold import Hold
@@ -79,8 +80,11 @@ class Group(Members):
         self.inside: set[int] = set()  # inputs that a replica had that does not lead any more, not ended since
         self.out: Work | None = None
         self.number = 0
-        self.is_again = False
+        self.is_again = False  # another leader has not been sent all there is
         self.is_live = self.has_gone = False
+        self.copy: Meta | None = None  # the state that home keeps while the mechanism is not trusted
+        self.wants_copy = False
+        self._pieces: list[bytes] = []
         self.is_held = False  # nothing new goes in: nobody could take over yet
         self.is_suspended = self.is_stopping = False
         self.change: Reconfiguration | None = None  # that is being made
@@ -99,7 +103,7 @@ class Group(Members):
         self.on_ended: Callable[[dict[str, Any]], None] = lambda reason: None
         self.on_joined: Callable[[], None] = lambda: None
         self.back_to: Callable[[], Reconfiguration | None] = lambda: None  # the stack that has to come back
-        self.refuses_all: Callable[[], bool] = lambda: False  # a new stack has not let pass a single request
+        self.drops: Callable[[TurnEnd], bool] = lambda end: False  # a new stack: what it lets fall is asked for again
         self.went_back: Callable[[Reconfiguration], None] = lambda change: None
         self.on_joining: Callable[[str], None] = lambda name: None
 
@@ -157,15 +161,19 @@ class Group(Members):
         return Inward(self.epoch, records) if records else None
 
     def next_work(self) -> Work | None:
-        """The next batch, if there is something, and none is out. What was inside once is ended in any case."""
+        """The next batch, if there is something, and none is out. What was inside once is ended in any case.
+
+        Another leader is sent one even if it is empty: what it has to say of the time before waits for that.
+        """
         if self._quiet:
             self._ended(set())  # Another one may lead now, and nothing was inside the last one.
-        if self.out is not None or self.primary is None or not self.waiting or (self.has_gone and self.is_held):
+        if self.out is not None or self.primary is None:
             return None
+        is_open = not (self.has_gone and self.is_held)
         takes_new = not (self.is_suspended or self.is_stopping or self.is_resting)
         requests, go, size = list[Request](), None, 0
         lives: dict[str, int] = {}
-        while self.waiting and len(requests) < MOST_REQUESTS and size < MOST_BYTES:
+        while is_open and self.waiting and len(requests) < MOST_REQUESTS and size < MOST_BYTES:
             first = self.waiting[0]
             if not takes_new and (isinstance(first, Go) or first.id not in self.inside):
                 break
@@ -186,11 +194,11 @@ class Group(Members):
             size += len(first.body)
             if is_alone:
                 break
-        if not requests and go is None:
+        if not requests and go is None and not self.is_again:
             return None
         self.number += 1
-        self.out = Work(self.epoch, self.config, self.number, requests, go, self.is_again)
-        if not self.waiting:
+        self.out = Work(self.epoch, self.config, self.number, requests, go, self.is_again, self.wants_copy)
+        if not self.waiting or not requests:
             self.is_again = False
         return self.out
 
@@ -240,6 +248,7 @@ class Group(Members):
         """Another one is to lead: what it asks again is answered again."""
         self.inward.clear()
         self.finished.clear()
+        self._pieces.clear()
         self.switch.timers.claimed.clear()  # Its hooks want theirs again.
         self.switch.arrival.cancel()  # The last one may have died in the middle of a snapshot,
         self.switch.due.restarted()  # or before it began with it.
@@ -268,6 +277,8 @@ class Group(Members):
                 self.on_ended(record.reason)
             elif isinstance(record, Strayed):
                 self.strays.told(record.path)
+            elif isinstance(record, Snapshot) and not self.switch.method.snapshots:
+                self.take_copy([record])
             elif isinstance(record, WorkLost):
                 if self.background.is_lost(record.turn):
                     self._give_up("a turn has failed with background work (pipe_to_self) out")
@@ -288,6 +299,16 @@ class Group(Members):
             self._forget_turns()
         if done.wait:
             self.finished.append(Ended(self.epoch, done.part))
+
+    def take_copy(self, records: list[Snapshot]) -> None:
+        """The state of an actor that is not recorded, with what has led to it."""
+        for record in records:
+            self._pieces.append(record.data)
+            if record.is_last:
+                state, self._pieces = b"".join(self._pieces), []
+                meta = meta_now(self.switch, record.turn, record.stash, state)
+                self.copy = msgspec.structs.replace(meta, traps=record.traps)
+                put(self.switch, self.copy, 1)
 
     def quiet(self) -> asyncio.Future[None]:
         """A future that ends when nothing is inside any more; somebody has seen to it that nothing new goes in."""
@@ -350,7 +371,7 @@ class Group(Members):
 
     def _end(self, end: TurnEnd) -> None:
         switch = self.switch
-        if end.turn < 0 and end.status == DROPPED and self.refuses_all():
+        if end.turn < 0 and end.status == DROPPED and end.id in switch.open and self.drops(end):
             return  # It is asked of the stack before.
         if end.turn < 0 and end.status == DROPPED:  # It was handled, and nobody knows any more what came of it.
             self.ledger.pop(end.id, None)

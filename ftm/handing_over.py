@@ -102,6 +102,7 @@ class OutOfSubtree(ToGroup):
         self.transit.over(cell, host)
         cell.extra().start = self._spec.start
         group.is_suspended = more.suspended
+        host.attached(cell, group)
         switch.from_life(live)  # What waits is fed.
         group.go_on()
         self.gone_on_at = now()

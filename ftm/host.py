@@ -40,17 +40,18 @@ from .events import ReplicaLost
 from .failover import FailoverManager, why_ended
 from .group import Group, Look
 from .join import Joiner
-from .mechanism import compose
+from .mechanism import NOTHING, compose
 from .members import fault_of
 from .messages import Lead
 from .orders import Finish, Install, Setting
 from .probation import Probation
 from .proxy import Proxy, Settle
 from .steering import Steered
-from .unkept import UNKEPT, begin_afresh, forget_later, is_unkept
+from .unkept import UNKEPT, begin_afresh, begin_again, forget_later, is_unkept
 
 if TYPE_CHECKING:
     from ..checkpoint.records import TurnEnd
+    from ..checkpoint.saved import Meta
     from ..checkpoint.switch import Switch
     from .mechanism import Mechanism
 
@@ -88,6 +89,7 @@ class GroupHost(Steered):
         self._ending: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
         self._careful: set[int] = set()
+        self._copy: Meta | None = None  # the next life begins with it, though nothing is kept otherwise
         self._joined: asyncio.Future[None] | None = None
 
     @property
@@ -112,8 +114,9 @@ class GroupHost(Steered):
     def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
         opened = super().open(cell)
         switch = opened[0]
-        if is_unkept(self.method):
+        if is_unkept(self.method) and not (self._copy is not None and begin_again(switch, self._copy)):
             begin_afresh(switch)
+        self._copy = None
         return opened
 
     def topics(self, cell: Cell) -> Iterable[str]:
@@ -197,7 +200,7 @@ class GroupHost(Steered):
         group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
         group.on_joined = self._has_joined
         group.on_fault = lambda name, why, has_ended: self._at_fault(group, name, why, has_ended=has_ended)
-        group.refuses_all = lambda: self.probation is not None and self.probation.refuses_all()
+        group.drops = lambda end: self.probation is not None and self.probation.drops(end)
         group.back_to = lambda: self._back_to(group)
         group.went_back = lambda back: self._went_back(cell, group, back)
         if self.probation is not None:
@@ -279,6 +282,12 @@ class GroupHost(Steered):
             group, before, change, earlier, lambda: self._begin_going_back(cell), self._probation_over
         )  # fmt: skip
 
+    def attached(self, cell: Cell, group: Group) -> None:
+        """There was no mechanism before."""
+        change = Reconfiguration(group, self.config, self.layers, REST_WITHIN)
+        self._put_on_probation(cell, group, NOTHING, change)
+        group.copy = group.switch.newest
+
     def _probation_over(self, probation: Probation) -> None:
         if self.probation is probation:
             earlier = probation.earlier
@@ -291,6 +300,21 @@ class GroupHost(Steered):
             group.change.give_up(f"{name} has ended when it prepared it: {why}")
         if self.probation is not None and group is self.group:
             self.probation.failed(f"{name}: {why}")
+
+    def _judge(self, cell: Cell, fault: str, why: str) -> None:
+        """No replica is left: if that is the fault of a stack that is new, the next life begins with the one before."""
+        probation = self.probation
+        if probation is None or probation.is_over or not (probation.why or fault):
+            return
+        probation.why = probation.why or why
+        self.last_config += 1
+        self.layers, self.config = probation.before, self.last_config
+        self.respecified(cell)
+        probation.went_back()
+
+    def respecified(self, cell: Cell) -> None:
+        """The next lives have the stack that there is now."""
+        replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=as_spec(self.layers)))
 
     def _back_to(self, group: Group) -> Reconfiguration | None:
         """What whoever leads next has to be brought to first."""
@@ -354,8 +378,9 @@ class GroupHost(Steered):
             self._put_on_probation(cell, group, before, change)
             self.on_switched()
         elif probation is not None:
-            replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=as_spec(change.layers)))
-            probation.end(is_kept=False)
+            self.respecified(cell)
+            group.send_again()  # What the bricks have let fall; they are at rest.
+            probation.went_back()
 
     def _step(self, name: str) -> None:
         if self.on_step is not None:
@@ -521,27 +546,22 @@ class GroupHost(Steered):
         self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int = -1, *, ordered: bool = True
     ) -> None:
         """End all replicas, then the life at the address."""
-        noticed = time.monotonic()
+        noticed, copy = time.monotonic(), None if self.group is None else self.group.copy
         await self.dismantle(cell)
         self._ending = None
         if cell.state is not RUNNING:
             return
         if failed is not None:
             reason = KILLED
+        if not ordered:
+            self._copy = copy
+            self._judge(cell, fault_of(reason), f"no replica is left: {failed or reason}")
         self.life_over(cell, reason, failed, running, noticed, ordered=ordered)
 
     def life_over(
         self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int, noticed: float, *, ordered: bool
     ) -> None:
         """All replicas have ended: the life at the address is over."""
-        probation = self.probation
-        if probation is not None and not ordered and not probation.is_over and (probation.why or fault_of(reason)):
-            probation.why = probation.why or f"no replica is left: {failed or reason}"
-            # Nobody is left who could be brought back: the next life begins with the stack before.
-            self.last_config += 1
-            self.layers, self.config = probation.before, self.last_config
-            replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=as_spec(probation.before)))
-            probation.end(is_kept=False)
         self.over(
             cell, running, str(failed or reason), ordered=ordered or running < 0, noticed=noticed, reason=reason
         )  # fmt: skip

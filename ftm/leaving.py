@@ -117,6 +117,8 @@ class FromGroup(Move):
         group = host.group
         if group is not None:
             group.is_over = True
+        if host.probation is not None:
+            host.probation.left()
         self.ending = asyncio.ensure_future(host.dismantle(cell))
 
     def undo(self) -> None:

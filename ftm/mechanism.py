@@ -41,15 +41,11 @@ COMMON = tuple(f"{__package__}.mechanisms.{name}" for name in BUILT_IN if name !
 """Modules that each replica has from its first moment; not that which needs an extra."""
 
 
-class MechanismRefused(HoldfastError):
+class MechanismRefused(HoldfastError, text="{name}: {problem}"):
     """The mechanism does not suit the actor, or cannot be had; the text says why."""
 
-    def __init__(self, name: str, problem: str) -> None:
-        super().__init__(name, problem)
-        self.name, self.problem = name, problem
-
-    def __str__(self) -> str:
-        return f"{self.name}: {self.problem}"
+    name: str
+    problem: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,6 +160,16 @@ class Mechanism:
         settings = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self) if field.init}
         bricks = tuple((*key, code_of(kind)) for key, kind in sorted(self.exchanged.items(), key=lambda pair: pair[0]))
         return Description(code.kind, settings, code.file, code.sha256, bricks)
+
+
+@dataclasses.dataclass(frozen=True)
+class Unprotected(Mechanism):
+    """One replica that does nothing else: on the way back from a mechanism to none."""
+
+    name: ClassVar[str] = "unprotected"
+
+
+NOTHING = (Unprotected(),)
 
 
 def code_of(kind: type[Any]) -> Code:

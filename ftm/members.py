@@ -19,6 +19,7 @@ from .events import ReplicaLost, WrongSuspicion
 from .securing import Securing
 
 if TYPE_CHECKING:
+    from ..actors.ref import ActorRef
     from .detector import Detection
     from .stuck import Stuck
 
@@ -55,6 +56,11 @@ def is_blocked(pid: int) -> bool:
     except OSError:
         return False
     return state == "S" or (state == "R" and os.getloadavg()[0] <= (os.cpu_count() or 1))
+
+
+def is_within(place: str, sender: ActorRef[Any] | None) -> bool:
+    """Whether a replica, or what is below it, has said this."""
+    return sender is not None and f"{sender.path}/".startswith(f"{place}/")
 
 
 class Look(Message):
@@ -106,6 +112,11 @@ class Members(Securing):
         """The number of the life that a replica lives now; 0 if none."""
         cell = self.cell_of(name)
         return cell.life if cell is not None and cell.state is RUNNING else 0
+
+    def is_from_leader(self, sender: ActorRef[Any] | None) -> bool:
+        """Whether whoever leads, or is told to, has said this."""
+        names = self.primary, self.leading
+        return any(name is not None and is_within(self.place(name), sender) for name in names)
 
     def is_well(self, name: str) -> bool:
         """Whether a member is the one that was taken in, and nobody suspects it."""

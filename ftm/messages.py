@@ -55,10 +55,14 @@ class CannotJoin(Refusal):
 
 
 class RequestDropped(Refusal):
-    """A brick of the mechanism has neither passed this request on nor ended it."""
+    """A brick of the mechanism has neither passed this request on nor ended it.
+
+    `may_have_run`: a turn was handled whose outcome was lost in the bricks too, and that may be this one.
+    """
 
     path: str
     number: int
+    may_have_run: bool = False
 
 
 class ReplyEvicted(Refusal):
@@ -112,7 +116,10 @@ Logged = tuple[str, int, int, TurnEnd]
 
 
 class Work(Message):
-    """A batch of requests on its way in. `again`: some may have been handled before (failover)."""
+    """A batch of requests on its way in. `again`: some may have been handled before (failover).
+
+    `copy`: home wants the state behind it too.
+    """
 
     epoch: int
     config: int
@@ -120,6 +127,7 @@ class Work(Message):
     requests: list[Request]
     go: Go | None = None  # replay is over behind these
     again: bool = False
+    copy: bool = False
 
 
 class Taken(msgspec.Struct, array_like=True):

@@ -79,7 +79,10 @@ class ToGroup(Move):
     async def prepare(self) -> None:
         cell, host = self.cell, self.host
         if cell.children:
-            raise CannotMove(cell.path, f"it has children of its own ({', '.join(cell.children)})")
+            raise CannotMove(
+                cell.path,
+                f"it has children of its own ({', '.join(cell.children)}): have a supervisor start them beside it",
+            )
         if self._switch is None:
             self._switch = host.homes.made(cell, host.method)
         switch = host.switch = self._switch
@@ -193,6 +196,7 @@ class ToGroup(Move):
         self.transit.over(cell, host)
         if suspended:
             group.is_suspended = more.suspended = True
+        host.attached(cell, group)
         switch.from_life(live)  # What waits is fed.
         group.go_on()
         self.gone_on_at = now()

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from ..actors.message import Message
-from ..checkpoint.records import TurnEnd
+from ..checkpoint.records import Snapshot, TurnEnd
 from .mechanism import Description
 
 
@@ -69,13 +69,18 @@ class Stand(msgspec.Struct, array_like=True):
     config: int
     turn: int
     leads: bool
+    copy: list[Snapshot] = []
 
 
 class Quiesce(Message[Stand]):
-    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in."""
+    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in.
+
+    `copy`: home wants the state of the one that leads too.
+    """
 
     epoch: int
     config: int
+    copy: bool = False
 
 
 class Prepare(Message[None]):
@@ -108,12 +113,18 @@ class Doing(msgspec.Struct, array_like=True):
     """The protected actor, or another life of it here, is at work; else what is inside is in the bricks."""
     keeps: bool
     """Nothing that was computed has been lost in the bricks: what is inside can be asked for again."""
+    passes: bool = True
+    """The bricks have handled what had come to them; not looked at where it leads."""
 
 
 class Computes(Message[Doing]):
-    """What do you do with what is inside? `turn` is the last one that home knows of."""
+    """What do you do with what is inside? `turn` is the last one that home knows of.
+
+    One that does not lead has `seconds` for its bricks to handle what has come to them.
+    """
 
     turn: int
+    seconds: float = 0.0
 
 
 class Rehearse(Message[None]):

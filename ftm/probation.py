@@ -10,12 +10,17 @@ import asyncio
 from typing import TYPE_CHECKING, Final
 
 from ..actors.errors import HoldfastError
+from ..actors.message import message_name
 from .events import MechanismSettled
+from .mechanism import NOTHING
+from .messages import RequestDropped
 from .orders import Computes, Doing
+from .unkept import is_unkept
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
 
+    from ..checkpoint.records import TurnEnd
     from .adaptation import Reconfiguration
     from .group import Group
     from .mechanism import Mechanism
@@ -32,6 +37,7 @@ LOOK_EVERY: Final = 1.0
 """Seconds between two looks at how it does."""
 LONGEST_PAUSE: Final = 60.0
 """Seconds until going back is tried again, if it could not be; doubled each time, from one second on."""
+DROPPED: Final = message_name(RequestDropped)
 ASKED_WITHIN: Final = 2.0
 """Seconds that whoever leads has to say whether it is at work."""
 
@@ -62,10 +68,13 @@ class Probation:
         self.why = ""  # it has failed
         self.back: Reconfiguration | None = None  # how it goes back
         self.settled: asyncio.Future[MechanismSettled] = group.node.loop.create_future()
-        self.on_back: Callable[[], None] = lambda: None  # keeps in the store that the stack before is there again
-        self._group, self._begin_going_back, self._over = group, begin, over
+        self._on_over: Callable[[bool], None] = lambda is_kept: None
+        self.detach: Callable[[], Awaitable[None]] | None = None  # there was no mechanism before
+        self._detaching: asyncio.Task[None] | None = None
+        self._begin_going_back, self._over = begin, over
+        self.moved(group)
         self._since, self._turn = group.node.loop.time(), group.switch.turn
-        self._last_turn, self._moved_at = self._turn, self._since
+        self._last_turn, self._moved_at, self._looked_at = self._turn, self._since, self._since
         self._timer = group.node.loop.call_later(LOOK_EVERY, self._look)
         self._asking: asyncio.Task[None] | None = None
         self._again_at, self._pause = 0.0, LOOK_EVERY  # when going back is tried again
@@ -75,9 +84,16 @@ class Probation:
         """Whether it is known what comes of it."""
         return self.settled.done()
 
+    def when_over(self, told: Callable[[bool], None]) -> None:
+        """Have somebody told whether it stays, as soon as that is known."""
+        self._on_over = told
+        if self.is_over:
+            told(self.settled.result().is_kept)
+
     def moved(self, group: Group) -> None:
         """Another group goes on with the same stack."""
         self._group = group
+        group.wants_copy = is_unkept(group.switch.method)
 
     def failed(self, why: str) -> bool:
         """Something has gone wrong which may be the fault of this stack. Whether the one before has to come back."""
@@ -87,16 +103,17 @@ class Probation:
         self._begin_going_back()
         return True
 
-    def refuses_all(self) -> bool:
-        """A brick has let a request fall, and no other one has passed: whether another replica is asked instead."""
+    def drops(self, end: TurnEnd) -> bool:
+        """A brick has ended a request itself: whether that is asked of the stack before, since it was let fall."""
         group, name = self._group, self._group.primary
-        if self.is_over or group.switch.turn != self._turn or not group.backups():
+        if self.is_over or end.answer.name != DROPPED:
             return False
+        error = group.node.codec.decode_error(end.answer.kind, end.answer.name, end.answer.body)
+        why = "its bricks have let a request fall"
         if not self.why and name is not None:
-            why = "its bricks let all requests fall"
             group.at_fault(name, why)
-            group.suspect(name, group.members.get(name, 0), why)
-        return True
+            self._take_from(name, group.members.get(name, 0), why)
+        return isinstance(error, RequestDropped) and not error.may_have_run
 
     def end(self, *, is_kept: bool) -> None:
         """It is known what comes of it."""
@@ -104,16 +121,40 @@ class Probation:
             return
         self._timer.cancel()
         node = self._group.node
-        was, now = (tuple(one.name for one in layers) for layers in (self.before, self.layers))
+        stacks = self.before if self.before is not NOTHING else (), self.layers
+        was, now = (tuple(one.name for one in layers) for layers in stacks)
         event = MechanismSettled(
             self._group.path, was, now, is_kept, self.why, node.loop.time() - self._since
         )  # fmt: skip
         self.settled.set_result(event)
         if node.watched:
             node.emit(event)
-        if not is_kept:
-            self.on_back()
+        self._group.wants_copy = False
+        self._on_over(is_kept)
         self._over(self)
+
+    def left(self) -> None:
+        """There is no mechanism any more: because of this, or because somebody wants that."""
+        if self._detaching is None:
+            self.end(is_kept=True)
+
+    def went_back(self) -> None:
+        """The stack before is there again; if that was none, all replicas but one have to go, and then that one."""
+        if self.detach is None:
+            self.end(is_kept=False)
+        elif self._detaching is None and not self.is_over:
+            self._detaching = self._group.node.loop.create_task(self._detach(self.detach))
+
+    async def _detach(self, detach: Callable[[], Awaitable[None]]) -> None:
+        cell, pause = self._group.cell, LOOK_EVERY
+        while not (cell.is_dead or self.is_over):
+            try:
+                await detach()
+                break
+            except HoldfastError:  # The text says why, to whoever detaches it by hand.
+                await asyncio.sleep(pause)
+                pause = min(2 * pause, LONGEST_PAUSE)
+        self.end(is_kept=False)
 
     def _look(self) -> None:
         group, loop = self._group, self._group.node.loop
@@ -132,14 +173,14 @@ class Probation:
             return
         if group.is_over:
             return  # Its life is being begun again.
+        self._looked_at = now
         if group.switch.turn != self._last_turn or (group.out is None and not group.waiting):
             self._last_turn, self._moved_at = group.switch.turn, now
-        seconds, turns = now - self._since, group.switch.turn - self._turn
         if now - self._moved_at >= STUCK_AFTER:  # Whoever has led meanwhile: nothing has passed.
             if self._asking is None and group.primary is not None:
                 self._asking = loop.create_task(self._ask(group, group.primary))
-        elif self._moved_at == now and (seconds >= MOST_SECONDS or (seconds >= SECONDS and turns >= TURNS)):
-            self.end(is_kept=True)  # Not while something is inside that may never come out.
+        elif self._is_long_enough() and self._asking is None:
+            self._asking = loop.create_task(self._look_at_others(group))
 
     async def _ask(self, group: Group, name: str) -> None:
         """Something has waited for long, and no turn has ended: is the actor at work, or do the bricks keep it?"""
@@ -151,16 +192,45 @@ class Probation:
         finally:
             self._asking = None
         if doing.computes or group.is_suspended or group.is_stopping:
-            self._moved_at = group.node.loop.time()
-            if self._moved_at - self._since >= MOST_SECONDS:
-                self.end(is_kept=True)
+            self._moved_at = self._looked_at = group.node.loop.time()
             return
         if group.switch.turn != self._last_turn or group.primary != name or not group.is_well(name):
             return  # It goes on, or another one is asked.
         why = f"its bricks have let nothing pass for {STUCK_AFTER:g} s"
         group.at_fault(name, why)
-        if group.backups() or not doing.keeps:
+        self._take_from(name, life, why, keeps=doing.keeps)
+
+    def _take_from(self, name: str, life: int, why: str, *, keeps: bool = True) -> None:
+        """Whoever leads has bricks that do not do it: another one leads, or the same one with the bricks before."""
+        group = self._group
+        if group.backups() or not keeps:
             group.suspect(name, life, why)
         else:  # It is all there is.
             group.why, group.renewing = why, name
             group.wake()
+
+    async def _look_at_others(self, group: Group) -> None:
+        """Nobody waits for the bricks of those that do not lead: it stays if they too have let pass what has come."""
+        try:
+            for name in group.backups():
+                life, order = group.members.get(name, 0), Computes(group.switch.turn, STUCK_AFTER)
+                doing: Doing = await group.protocol(name).ask(order, STUCK_AFTER + ASKED_WITHIN)
+                if not doing.passes and not doing.computes and name != group.primary and group.is_well(name):
+                    why = f"its bricks have let nothing pass for {STUCK_AFTER:g} s"
+                    group.at_fault(name, why)
+                    group.suspect(name, life, why)
+                    return
+        except HoldfastError:  # If it has died, that is seen elsewhere; else it is asked once more.
+            return
+        finally:
+            self._asking = None
+        if not self.why and self._is_long_enough():
+            self.end(is_kept=True)
+
+    def _is_long_enough(self) -> bool:
+        """Whether it has worked for so long, and nothing is inside that may never come out."""
+        group, now = self._group, self._group.node.loop.time()
+        seconds, turns = now - self._since, group.switch.turn - self._turn
+        is_idle = group.out is None and not group.waiting
+        is_moving = is_idle or group.switch.turn != self._last_turn or self._moved_at == self._looked_at
+        return is_moving and (seconds >= MOST_SECONDS or (seconds >= SECONDS and turns >= TURNS))

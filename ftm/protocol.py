@@ -15,14 +15,14 @@ import msgspec
 
 from ..actors.actor import on
 from ..actors.bindings import Binding
-from ..actors.errors import ActorStopped, HoldfastError
+from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
 from ..actors.exits import unpack_exit
 from ..actors.mail import ReplyHandle
 from ..actors.message import Message, message_name
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import DROPPED, Answer, TurnEnd
 from .alarms import RequestsDropped
-from .bricks import FOREVER, Brick, Flush, Proceed
+from .bricks import FOREVER, Brick, Flush, Proceed, Settle
 from .images import image_from
 from .messages import (
     CannotLead,
@@ -103,6 +103,10 @@ class RequestProtocol(Transfer):
         self._least = -1  # the turn after which we go on, if those up to it have left nothing here
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
         self._later: list[Any] = []  # what goes home behind that
+        self._turn = -1  # the last one before the batch that is inside
+        self._came_out = 0  # turns of it that have come out of the bricks
+        self._copies = False  # home gets the state behind it
+        self._behind: tuple[list[TurnEnd], list[Any]] = [], []  # what goes home with that
         self.paths: dict[str, str] = {}
 
     # -- requests ---------------------------------------------------------------------------------------------------
@@ -137,7 +141,8 @@ class RequestProtocol(Transfer):
             self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in, None, more))
         if goes_in:
             self._standing.inside.update((one.feed.id, one) for one in left)
-            self._current = work.number
+            self._current, self._copies = work.number, work.copy
+            self._turn, self._came_out, self._behind = self._standing.server.turn, 0, ([], [])
             self.before.tell(Work(work.epoch, work.config, work.number, left, work.go, work.again))
 
     def _split(self, work: Work) -> tuple[list[TurnEnd], list[Request]]:
@@ -172,7 +177,8 @@ class RequestProtocol(Transfer):
         elif standing.leads:
             if done.epoch != standing.epoch:
                 done = msgspec.structs.replace(done, epoch=standing.epoch)
-            self.next.tell(done)
+            self._came_out += len({end.turn for end in done.ends if end.turn > self._turn})
+            self._leave(done)
         if done.is_last and done.number == self._current:
             self._current = None
             if standing.leads and done.number >= 0 and not standing.server.is_over:
@@ -183,13 +189,26 @@ class RequestProtocol(Transfer):
             self._go_on()
         return Taken()
 
+    def _leave(self, done: Done) -> None:
+        """Outcomes go home; with the state behind them if home wants it, which is only there when no turn is run."""
+        if self._copies and done.number == self._current:
+            ends, more = self._behind
+            ends += done.ends
+            more += done.more
+            if not (done.is_last or done.wait):
+                return
+            self._behind = [], []
+            done = msgspec.structs.replace(done, ends=ends, more=[*more, *self._standing.server.copied()])
+        self.next.tell(done)
+
     def _end_dropped(self, done: Done, numbers: list[int]) -> None:
         """The batch is over, and these requests have no end: a brick has let them fall."""
         standing = self._standing
+        may_have_run = standing.server.turn - self._turn > self._came_out
         standing.node.emit(RequestsDropped(standing.address, standing.path, ", ".join(map(str, numbers))))
         ends = list[TurnEnd]()
         for number in numbers:
-            error = RequestDropped(path=standing.path, number=number)
+            error = RequestDropped(path=standing.path, number=number, may_have_run=may_have_run)
             ends.append(TurnEnd(-1, number, DROPPED, [], Answer(*standing.node.codec.encode_error(error))))
         self.next.tell(Done(standing.epoch, done.config, -1, ends, False))
 
@@ -387,17 +406,20 @@ class RequestProtocol(Transfer):
     def _quiesce(self, message: Quiesce) -> Any:
         self._check(message.epoch, message.config)
         handle = self.ctx.reply_handle()
-        self.ctx.create_task(self._come_to_rest(handle))  # Not in line with other orders: one of them may unblock it.
+        self.ctx.create_task(
+            self._come_to_rest(handle, message)
+        )  # Not in line with other orders: one of them may unblock it.
         return handle
 
-    async def _come_to_rest(self, handle: ReplyHandle[Any]) -> None:
+    async def _come_to_rest(self, handle: ReplyHandle[Any], message: Quiesce) -> None:
         standing = self._standing
         self._holds += 1
         try:
             await self._quiet()
             await self.proceed.ask(Flush(), timeout=FOREVER)
             await self._drain_bricks()
-            handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads))
+            copy = standing.server.copied() if message.copy and standing.leads else []
+            handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads, copy))
         except HoldfastError as error:
             handle.fail(error)
         finally:
@@ -405,7 +427,23 @@ class RequestProtocol(Transfer):
             self._go_on()
 
     @on(Computes)
-    def _computes(self, message: Computes) -> Doing:
+    def _computes(self, message: Computes) -> Any:
+        if self._standing.leads:
+            return self._doing(message)
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._follows(handle, message))
+        return handle
+
+    async def _follows(self, handle: ReplyHandle[Any], message: Computes) -> None:
+        """Bricks of one that does not lead wait for nobody: what has come to them is handled soon."""
+        node, paths = self._standing.node, self._standing.paths
+        bricks = [path for slot, path in paths.items() if slot.endswith((".before", ".after"))]
+        asked = [node.cell_at(path).ref.ask(Settle(), timeout=message.seconds) for path in bricks]
+        found = await asyncio.gather(*asked, return_exceptions=True)
+        passes = not any(isinstance(one, AskTimeout) for one in found)
+        handle.reply(msgspec.structs.replace(self._doing(message), passes=passes))
+
+    def _doing(self, message: Computes) -> Doing:
         standing = self._standing
         servers = (standing.server, *standing.shadows)
         computes = any(one.life is not None and one.life.feed is not None for one in servers)

@@ -9,6 +9,7 @@ from ..actors.bindings import Binding
 from ..actors.errors import HoldfastError
 from ..actors.message import Message, message_name
 from .group import Flush
+from .members import is_within
 from .messages import Done, Outward
 from .orders import Stalled
 from .sealed import Agree, Back, Call, Greet, Refused, Sealed
@@ -54,21 +55,30 @@ class Proxy(Actor):
     @on(Done)
     def done(self, done: Done) -> Any:
         """Outcomes have come."""
-        if self._group.is_plain():
-            self._group.take_done(done)
+        group = self._group
+        if group.is_plain():
+            if group.is_from_leader(self.ctx.sender):
+                group.take_done(done)
+            else:
+                group.stale += 1
             self._send()
 
     @on(Outward)
     def outward(self, outward: Outward) -> None:
         """Something leaves in the middle of a turn."""
-        if self._group.is_plain():
-            self._group.take_outward(outward)
+        group = self._group
+        if group.is_plain():
+            if group.is_from_leader(self.ctx.sender):
+                group.take_outward(outward)
+            else:
+                group.stale += 1
 
     @on(Stalled)
     def stalled(self, stalled: Stalled) -> None:
         """A turn takes too long."""
-        if self._group.is_plain():
-            self._group.stuck.told(stalled)
+        group = self._group
+        if group.is_plain() and is_within(group.place(stalled.name), self.ctx.sender):
+            group.stuck.told(stalled)
 
     @on(Greet)
     async def greet(self, message: Greet) -> bytes:

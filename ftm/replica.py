@@ -184,9 +184,9 @@ class Replica(Supervisor):
             intensity=0,
         )
 
-    async def on_start(self, restored: bool) -> None:
+    async def _start_all(self) -> None:
         """Start the protected actor's address, then the bricks as one that does not lead, then the heartbeat."""
-        await super().on_start(restored)
+        await super()._start_all()
         setting, node = self._setting, self.ctx.cell.node
         self._bind(STATE, "server", self._cell(SERVER))
         for port, path in setting.bindings.items():
@@ -220,7 +220,7 @@ class Replica(Supervisor):
         why, setting, cell = f"its {one.spec.id} has ended: {reason}", self._setting, self.ctx.cell
         super()._give_up(one, reason, Shutdown(why))
         with suppress(HoldfastError):  # It is between two lives: then it hears of our end.
-            cell.node.cell_at(f"{setting.address}/ftm/detector").ref.tell(Broken(setting.name, cell.life, why))
+            self.ctx.tell(cell.node.cell_at(f"{setting.address}/ftm/detector"), Broken(setting.name, cell.life, why))
 
     def _cell(self, name: str) -> Cell:
         cell = self._children[name].cell
@@ -543,7 +543,11 @@ class Replica(Supervisor):
         except HoldfastError as error:
             await self._drop_prepared()
             return error
-        except Exception as error:  # Importing a module, and making a mechanism of its settings, raise anything.
+        except (
+            Exception,
+            SystemExit,
+            KeyboardInterrupt,
+        ) as error:  # Importing a module, and making a mechanism of its settings, raise anything.
             await self._drop_prepared()
             return MechanismRefused(self.ctx.path, f"{type_name(type(error))}: {error}")
         return None

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import time
+from typing import Final
 
 from ..checkpoint.keys import save_state
 from ..checkpoint.records import Snapshot, Unsaved, pieces
 from .messages import Beside
 from .points import Points
+
+MOST_COPIED: Final = 16_000_000
+"""Bytes of a state that home gets a copy of."""
 
 
 class Reports(Points):
@@ -52,6 +56,20 @@ class Reports(Points):
         parts, pause = pieces(data), time.perf_counter() - begin
         for index, one in enumerate(parts, 1):
             self.more.append(Snapshot(life.turn, one, index == len(parts), stash, pause, traps=life.traps))
+
+    def copied(self) -> list[Snapshot]:
+        """The state as it is between two turns, for a home that keeps nothing otherwise; [] if it cannot be had."""
+        life, more = self.life, self.more
+        if life is None or life.feed is not None or not life.is_live or not self.has_access:
+            return []
+        self.more = []
+        try:
+            self._send_snapshot()
+            found = [one for one in self.more if isinstance(one, Snapshot)]
+        except Exception:  # What the user's own `get_state` raises: there is no copy then.
+            found = []
+        self.more = more
+        return found if sum(len(one.data) for one in found) <= MOST_COPIED else []
 
     def last_snapshot(self) -> None:
         """The life ends in good order."""

@@ -384,7 +384,7 @@ class Server(Reports):
         self._skips.clear()
         try:
             state = self.capture()
-        except Exception as error:  # What the user's own values and methods raise: as in `sealed`.
+        except BaseException as error:  # What the user's own values and methods raise: as in `sealed`.
             if len(requests) != 1 or len(ends) != 1 or skips:
                 raise
             self.fail(requests[0], ends[0], error)
@@ -393,7 +393,7 @@ class Server(Reports):
         self.previous = previous
         return ends, state
 
-    def fail(self, request: Request, end: TurnEnd, error: Exception) -> None:
+    def fail(self, request: Request, end: TurnEnd, error: BaseException) -> None:
         """This turn has left what is no state: run again, it fails."""
         codec = self.standing.node.codec
         answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()

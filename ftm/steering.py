@@ -28,7 +28,7 @@ class Steered(HomeHost):
         """Orders go to the actor of the replica that leads; what would change one replica alone is refused."""
         group, ask = self.group, call.ask
         if isinstance(call.order, (ReplaceState, ReplaceCode)):
-            why = "it is protected: detach its mechanism first, for all replicas have to have the same"
+            why = "it is protected, and all replicas have to be alike: detach its mechanism, and attach it again after"
             ask.fail(ControlFailed(cell.path, call.order.verb, why))
             return
         if group is None or group.is_over or group.primary is None or not self.is_up(cell):

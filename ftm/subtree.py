@@ -204,10 +204,18 @@ class SubtreeGroup(GroupHost):
     ) -> Reconfiguration:
         def also_there() -> None:
             switched()
-            if self._port is not None:
-                self._port.to_life(Respec(self.described()))
+            self._say_spec()
 
         return await super().adapt(cell, mechanism, also_there, rest_within)
+
+    def respecified(self, cell: Cell) -> None:
+        super().respecified(cell)
+        self._say_spec()
+
+    def _say_spec(self) -> None:
+        """The supervisor in the process starts its next lives with the stack that there is now."""
+        if self._port is not None:
+            self._port.to_life(Respec(self.described()))
 
 
 def subtree_group(place: SubtreeHome, cell: Cell, wanted: Wanted, before: Any) -> SubtreeGroup:

@@ -31,15 +31,11 @@ PASSED_WITHIN: Final = 15.0
 """Seconds that it may take to play all roles."""
 
 
-class TrialFailed(HoldfastError):
+class TrialFailed(HoldfastError, text="{why}"):
     """The stack was tried, and does not work."""
 
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return self.why
+    actor: str
+    why: str
 
 
 async def tried(group: Group, above: Cell, spec: ChildSpec) -> None:

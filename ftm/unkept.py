@@ -9,6 +9,7 @@ from ..checkpoint.method import Method
 from .group import forget_ended
 
 if TYPE_CHECKING:
+    from ..checkpoint.saved import Meta
     from ..checkpoint.switch import Switch
 
 UNKEPT = Method("protected", durability="memory")
@@ -33,6 +34,11 @@ def begin_afresh(switch: Switch) -> None:
     switch.stash = []
     switch.timers.replace({})
     switch.topics.clear()
+
+
+def begin_again(switch: Switch, copy: Meta) -> bool:
+    """Between two lives of an actor whose mechanism was not trusted: whether it begins with the copy of its state."""
+    return switch.newest is copy and copy.turn == switch.turn
 
 
 def forget_later(switch: Switch, why: str) -> None:

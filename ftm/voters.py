@@ -32,15 +32,11 @@ MOST_BALLOTS: Final = 15
 """With more, finding those that agree with each other could take for ever."""
 
 
-class NoMajority(HoldfastError):
+class NoMajority(HoldfastError, text="the runs of {actor} do not agree: {why}; no answer is given rather than a guess"):
     """The runs of a request did not agree: nobody knows the right answer, so none is given."""
 
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return f"the runs of {self.actor} do not agree: {self.why}; no answer is given rather than a guess"
+    actor: str
+    why: str
 
 
 class Agreed(msgspec.Struct, Generic[T], frozen=True):

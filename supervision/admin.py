@@ -160,7 +160,10 @@ class RestartChild(Order[Any]):
 
 
 class DeleteChild(Order[None]):
-    """Forget a stopped child, and (unless `erase` is False) what was recorded of it and of all below it."""
+    """Forget a stopped child, and (unless `erase` is False) what was recorded of it and of all below it.
+
+    A dynamic supervisor forgets those that have ended by itself; this erases what was recorded of one.
+    """
 
     id: str
     erase: bool = True

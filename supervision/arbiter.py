@@ -72,26 +72,20 @@ class Grant:
     errand: object = dataclasses.field(default=None, repr=False, compare=False)
 
 
-class InOtherHands(HoldfastError):
+class InOtherHands(HoldfastError, text="{address} is in the hands of {hand}: {reason}"):
     """Somebody else acts on the address, or on one above or below it: `hand` does, because of `reason`."""
 
-    def __init__(self, address: str, hand: str, reason: str) -> None:
-        super().__init__(address, hand, reason)
-        self.address, self.hand, self.reason = address, hand, reason
-
-    def __str__(self) -> str:
-        return f"{self.address} is in the hands of {self.hand}: {self.reason}"
+    address: str
+    hand: str
+    reason: str
 
 
-class GrantLost(HoldfastError):
+class GrantLost(HoldfastError, text="the grant of {address} (epoch {epoch}) is lost: {reason}"):
     """The grant of this epoch does not count any more: `reason` says who has the address now, or that time is up."""
 
-    def __init__(self, address: str, epoch: int, reason: str) -> None:
-        super().__init__(address, epoch, reason)
-        self.address, self.epoch, self.reason = address, epoch, reason
-
-    def __str__(self) -> str:
-        return f"the grant of {self.address} (epoch {self.epoch}) is lost: {self.reason}"
+    address: str
+    epoch: int
+    reason: str
 
 
 class Arbiter:

@@ -60,7 +60,7 @@ def _asked_anew(supervisor: Supervisor) -> Plan:
         raise StartIgnored(supervisor.ctx.path, no.why) from no
     except HoldfastError:
         raise
-    except Exception as error:
+    except BaseException as error:
         raise remote_crash(error) from error
 
 

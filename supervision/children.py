@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from ..actors.cell import Cell
@@ -106,19 +106,31 @@ LOOKS = 4
 """How often the progress of a start is looked at within its time."""
 
 
+def begin_start(cell: Cell, seconds: float) -> Callable[[], None]:
+    """In an actor process, see to it that it ends if a start blocks it for longer; what is returned voids that."""
+    return cell.node.begin_limit(f"{cell.path} had {seconds:g} s to start", seconds)
+
+
 class StartLimit:
     """The time that a start may take. A child that is brought back has it anew with all that it has handled again."""
 
-    __slots__ = ("_cell", "_reached", "_since", "_timer", "is_over", "seconds")
+    __slots__ = ("_cell", "_end", "_reached", "_since", "_timer", "is_over", "seconds")
 
     def __init__(self, one: Child) -> None:
         assert one.cell is not None
         self._cell, self.seconds = one.cell, one.spec.start_timeout or "infinity"
         self.is_over = False
         self._timer: asyncio.TimerHandle | None = None
+        self._end: Callable[[], None] | None = None
         self._reached, self._since = one.cell.host.progress(one.cell), one.cell.node.loop.time()
         if not isinstance(self.seconds, str):
+            self._begin(self.seconds)
             self._wait(self.seconds)
+
+    def _begin(self, seconds: float) -> None:
+        if self._end is not None:
+            self._end()
+        self._end = begin_start(self._cell, seconds)
 
     def _wait(self, seconds: float) -> None:
         cell = self._cell
@@ -136,12 +148,15 @@ class StartLimit:
         reached = self._cell.host.progress(self._cell)
         if reached != self._reached:
             self._reached, self._since = reached, self._cell.node.loop.time()
+            self._begin(seconds)
         self._wait(seconds)
 
     def close(self) -> None:
         """The start is over."""
         if self._timer is not None:
             self._timer.cancel()
+        if self._end is not None:
+            self._end()
 
     @property
     def told(self) -> str:

@@ -22,10 +22,13 @@ from ..actors.process.limits import Limits
 from ..actors.process.recipe import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .change import check_place, check_subtree
-from .children import STARTING, Child, Row
+from .children import STARTING, Child, Row, complete
 from .rules import Rule
 from .spec import NAMELESS, ChildSpec, Flags, Isolation, Plan, Restart, Shutdown, check_spec, child
 from .supervisor import Supervisor
+
+MADE_UP = b""
+"""What is noted of a child whose id nobody knows when its supervisor is started again."""
 
 
 class DynamicSupervisor(Supervisor):
@@ -52,10 +55,15 @@ class DynamicSupervisor(Supervisor):
         """Start empty, or with the children that were there before, if there is a journal of them."""
         node, where = self.ctx.cell.node, child_key(self.ctx.path, "")
         noted: list[Child] = []
-        for key, data in node.keeper.notes(where).items() if self._flags.journal else ():
+        for key, data in node.keeper.notes(where).items():
             name = key.removeprefix(where)
             if "/" in name:
                 continue  # It is the child of a supervisor below us.
+            if data == MADE_UP:
+                self._lose(name)
+                continue
+            if not self._flags.journal:
+                continue
             try:
                 noted.append(Child(self._noted(name, data)))
             except HoldfastError as error:  # It stays in the journal: perhaps its class is only not there today.
@@ -67,6 +75,15 @@ class DynamicSupervisor(Supervisor):
                 await self._come_up_in(row, one)
             except HoldfastError as error:  # One that fails must not keep the others from coming back.
                 self._again(one, exits.crash(error))
+
+    def _lose(self, name: str) -> None:
+        """A child of our last life whose id nobody knows: whoever waits for it is told, what was recorded is erased."""
+        path, keeper = f"{self.ctx.path}/{name}", self.ctx.cell.node.keeper
+        try:
+            keeper.erase(path, below=True)
+            keeper.note(child_key(self.ctx.path, name), None)
+        except HoldfastError as error:  # It is tried again at our next start.
+            self.ctx.cell.node.emit(StoreRefused(path, str(error)))
 
     def _noted(self, name: str, data: bytes) -> ChildSpec:
         """A child as the journal has it. Raises HoldfastError if it can not be made any more."""
@@ -84,11 +101,18 @@ class DynamicSupervisor(Supervisor):
             given = one.spec if self._template is None else _added(self._template.start, one.spec.start)
             data = pack_data(given, f"child {one.spec.id!r}")
             self.ctx.cell.node.keeper.note(child_key(self.ctx.path, one.spec.id), data)
+        elif self._is_lost_with_us(one):
+            self.ctx.cell.node.keeper.note(child_key(self.ctx.path, one.spec.id), MADE_UP)
         super()._enlist(one)
+
+    def _is_lost_with_us(self, one: Child) -> bool:
+        """Whether something is recorded of a child that nobody knows when we have been restarted."""
+        spec = complete(self.ctx.cell, one.spec)
+        return not spec.comes_back and (spec.has_home or spec.is_supervisor)
 
     def _forget(self, one: Child) -> None:
         super()._forget(one)
-        if not self._flags.journal:
+        if not self._flags.journal and not self._is_lost_with_us(one):
             return
         node = self.ctx.cell.node
         try:
@@ -173,7 +197,15 @@ class DynamicSupervisor(Supervisor):
 
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
-        """A stopped child is forgotten here."""
+        """A stopped child is forgotten here by itself; what was recorded of it is forgotten now."""
+        path, keeper = f"{self.ctx.path}/{message.id}", self.ctx.cell.node.keeper
+        is_there = message.id in self._children or message.id in (self.ctx.cell.children or ())
+        if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
+            try:
+                keeper.erase(path, below=True)
+            except HoldfastError as error:  # It can be deleted again.
+                return self._fail(error)
+            return None
         self._child(message.id)
         raise NotSupported("a dynamic supervisor forgets stopped children by itself: use TerminateChild")
 

@@ -53,7 +53,7 @@ class Errand(Item):
     def run(actor: Any, item: Any) -> object:
         try:
             item.step()
-        except Exception as error:
+        except BaseException as error:
             if item._first is None:
                 raise
             lives.crash(item._ctx.cell, item._first, error)  # It is the start of this life that has failed.

@@ -78,7 +78,7 @@ class JobActor(Actor):
                 self._fail(AskFailed(self.ctx.path, why))
                 self.ctx.stop(Shutdown(why))
             raise
-        except (Exception, SystemExit, KeyboardInterrupt) as error:
+        except BaseException as error:
             self._fail(error if isinstance(error, HoldfastError) else remote_crash(error))
             if not isinstance(error, Refusal):
                 raise  # Now the job crashes.

@@ -20,7 +20,7 @@ def respec(cell: Cell, start: Start[Any]) -> None:
     Raises:
         SpecError: the child's spec does not allow it.
     """
-    spec = None if cell.spec is None else dataclasses.replace(cell.spec, start=start)
+    spec = dataclasses.replace(cell.spec, start=start) if isinstance(cell.spec, ChildSpec) else cell.spec
     cell.extra().start = start
     _change(cell, spec, lambda known: dataclasses.replace(known, start=start))
 

@@ -103,7 +103,7 @@ class Router(Actor):
         try:
             key = getattr(message, self._key) if isinstance(self._key, str) else self._key(message)
             partition_of(key, 1)
-        except Exception as error:  # The user's own function, or a key that nothing stable can be made of.
+        except BaseException as error:  # The user's own function, or a key that nothing stable can be made of.
             raise NoRoute(f"{type(error).__name__}: {error}") from error
         return key
 

@@ -15,6 +15,7 @@ from ..actors.cell import Cell
 from ..actors.errors import SpecError, type_name
 from ..actors.events import ShutdownError
 from ..actors.exits import KILLED, SHUTDOWN, ExitReason
+from ..actors.lives import GRACE
 from ..actors.mailbox import Bounded
 from ..actors.process.limits import Limits
 from ..actors.process.recipe import pack_recipe
@@ -185,6 +186,10 @@ class ChildSpec(Generic[A_co]):
             cell.request_stop(reason)
         if self.is_supervisor and self.shutdown == "infinity":
             end_within(cell, gone)
+        elif self.shutdown != "infinity" and not gone.done():
+            seconds = GRACE if isinstance(self.shutdown, str) else self.shutdown
+            void = cell.node.begin_limit(f"{cell.path} had {seconds:g} s to stop", seconds)
+            gone.add_done_callback(lambda _: void())
         return gone
 
     def judge(self, cell: Cell, told: ExitReason, ended: ExitReason) -> None:

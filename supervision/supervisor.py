@@ -15,7 +15,7 @@ from ..actors.actor import Start, on
 from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
-from ..actors.exits import SHUTDOWN, ExitReason, unpack_exit
+from ..actors.exits import SHUTDOWN, ExitReason, crash, unpack_exit
 from ..actors.mail import Item, ReplyHandle
 from .admin import (
     AlreadyPresent,
@@ -41,6 +41,7 @@ from .children import (
     Retry,
     Row,
     StartLimit,
+    begin_start,
     complete,
     new_cell,
 )
@@ -114,7 +115,7 @@ class Supervisor(Inquiries):
         """
         self.ctx.trap_exits = True  # Only our own parent can end us: the end of a stranger that is linked is no order.
         self._begin(new_plan(self))
-        self._first = self._errand(self._start_all(), self.ctx.item)
+        self._first = self._errand(self._come_all_up(), self.ctx.item)
 
     def _begin(self, plan: Plan) -> None:
         """Take up the plan of this start."""
@@ -128,8 +129,15 @@ class Supervisor(Inquiries):
     def _is_starting(self) -> bool:
         return self._first is not None and not self._first.is_over
 
-    async def _start_all(self) -> None:
+    async def _come_all_up(self) -> None:
         """The errand of our own start."""
+        await self._start_all()
+        for early in self._early:
+            self.ctx.cell.push(early)
+        self._early.clear()
+
+    async def _start_all(self) -> None:
+        """Start the children of the plan."""
         row = Row(self._children.values(), STARTING)
         while (one := row.next()) is not None:
             try:
@@ -137,9 +145,6 @@ class Supervisor(Inquiries):
             except HoldfastError:
                 self._blame(one)
                 raise
-        for early in self._early:
-            self.ctx.cell.push(early)
-        self._early.clear()
 
     async def _start(self, one: Child) -> bool:
         """Start a child and wait until it is up. False: it did not want to be.
@@ -194,7 +199,8 @@ class Supervisor(Inquiries):
             turn = self.ctx.cell.extra().turn
             if turn is not None and turn.killed:
                 raise  # It is our own turn that is killed.
-            raise StartFailed(self._path_of(one), "it was killed while it started") from error
+            why = limit.told if limit.is_over else "it was killed while it started"
+            raise StartFailed(self._path_of(one), why) from error
         except StartFailed as error:
             if limit.is_over:
                 raise StartFailed(self._path_of(one), limit.told) from error
@@ -218,7 +224,14 @@ class Supervisor(Inquiries):
         if cell is None or cell.state is GONE:
             cell = one.cell = new_cell(self.ctx.cell, one)
             one.ignored_life = 0  # A new address counts its lives anew.
-        return cell.host.start(cell)
+        seconds = one.spec.start_timeout or "infinity"
+        if isinstance(seconds, str):
+            return cell.host.start(cell)
+        void = begin_start(cell, seconds)
+        try:
+            return cell.host.start(cell)  # `__init__` may block already.
+        finally:
+            void()
 
     def _is_up(self, one: Child) -> None:
         one.state = UP
@@ -391,9 +404,9 @@ class Supervisor(Inquiries):
                 continue
             try:
                 await self._come_up_in(row, other)
-            except HoldfastError:
+            except HoldfastError as error:
                 row.leave()
-                self._again(other, reason)  # The others stay up, or are stopped, until it is tried again.
+                self._again(other, crash(error))  # The others stay up, or are stopped, until it is tried again.
 
     def _again(self, one: Child, reason: ExitReason) -> None:
         """A start has failed: try once more, which counts."""

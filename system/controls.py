@@ -35,7 +35,7 @@ from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
 from ..checkpoint.outputs import switch_of
 from ..checkpoint.switch import Switch
 from ..supervision.respec import respec
-from ..supervision.spec import Isolation
+from ..supervision.spec import ChildSpec, Isolation
 from .moving import Moves, check_isolation
 
 if TYPE_CHECKING:
@@ -115,9 +115,18 @@ class Controls:
             raise SpecError(cell.path, f"replace_code takes an Actor class or start(Class, ...), not {new!r}")
         start = new if isinstance(new, Start) else Start(new)
         keeps = not isinstance(new, Start)
+        switch = switch_of(cell)
         if not isinstance(cell.host, OutsideHost):
-            next_start(cell, start, keeps_arguments=keeps)  # What cannot be is refused before anything is done.
-        recipe = await self._replace(ref, ReplaceCode(start, keeps, migrate), timeout)
+            becomes = next_start(
+                cell, start, keeps_arguments=keeps
+            )  # What cannot be is refused before anything is done.
+            if switch is not None and isinstance(cell.spec, ChildSpec):
+                switch.becomes = becomes
+        try:
+            recipe = await self._replace(ref, ReplaceCode(start, keeps, migrate), timeout)
+        finally:
+            if switch is not None:
+                switch.becomes = None
         if recipe is not None:
             start = unpack_recipe(recipe, imports=False)
             cell.table = start.kind._table

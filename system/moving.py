@@ -108,6 +108,13 @@ class Moves:
 
         before = _spec_of(cell)
         wanted = dataclasses.replace(before, mechanism=mechanism)
+
+        def moved() -> None:
+            replace_mechanism(cell, wanted)
+            probation = getattr(cell.host, "probation", None)
+            if probation is not None:
+                probation.detach = lambda: self.unprotect(cell, timeout)
+
         if place_of(cell) == "process":
             await self._settle_in(cell, "task", before.limits, timeout)
         try:
@@ -115,7 +122,7 @@ class Moves:
                 cell,
                 timeout,
                 lambda: to_group(cell, homes, mechanism, timeout),
-                lambda: replace_mechanism(cell, wanted),
+                moved,
             )
         except BaseException:
             if before.isolation == "process":

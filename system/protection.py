@@ -55,7 +55,7 @@ class Protection:
     def __init__(self, homes: Homes) -> None:
         self._homes = homes
         found = homes.notes(KEPT).get(KEPT)
-        self._kept: dict[str, tuple[Any, Any]] = msgspec.msgpack.decode(found) if found else {}
+        self._kept: dict[str, tuple[Any, ...]] = msgspec.msgpack.decode(found) if found else {}
         self._loaded = set(self._kept)  # those that no spec has got yet
         self._is_dirty = False
         for key, step in homes.notes(UNDER_WAY).items():
@@ -84,10 +84,15 @@ class Protection:
         from ..ftm.mechanism import Description, MechanismRefused, revive
 
         self._loaded.discard(address)
-        declared, current = self._kept[address]
+        declared, current, *before = self._kept[address]
         if _data(spec.mechanism) != declared:  # The program says something else now: that is newer.
             self.forget(address)
             return spec
+        if before:  # The last root has not lived to see whether it stays.
+            (current,) = before
+            self._keep(address, declared, current)
+            self.flush()
+            self._homes.node.emit(AdaptationUndone(address, "probation"))
         try:
             layers = tuple(map(revive, msgspec.convert(current or [], list[Description])))
         except MechanismRefused as error:
@@ -106,13 +111,25 @@ class Protection:
                 spec = dataclasses.replace(spec, start=rebuilt(spec.start, names, functools.partial(_instead, other)))
         return spec
 
-    def put(self, address: str, before: Any, after: Any) -> None:
-        """The address has another mechanism from now on; kept with all others by the next `flush`."""
-        declared = self._kept[address][0] if address in self._kept else _data(before)
-        current = _data(after)
+    def put(self, address: str, before: Any, after: Any, *, is_trusted: bool = True) -> None:
+        """The address has another mechanism from now on; kept with all others by the next `flush`.
+
+        If that `is_trusted` only when it is `settled`, the next root has the last one that was.
+        """
+        declared, _, *last = self._kept.get(address, (_data(before), None))
+        self._keep(address, declared, _data(after), *([] if is_trusted else last or [_data(before)]))
+
+    def settled(self, address: str, mechanism: Any) -> None:
+        """A mechanism that was put there is trusted from now on."""
+        declared, current, *last = self._kept.get(address, (None, None))
+        if last:
+            self._keep(address, declared, current, _data(mechanism))
+
+    def _keep(self, address: str, declared: Any, current: Any, *last: Any) -> None:
         self._kept.pop(address, None)
-        if current != declared:
-            self._kept[address] = (declared, current)
+        last = tuple(one for one in last if one != current)
+        if current != declared or last:
+            self._kept[address] = (declared, current, *last)
         self._is_dirty = True
 
     def forget(self, address: str) -> None:

@@ -25,15 +25,11 @@ LARGEST = 4 * 1024 * 1024
 """Bytes a script may have."""
 
 
-class UntrustedFile(HoldfastError):
+class UntrustedFile(HoldfastError, text="{path} is not loaded: {problem}"):
     """A file, or a folder above it, could have been written by somebody else: it is not loaded."""
 
-    def __init__(self, path: str, problem: str) -> None:
-        super().__init__(path, problem)
-        self.path, self.problem = path, problem
-
-    def __str__(self) -> str:
-        return f"{self.path} is not loaded: {self.problem}"
+    path: str
+    problem: str
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

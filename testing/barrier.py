@@ -45,9 +45,8 @@ PING = "holdfast.testing:Ping"
 class NotIdle(HoldfastError, TimeoutError):
     """What was waited for did not come to rest: `after` so much of something; `busy` says what still moved."""
 
-    def __init__(self, after: str, busy: tuple[str, ...]) -> None:
-        super().__init__(after, busy)
-        self.after, self.busy = after, busy
+    after: str
+    busy: tuple[str, ...]
 
     def __str__(self) -> str:
         return f"not idle after {self.after}: {'; '.join(self.busy) or 'something came up each time'}"

@@ -54,18 +54,14 @@ class NothingToWaitFor(RuntimeError):
         )
 
 
-class RealTimeNeeded(HoldfastError):
+class RealTimeNeeded(
+    HoldfastError,
+    text="{what} cannot run under the virtual clock: another process has a clock of its own, and this one "
+    "would jump ahead of it. Use a real loop (uvloop or the stock one), or isolation='task'",
+):
     """Another process was to be started or spoken to under the virtual clock."""
 
-    def __init__(self, what: str) -> None:
-        super().__init__(what)
-        self.what = what
-
-    def __str__(self) -> str:
-        return (
-            f"{self.what} cannot run under the virtual clock: another process has a clock of its own, and this one "
-            "would jump ahead of it. Use a real loop (uvloop or the stock one), or isolation='task'"
-        )
+    what: str
 
 
 class ThreadAtWork(RuntimeError):

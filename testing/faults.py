@@ -97,15 +97,12 @@ POINTS: dict[str, Point] = {
 """Every point, by name."""
 
 
-class InjectedCrash(HoldfastError):
+class InjectedCrash(HoldfastError, text="injected crash at {at!r}, chance {number} (seed {seed})"):
     """Raised in a turn by a fault, as if the handler had."""
 
-    def __init__(self, at: str, number: int, seed: int) -> None:
-        super().__init__(at, number, seed)
-        self.at, self.number, self.seed = at, number, seed
-
-    def __str__(self) -> str:
-        return f"injected crash at {self.at!r}, chance {self.number} (seed {self.seed})"
+    at: str
+    number: int
+    seed: int
 
 
 class Strike(NamedTuple):

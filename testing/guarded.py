@@ -50,9 +50,7 @@ class Expected:
 class UnexpectedEnd(HoldfastError, AssertionError):
     """A guarded system saw what its test did not expect; each problem is a text."""
 
-    def __init__(self, problems: tuple[str, ...]) -> None:
-        super().__init__(problems)
-        self.problems = problems
+    problems: tuple[str, ...]
 
     def __str__(self) -> str:
         return "\n".join(self.problems)

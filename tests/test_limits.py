@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import sys
@@ -42,9 +41,6 @@ class Keeper(hf.Actor):
             case "tell itself":
                 self.ctx.ref.tell(Do("told"))
                 os.kill(os.getpid(), signal.SIGKILL)
-            case "publish":
-                self.ctx.ref.tell(Do("full"))
-                await self.ctx.publish("/limits", Do("heard"))
             case what:
                 self.done.append(what)
         return len(self.done)
@@ -54,6 +50,29 @@ class Keeper(hf.Actor):
 
     def on_undelivered(self, message: hf.Message[Any]) -> None:
         raise AssertionError("it is called in a task only")
+
+
+class Busy(Keeper):
+    """Has what binds it to its place: a child, a timer among its key variables, a wish to find somebody."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.timer: hf.Timer | None = None
+
+    @hf.on(Do)
+    async def do(self, message: Do) -> int:
+        match message.what:
+            case "spawn":
+                self.ctx.spawn(hf.start(Keeper), "child")
+            case "set a timer":
+                self.timer = self.ctx.tell_after(3600.0, Do("late"))
+            case "keep it aside":
+                self._timer, self.timer = self.timer, None
+            case "find":
+                return int(self.ctx.find("/app/nobody", Keeper).path == "/app/nobody")
+            case what:
+                self.done.append(what)
+        return len(self.done)
 
 
 class Acquainted(hf.Actor):
@@ -127,15 +146,67 @@ async def test_the_spec_of_a_child_comes_packed_from_another_process() -> None:
         assert isinstance(spec, Packed), spec
 
 
-async def test_who_publishes_to_its_own_full_mailbox_waits_for_itself() -> None:
-    """Until its life is ended. A tell would be refused, as long as there is no room."""
+async def attach(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    async with system.transaction(timeout=60.0) as change:
+        change.attach(ref, PBR())
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_an_actor_with_children_cannot_be_protected(isolation: Any) -> None:
     async with hf.ActorSystem("app", log=False) as system:
-        spec = hf.child("one", hf.start(Keeper), mailbox=hf.bounded(1), shutdown="brutal_kill")
-        ref = await system.start(spec)
-        waits = ref.ask(Do("publish"), timeout=60.0)
-        while (await system.get_status(ref, timeout=60.0)).turn is None:
-            await asyncio.sleep(0)
-        assert not waits.done()
-        await system.stop(ref)
-        with pytest.raises(hf.AskFailed):
-            await waits
+        ref = await system.start(hf.child("one", hf.start(Busy), isolation=isolation))
+        await ref.ask(Do("spawn"), timeout=60.0)
+        with pytest.raises(hf.TransactionFailed, match=r"children of its own \(child\): have a supervisor start them"):
+            await attach(system, ref)
+        assert await ref.ask(Do("goes on"), timeout=60.0) == 1
+
+
+async def test_what_a_protected_actor_spawns_ends_with_its_replica() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("one", hf.start(Busy), mechanism=PBR()))
+        await ref.ask(Do("spawn"), timeout=60.0)
+        os.kill(system.pid_of(system.ref("/app/one/ftm/r1", hf.Actor)), signal.SIGKILL)
+        assert await ref.ask(Do("goes on"), timeout=60.0) == 1
+        await ref.ask(Do("spawn"), timeout=60.0)  # The name is free: nobody has it there.
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_an_actor_with_a_timer_among_its_key_variables_cannot_be_attached(isolation: Any) -> None:
+    """The variable is named. With a leading underscore it is none."""
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("one", hf.start(Busy), isolation=isolation))
+        await ref.ask(Do("set a timer"), timeout=60.0)
+        with pytest.raises(hf.TransactionFailed, match=r"Busy\.timer: .*Timer cannot be saved; .* leading underscore"):
+            await attach(system, ref)
+        await ref.ask(Do("keep it aside"), timeout=60.0)
+        await attach(system, ref)
+        assert await ref.ask(Do("goes on"), timeout=60.0) == 1
+
+
+def with_more(state: Any) -> Any:
+    return {**state, "done": [*state["done"], "put there"]}
+
+
+async def test_state_and_code_of_a_protected_actor_are_not_replaced() -> None:
+    """Detach, replace, attach."""
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("one", hf.start(Keeper), mechanism=PBR()))
+        await system.suspend(ref, timeout=60.0)
+        for refused in (system.replace_state(ref, with_more), system.replace_code(ref, Busy)):
+            with pytest.raises(hf.ControlFailed, match=r"detach its mechanism, and attach it again after"):
+                await refused
+        await system.resume(ref, timeout=60.0)
+        async with system.transaction(timeout=60.0) as change:
+            change.detach(ref)
+        await system.replace_state(ref, with_more, timeout=60.0)
+        await attach(system, ref)
+        assert await ref.ask(Do("goes on"), timeout=60.0) == 2
+
+
+async def test_in_a_process_find_gives_a_ref_to_whatever_is_outside() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        ref = await system.start(hf.child("one", hf.start(Busy), isolation="process"))
+        assert await ref.ask(Do("find"), timeout=60.0) == 1
+        task = await system.start(hf.child("two", hf.start(Busy)))
+        with pytest.raises(hf.RemoteCrash, match="NoSuchActor"):
+            await task.ask(Do("find"), timeout=60.0)

@@ -9,9 +9,6 @@ from holdfast.actors.loop import RunLoop
 from holdfast.actors.stacks import stack_of
 from holdfast.supervision.supervisor import Supervisor
 
-WAIT_STILL = {"Replica"}
-"""Supervisors that do, by the names of their classes. The list may only become shorter."""
-
 
 class Waits:
     """What supervisors of the package have waited for in turns of their own, in this process."""
@@ -24,6 +21,6 @@ class Waits:
         """In place of `RunLoop.hold`, which is called where a turn begins to wait."""
         kind = type(cell.actor)
         is_ours = issubclass(kind, Supervisor) and kind.__module__.startswith("holdfast.")
-        if is_ours and item is not None and kind.__name__ not in WAIT_STILL:  # (No item: it ends.)
+        if is_ours and item is not None:  # (No item: it ends.)
             self.seen.append("\n".join([f"{cell.path} in the turn of {item!r}:", *stack_of(turn)]))
         self._hold(loop, cell, item, turn, waiting)

@@ -68,7 +68,7 @@ class Call(Item):
             value = call.order.run(ctx.cell, actor)
         except HoldfastError as error:
             ask.fail(error)
-        except Exception as error:  # The user's own code, such as `get_state`: no reason to end the actor.
+        except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.
             ask.fail(ControlFailed(ctx.path, call.order.verb, f"{type_name(type(error))}: {error_text(error)}"))
         else:
             call.give(value)

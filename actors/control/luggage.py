@@ -31,15 +31,10 @@ Owed = Callable[[int], Ask]
 """The ask that is known under a number."""
 
 
-class Stays(HoldfastError):
+class Stays(HoldfastError, text="{why}"):
     """Why an actor cannot leave the place it lives in."""
 
-    def __init__(self, why: str) -> None:
-        super().__init__(why)
-        self.why = why
-
-    def __str__(self) -> str:
-        return self.why
+    why: str
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -66,10 +66,12 @@ class Take(Item):
         try:
             children = [name for name in cell.children or () if name not in take._ignored]
             if children:
-                raise Stays(f"it has children of its own ({', '.join(children)})")
+                raise Stays(
+                    f"it has children of its own ({', '.join(children)}): have a supervisor start them beside it"
+                )
             state = ctx.depart(take._owe)
             take._taken(actor, state)
-        except Exception as error:  # The user's own code, such as `get_state`: no reason to end the actor.
+        except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.
             take._refused(str(error) if isinstance(error, HoldfastError) else error_text(error))
             return None
         take.is_done = True

@@ -167,14 +167,15 @@ def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[A
     """
     old = cell.more.start if cell.more is not None else None
     start = Start(new.kind, old.args, old.kwargs) if keeps_arguments and old is not None else new
-    if cell.spec is None:
-        return start  # It is never started again.
+    spec: Any = cell.spec
+    if not dataclasses.is_dataclass(spec) or isinstance(spec, type):
+        return start  # It is never started again, or by a supervisor in another process: there this is asked again.
     try:
         start.check()
     except TypeError as error:
         problem = f"{type_name(start.kind)} does not take the arguments of the old class ({error})"
         raise SpecError(cell.path, f"{problem}; give start({start.kind.__name__}, ...)") from error
-    dataclasses.replace(cell.spec, start=start)  # Raises what the spec does not allow.
+    dataclasses.replace(spec, start=start)  # Raises what the spec does not allow.
     return start
 
 
@@ -311,10 +312,15 @@ def pack_function(function: Callable[..., Any], where: str, order: str) -> list[
 
 def unpack_function(packed: Any) -> Callable[..., Any]:
     """The function again. Imports its module."""
-    name, args, kwargs = packed
+    try:
+        name, args, kwargs = packed
+    except (TypeError, ValueError):
+        raise SpecError(
+            "control", f"{packed!r:.100} is no function: a name, its arguments, and the named ones"
+        ) from None
     try:
         function = _found(name)
-    except Exception as error:  # Importing a module runs it: it may raise anything.
+    except BaseException as error:  # Importing a module runs it: it may raise anything.
         raise SpecError("control", f"{name} cannot be imported: {error_text(error)}") from error
     return functools.partial(function, *args, **kwargs) if args or kwargs else function
 

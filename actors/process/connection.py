@@ -62,15 +62,10 @@ FRAMES_PER_TICK = 128
 _DECODER: msgspec.msgpack.Decoder[AnyFrame] = msgspec.msgpack.Decoder(AnyFrame)
 
 
-class BadFrame(HoldfastError):
+class BadFrame(HoldfastError, text="malformed frame: {problem}"):
     """The peer sent something that is no frame of ours: the connection is closed."""
 
-    def __init__(self, problem: str) -> None:
-        super().__init__(problem)
-        self.problem = problem
-
-    def __str__(self) -> str:
-        return f"malformed frame: {self.problem}"
+    problem: str
 
 
 class Connection(asyncio.BufferedProtocol):

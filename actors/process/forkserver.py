@@ -9,6 +9,7 @@ Source: the fork server of `multiprocessing`; the zygote of Android.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import signal
@@ -39,7 +40,8 @@ class ForkServer:
         preload: names or paths of modules to import before the first fork.
         on_exit: called with (pid, wait status as from `waitpid`) when a child that `fork` has returned is dead and
             reaped, and its descendants are killed. Not called for children that end with the server.
-        on_lost: called when the server has died without `stop`; its children are being killed.
+        on_lost: called when the server has died without `stop`; its children are being killed, with what they have
+            started (but for what has left their process group).
         fork_seconds: time limit of `fork`.
     """
 
@@ -141,7 +143,7 @@ class ForkServer:
         """End the server, which kills all its children and their descendants first; may be called twice.
 
         Args:
-            timeout: seconds until the server itself is killed; its children then die too, their descendants may not.
+            timeout: seconds until the server itself is killed; its children then die too, and their process groups.
         """
         self._stopping = True
         self._close_control()
@@ -169,6 +171,9 @@ class ForkServer:
         # The kernel kills the children, except one that was stopped before it could ask for that.
         for child in self._children.values():
             child.kill()
+            # Each leads a process group: what it had started is in it, and nobody is left to find it there.
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.killpg(child.pid, signal.SIGKILL)
         self._children.clear()
         was_ready = self._ready.done() and not self._ready.cancelled() and self._ready.exception() is None
         self._fail_all(f"the fork server (pid {self._process.pid}) has died ({_cause(self._process.returncode)})")

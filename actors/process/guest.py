@@ -21,8 +21,9 @@ from ..events import ActorStarted, Event, event_data
 from ..exits import ExitReason, pack_exit
 from ..fast_loop import new_event_loop
 from ..mail import AnyTable
-from ..message import Order, message_name
+from ..message import Message, Order, message_name
 from ..node import Node
+from ..overdue import Overdue
 from ..ref import current
 from ..topics import Topics
 from . import frames
@@ -105,7 +106,10 @@ class OutsideTable(AnyTable):
     """The table of an actor that is not in this process: whether an order may be given there is looked at each time."""
 
     def __contains__(self, kind: object) -> bool:
-        return not issubclass(kind, Order)  # type: ignore[arg-type]  # a message's type
+        return self.knows(kind) and not issubclass(kind, Order)  # type: ignore[arg-type]  # a message's type
+
+    def knows(self, kind: type) -> bool:
+        return issubclass(kind, Message)
 
 
 OUTSIDE = OutsideTable()
@@ -163,6 +167,7 @@ class Guest(Peer):
         self.node.uplink = self
         self.node.here = InnerHost(self)
         self.node.topics = GuestTopics(self)
+        self.node.overdue = Overdue(loop)
         self.node.events.add_sink(self._on_event)
         self.takers: dict[type[frames.Frame], Callable[[Any], None]] = {
             frames.Tell: self._tell,
@@ -345,7 +350,9 @@ class Guest(Peer):
                 up: asyncio.Future[None] | None = self.moves.begin(cell, unpack_recipe(frame.recipe))
             else:
                 up = self._launcher(self, cell, frame)
-        except Exception as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
+        except (
+            BaseException
+        ) as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
             self._launched(frame.id, error)
             return
         if up is None:
@@ -358,7 +365,7 @@ class Guest(Peer):
         """An actor may be moved here."""
         try:
             self.moves.prepare(frame.recipe)
-        except Exception as error:  # Importing a module runs it.
+        except BaseException as error:  # Importing a module runs it.
             self._launched(frame.id, error)
         else:
             self._launched(frame.id, None)

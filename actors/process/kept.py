@@ -26,15 +26,11 @@ if TYPE_CHECKING:
     from ..node import Node
 
 
-class ProgramFailed(HoldfastError):
+class ProgramFailed(HoldfastError, text="{program}: {reason}"):
     """An external program could not be started, or was not ready in time; `reason` holds its last lines too."""
 
-    def __init__(self, program: str, reason: str) -> None:
-        super().__init__(program, reason)
-        self.program, self.reason = program, reason
-
-    def __str__(self) -> str:
-        return f"{self.program}: {self.reason}"
+    program: str
+    reason: str
 
 
 class Kept:

@@ -49,7 +49,7 @@ class Offered:
         taken: Awaitable[None] | None = None
         try:
             if self._topic is None or peer.node.topics.has(self._topic, cell):
-                room = cell.room()
+                room = None if cell is self._sender else cell.room()  # Who waits for itself waits for ever.
                 if room is not None:
                     room.add_done_callback(functools.partial(self._hand_to, cell))
                     return

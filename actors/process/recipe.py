@@ -150,6 +150,6 @@ def _named(name: str) -> Any:
         found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)
         for part in path.split("."):
             found = getattr(found, part)
-    except Exception as error:  # Importing a module runs it: it may raise anything.
+    except BaseException as error:  # Importing a module runs it: it may raise anything.
         raise SpecError("recipe", f"{name} cannot be imported: {error}") from error
     return found

@@ -131,7 +131,7 @@ class ToTask(FromProcess):
             self._luggage = luggage
             self._stash = unpack_items(cell, luggage["stash"], known)
             self._queued = unpack_items(cell, luggage["queue"], known)
-        except Exception as error:  # What a class of the state raises when it is read.
+        except BaseException as error:  # What a class of the state raises when it is read.
             self.give_up(error_text(error))
             return
         if not self.taken.done():
@@ -157,7 +157,7 @@ class ToTask(FromProcess):
         assert actor is not None
         try:
             unpack(actor, self._luggage["state"], rest, self._asks.__getitem__, self._watched)
-        except Exception as error:
+        except BaseException as error:
             raise StartFailed(cell.path, f"its state could not be restored: {error_text(error)}") from error
         gone = other.ended()
         settled = await_up(other, start)

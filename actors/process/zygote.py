@@ -80,6 +80,7 @@ class Zygote:
         config = self._config
         try:
             self._entry = find_entry(config.entry)
+            gc.enable()
         except BaseException as error:
             self._send(Kind.BROKEN, text=f"{type(error).__name__}: {error}")
             return False

@@ -45,6 +45,11 @@ def create_database(path: str, folder: str) -> None:
             db.execute(statement)
         db.execute("INSERT INTO store VALUES (1, 0, 0, '', 0, 0, ?)", (crc_of(0, 0, "", 0, 0),))
         db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", new_note())
+        # What is left in the WAL would be missing under the other name, and closing says nothing of what it could not
+        # bring over.
+        (is_busy, left, _) = db.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+        if is_busy or left:
+            raise sqlite3.OperationalError(f"{left} pages of the new database stay in its WAL")
     sync(new)
     try:
         os.link(new, path)

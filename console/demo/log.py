@@ -17,6 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...actors.errors import HoldfastError
+
 SCAN = "ROBOTLASER1"
 FIELDS_BEFORE_RANGES = 9  # tag type start fov step max_range accuracy remission_mode n
 FIELDS_AFTER_RANGES = 14  # laser x y theta, robot x y theta, tv rv forward side turn, time, host, logger_time
@@ -24,12 +26,12 @@ FEWEST_FIELDS = {"VERTEX_SE2": 5, "EDGE_SE2": 12}
 RECORD = re.compile(r"[A-Z][A-Z0-9_]*(:[A-Z0-9_]+)?$")
 
 
-class LogError(Exception):
+class LogError(HoldfastError):
     """A log cannot be used from this line on; line 0 is the file as a whole."""
 
-    def __init__(self, file: str, line: int, reason: str) -> None:
-        super().__init__(file, line, reason)
-        self.file, self.line, self.reason = file, line, reason
+    file: str
+    line: int
+    reason: str
 
     def __str__(self) -> str:
         where = f"{self.file}, line {self.line}" if self.line else self.file

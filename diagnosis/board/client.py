@@ -44,48 +44,33 @@ class BoardError(HoldfastError):
     """Something did not go well with the board."""
 
 
-class BoardUnreachable(BoardError):
+class BoardUnreachable(BoardError, text="the board at {url} cannot be reached: {why}; nothing was sent"):
     """There was no connection: nothing was sent."""
 
-    def __init__(self, url: str, why: str) -> None:
-        super().__init__(url, why)
-        self.url, self.why = url, why
-
-    def __str__(self) -> str:
-        return f"the board at {self.url} cannot be reached: {self.why}; nothing was sent"
+    url: str
+    why: str
 
 
-class BoardLost(BoardError):
+class BoardLost(
+    BoardError, text="the connection to the board at {url} ended before it had answered; it may have done it"
+):
     """The connection ended before the answer: it may have been done. To ask for the same again does no harm."""
 
-    def __init__(self, url: str) -> None:
-        super().__init__(url)
-        self.url = url
-
-    def __str__(self) -> str:
-        return f"the connection to the board at {self.url} ended before it had answered; it may have done it"
+    url: str
 
 
-class BoardSilent(BoardError):
+class BoardSilent(BoardError, text="the board at {url} did not answer within {seconds:g} s; it may have done it"):
     """No answer came in time: it may have been done. To ask for the same again does no harm."""
 
-    def __init__(self, url: str, seconds: float) -> None:
-        super().__init__(url, seconds)
-        self.url, self.seconds = url, seconds
-
-    def __str__(self) -> str:
-        return f"the board at {self.url} did not answer within {self.seconds:g} s; it may have done it"
+    url: str
+    seconds: float
 
 
-class BoardRefused(BoardError):
+class BoardRefused(BoardError, text="the board at {url} refuses: {why}"):
     """The board, or the client itself, says no, and why: nothing was done."""
 
-    def __init__(self, url: str, why: str) -> None:
-        super().__init__(url, why)
-        self.url, self.why = url, why
-
-    def __str__(self) -> str:
-        return f"the board at {self.url} refuses: {self.why}"
+    url: str
+    why: str
 
 
 class Board:

@@ -33,7 +33,7 @@ FASTEST, SLOWEST = 10, 3_600_000
 """Milliseconds between two broadcasts, at least and at most; 0 is none."""
 
 
-class BadFrame(HoldfastError):
+class BadFrame(HoldfastError, text="bad frame: {why}"):
     """Bytes that are no frame, or a frame that says what cannot be.
 
     Attributes:
@@ -41,12 +41,9 @@ class BadFrame(HoldfastError):
         is_fatal: where the next frame begins is not known.
     """
 
-    def __init__(self, why: str, sequence: int = 0, is_fatal: bool = False) -> None:
-        super().__init__(why, sequence, is_fatal)
-        self.why, self.sequence, self.is_fatal = why, sequence, is_fatal
-
-    def __str__(self) -> str:
-        return f"bad frame: {self.why}"
+    why: str
+    sequence: int = 0
+    is_fatal: bool = False
 
 
 class AskSpecification(msgspec.Struct, frozen=True):

@@ -30,9 +30,7 @@ class Problem(msgspec.Struct, frozen=True):
 class ModelError(HoldfastError):
     """A model that cannot be used: all that is wrong with it, one line each, with file and line where there is one."""
 
-    def __init__(self, problems: tuple[str, ...]) -> None:
-        super().__init__(tuple(problems))
-        self.problems = tuple(problems)
+    problems: tuple[str, ...]
 
     def __str__(self) -> str:
         return "\n".join(self.problems)

@@ -82,9 +82,8 @@ class Version(msgspec.Struct, frozen=True):
 class NoSuchVersion(HoldfastError):
     """A version that never was, or that is not kept any more."""
 
-    def __init__(self, version: int, kept: tuple[int, ...]) -> None:
-        super().__init__(version, tuple(kept))
-        self.version, self.kept = version, tuple(kept)
+    version: int
+    kept: tuple[int, ...]
 
     def __str__(self) -> str:
         return f"there is no version {self.version} of the model; kept are {', '.join(map(str, self.kept))}"

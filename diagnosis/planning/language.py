@@ -23,15 +23,11 @@ class Literal(NamedTuple):
         return text if self.value else f"not {text}"
 
 
-class PlanningError(HoldfastError):
+class PlanningError(HoldfastError, text="{where}: {problem}"):
     """A domain, a problem or an action is not valid: `where` names it."""
 
-    def __init__(self, where: str, problem: str) -> None:
-        super().__init__(where, problem)
-        self.where, self.problem = where, problem
-
-    def __str__(self) -> str:
-        return f"{self.where}: {self.problem}"
+    where: str
+    problem: str
 
 
 class Variable(NamedTuple):

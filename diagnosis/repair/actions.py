@@ -47,15 +47,11 @@ class Act:
     check: Callable[[], None]
 
 
-class ActionFailed(HoldfastError):
+class ActionFailed(HoldfastError, text="{action}: {why}"):
     """An action could not be done: `why` in words."""
 
-    def __init__(self, action: str, why: str) -> None:
-        super().__init__(action, why)
-        self.action, self.why = action, why
-
-    def __str__(self) -> str:
-        return f"{self.action}: {self.why}"
+    action: str
+    why: str
 
 
 Run = Callable[..., Awaitable[None]]

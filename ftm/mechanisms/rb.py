@@ -25,15 +25,11 @@ from ..runs import Deciding, Missing, Remembering, Run, Shadow
 from ..versions import version
 
 
-class NotAccepted(HoldfastError):
+class NotAccepted(HoldfastError, text="{actor}: {why}"):
     """No version has come to an outcome that the acceptance test takes: nothing was changed."""
 
-    def __init__(self, actor: str, why: str) -> None:
-        super().__init__(actor, why)
-        self.actor, self.why = actor, why
-
-    def __str__(self) -> str:
-        return f"{self.actor}: {self.why}"
+    actor: str
+    why: str
 
 
 class Alternating(Deciding):

@@ -17,11 +17,13 @@ from __future__ import annotations
 
 import asyncio
 import atexit
+import contextlib
 import dataclasses
 import functools
 import importlib
 import os
-import shutil
+import re
+import stat
 import tempfile
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -134,14 +136,24 @@ SUITES = ("aes-256-gcm", "chacha20-poly1305")
 """Ciphers that there are."""
 
 
+_MADE = re.compile(r"\.?[0-9a-f]{32}\.(key|root)(\..+)?")
+"""Names of the files that a participant makes among the keys."""
+
+
 @functools.cache
 def _folder_of(process: int) -> str:
     """The directory for keys that end with this process."""
     folder = tempfile.mkdtemp(prefix="holdfast-sec-")
+    made = os.lstat(folder)
 
     def remove() -> None:
-        if os.getpid() == process:  # A forked process ends, too.
-            shutil.rmtree(folder, ignore_errors=True)
+        if os.getpid() != process:  # A forked process ends, too.
+            return
+        with contextlib.suppress(OSError):  # Somebody was there before us, or has put something there: it stays.
+            if os.path.samestat(os.lstat(folder), made):
+                for name in filter(_MADE.fullmatch, os.listdir(folder)):
+                    os.unlink(os.path.join(folder, name))
+                os.rmdir(folder)
 
     atexit.register(remove)
     return folder
@@ -202,9 +214,11 @@ class SEC(Mechanism):
         except ImportError as error:
             raise MechanismRefused(self.name, str(error)) from error
         try:
-            about = os.stat(self.keys)
+            about = os.lstat(self.keys)
         except OSError as error:
             raise MechanismRefused(self.name, f"the directory of keys {self.keys} cannot be used: {error}") from error
+        if not stat.S_ISDIR(about.st_mode):
+            raise MechanismRefused(self.name, f"{self.keys} is no directory, and links are not followed")
         if about.st_uid != os.geteuid() or about.st_mode & 0o077:
             raise MechanismRefused(self.name, f"{self.keys} must belong to this user, with mode 0700")
 

@@ -39,24 +39,19 @@ _WORDS: Final = {
 class Rejected(HoldfastError):
     """Something was not accepted; `reason` is one of the constants here. It never tells of keys or contents."""
 
-    def __init__(self, reason: str, what: str = "") -> None:
-        super().__init__(reason, what)
-        self.reason, self.what = reason, what
+    reason: str
+    what: str = ""
 
     def __str__(self) -> str:
         about = f"{self.what}: " if self.what else ""
         return f"rejected ({self.reason}): {about}{_WORDS.get(self.reason, self.reason)}"
 
 
-class UnsafeKeyFile(HoldfastError):
+class UnsafeKeyFile(HoldfastError, text="the key file {path} is not used: {problem}"):
     """A file of private keys that others could have read or written, or that is none."""
 
-    def __init__(self, path: str, problem: str) -> None:
-        super().__init__(path, problem)
-        self.path, self.problem = path, problem
-
-    def __str__(self) -> str:
-        return f"the key file {self.path} is not used: {self.problem}"
+    path: str
+    problem: str
 
 
 class EnrolmentRefused(Refusal):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import os
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -18,9 +17,9 @@ from ..mechanism import MechanismRefused
 from ..sealed import FrameRefused
 from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
 from .certificates import MOST_NAME, Trust, about, make_request, public_of
-from .errors import UNTRUSTED, EnrolmentRefused, NoCertificate, Rejected
+from .errors import UNTRUSTED, EnrolmentRefused, NoCertificate, Rejected, UnsafeKeyFile
 from .handshake import Participant
-from .keys import Secret, SigningKey, raw_public
+from .keys import Secret, SigningKey, raw_public, read_own, write_own
 from .session import Limits
 
 if TYPE_CHECKING:
@@ -104,11 +103,11 @@ class Identity(Secret):
         if self._enrols is not None:
             root = await self._authority(GetRoot())
             self._check_root(root)
-            write_whole(root_file(settings.keys, settings.authority), root)
+            write_root(root_file(settings.keys, settings.authority), root)
             for path in (self.path, *self._enrols()):
                 await self._enrol(path)
         else:
-            root = root_file(settings.keys, settings.authority).read_bytes()
+            root = read_root(root_file(settings.keys, settings.authority))
             self._check_root(root)
         key = SigningKey.from_file(key_file(settings.keys, self.path))
         certificate = await self._authority(GetCertificate(certified(self.path)))
@@ -165,14 +164,19 @@ class Identity(Secret):
         self._node.emit(FrameRefused(self._address, self.path, reason, self.rejected[reason]))
 
 
-def write_whole(file: Path, content: bytes) -> None:
-    """All of it or nothing of it is there; mode 0600."""
+def write_root(file: Path, content: bytes) -> None:
+    """Write the authority's certificate for those who have to know it. What is there must be ours (`read_own`)."""
     try:
-        if file.read_bytes() == content:
+        if read_own(file) == content:
             return
     except FileNotFoundError:
         pass
-    descriptor, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
-    with os.fdopen(descriptor, "wb") as out:
-        out.write(content)
-    os.replace(name, file)
+    write_own(file, content, place=os.replace)
+
+
+def read_root(file: Path) -> bytes:
+    """Read it. Raises UnsafeKeyFile: it is not there, or not ours."""
+    try:
+        return read_own(file)
+    except FileNotFoundError:
+        raise UnsafeKeyFile(str(file), "the certificate of the authority is not there") from None

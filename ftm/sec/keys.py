@@ -6,10 +6,13 @@ is the fingerprint of its public half.
 
 from __future__ import annotations
 
+import contextlib
+import glob
 import hashlib
 import os
 import stat
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -102,6 +105,30 @@ def is_signed(key: Ed25519PublicKey, signature: bytes, data: bytes) -> bool:
 
 
 def _read(path: Path) -> Ed25519PrivateKey:
+    content = read_own(path)
+    try:
+        key = serialization.load_pem_private_key(content, password=None)
+    except (ValueError, TypeError, UnsupportedAlgorithm):
+        # No cause: its text could show what is in the file.
+        raise UnsafeKeyFile(str(path), "it holds no private key in PEM form") from None
+    if not isinstance(key, Ed25519PrivateKey):
+        raise UnsafeKeyFile(str(path), "its key is not an Ed25519 key")
+    return key
+
+
+def _write_new(path: Path, key: Ed25519PrivateKey) -> None:
+    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
+    with contextlib.suppress(FileExistsError):
+        write_own(path, pem, place=os.link)
+
+
+def read_own(path: Path) -> bytes:
+    """Read a file that only this process's user can have written or read. No link is followed.
+
+    Raises:
+        UnsafeKeyFile: somebody else could have, or it is a link, has several names, or cannot be read.
+        FileNotFoundError: it is not there.
+    """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
     except FileNotFoundError:
@@ -117,35 +144,46 @@ def _read(path: Path) -> Ed25519PrivateKey:
         if about.st_mode & 0o077:
             mode = f"{stat.S_IMODE(about.st_mode):04o}"
             raise UnsafeKeyFile(str(path), f"its mode is {mode}: others can get at it. Make new keys, with mode 0600")
-        content = os.read(descriptor, MOST_BYTES)
+        if about.st_nlink > 1:
+            _remove_half_made(path, about)
+            if os.fstat(descriptor).st_nlink > 1:
+                raise UnsafeKeyFile(str(path), "it has several names (hard links): remove all but one of them")
+        return os.read(descriptor, MOST_BYTES)
     finally:
         os.close(descriptor)
-    try:
-        key = serialization.load_pem_private_key(content, password=None)
-    except (ValueError, TypeError, UnsupportedAlgorithm):
-        # No cause: its text could show what is in the file.
-        raise UnsafeKeyFile(str(path), "it holds no private key in PEM form") from None
-    if not isinstance(key, Ed25519PrivateKey):
-        raise UnsafeKeyFile(str(path), "its key is not an Ed25519 key")
-    return key
 
 
-def _write_new(path: Path, key: Ed25519PrivateKey) -> None:
-    """All of the file or nothing of it is there, and it is not written over."""
-    pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")  # mode 0600
+def write_own(path: Path, content: bytes, *, place: Callable[[str, Path], None]) -> None:
+    """Make a file, mode 0600: all of it is there, under a name of its own, before `place` puts it where it belongs.
+
+    Raises:
+        UnsafeKeyFile: it cannot be written. FileExistsError: of `place`.
+    """
     try:
-        with os.fdopen(descriptor, "wb") as file:
-            file.write(pem)
-            file.flush()
-            os.fsync(file.fileno())
-        os.link(name, path)
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            place(name, path)
+        finally:
+            with contextlib.suppress(FileNotFoundError):  # It was renamed, or somebody has tidied up.
+                os.unlink(name)
+        folder = os.open(path.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
     except FileExistsError:
-        pass
-    finally:
-        os.unlink(name)
-    folder = os.open(path.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+        raise
+    except OSError as error:
+        raise UnsafeKeyFile(str(path), f"it cannot be written: {error}") from error
+
+
+def _remove_half_made(path: Path, about: os.stat_result) -> None:
+    """Remove the name that the file had before it was put in place: its maker was killed, or is about to do it."""
+    for one in path.parent.glob(f".{glob.escape(path.name)}.*"):
+        with contextlib.suppress(FileNotFoundError):
+            if os.path.samestat(os.lstat(one), about):
+                os.unlink(one)

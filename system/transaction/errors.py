@@ -15,9 +15,10 @@ class TransactionFailed(HoldfastError):
         kept: steps that could not be undone, each with the reason: their effect is still there.
     """
 
-    def __init__(self, step: str, cause: str, undone: tuple[str, ...] = (), kept: tuple[str, ...] = ()) -> None:
-        super().__init__(step, cause, tuple(undone), tuple(kept))
-        self.step, self.cause, self.undone, self.kept = step, cause, tuple(undone), tuple(kept)
+    step: str
+    cause: str
+    undone: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         left = f"; NOT undone: {'; '.join(self.kept)}" if self.kept else "; everything is as before"

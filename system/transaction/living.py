@@ -194,7 +194,7 @@ class ReplaceCode(Held):
 def check_unprotected(place: Place) -> None:
     """Refuse what would change one replica of a protected actor, and not the others. Raises SpecError."""
     if place.spec is not None and place.spec.mechanism is not None:
-        raise wrong(place.path, "it is protected by a mechanism: detach that first")
+        raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
 
 
 def _is_actor(kind: object) -> bool:

@@ -66,6 +66,7 @@ class OnProtection(OnLiving):
         )
         self._under_way = system.node.loop.create_task(change, name=f"mechanism of {cell.path}")
         await to_its_end(self.target, self._under_way)
+        self.probation = getattr(cell.host, "probation", None)  # None: there is no mechanism.
 
     async def undo(self, system: ActorSystem) -> None:
         if not self._has_begun:
@@ -108,15 +109,20 @@ class OnProtection(OnLiving):
 
     def seal(self, system: ActorSystem) -> None:
         notes, target, before, after = system.mechanism_notes, self.target, self._before, self._after
-        notes.put(target, before, after)
+        probation = self.probation
+        is_open = probation is not None and not probation.is_over
+        notes.put(target, before, after, is_trusted=not is_open)
         notes.over(target)
 
-        def back() -> None:
-            notes.put(target, after, before)
+        def over(is_kept: bool) -> None:
+            if is_kept:
+                notes.settled(target, after)
+            else:
+                notes.put(target, after, before, is_trusted=False)
             notes.flush()
 
-        if self.probation is not None:
-            self.probation.on_back = back
+        if probation is not None:
+            probation.when_over(over)
         self._give_back(system)
 
     async def finish(self, system: ActorSystem) -> None:

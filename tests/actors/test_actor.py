@@ -1,6 +1,7 @@
 """Actor classes: what `@on` checks, which handler gets a message, what a life has (DESIGN 3)."""
 
-from typing import Any
+import functools
+from typing import Any, cast
 
 import pytest
 
@@ -102,6 +103,44 @@ async def test_what_is_no_message_is_refused_with_advice(send: str, isolation: A
                 await getattr(ref, send)(no_message)  # A tell would return None, were it not refused.
             assert advice in str(caught.value)
             assert "@on(str)" not in str(caught.value)
+
+
+class Babble(hf.Message[list[str]]):
+    """Answered with how each way to send what is no message was refused."""
+
+
+class Babbler(hf.Actor):
+    to: hf.Binding[hf.Actor]
+
+    @hf.on(Babble)
+    async def babble(self, message: Babble) -> list[str]:
+        to, ctx = cast("Any", self.to), cast("Any", self.ctx)
+        refused: list[str] = []
+        for send in (to.tell, to.send, to.ask, functools.partial(ctx.publish, "/babble")):
+            for no_message in ("hello", Add):
+                try:
+                    sending = send(no_message)
+                    if sending is not None:
+                        await sending
+                except hf.BadMessage as error:
+                    refused.append(str(error))
+        return refused
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("to", ["task", "process"])
+async def test_what_an_actor_sends_that_is_no_message_is_refused_alike(to: Any, isolation: Any, recovery: Any) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("to", hf.start(Counter), isolation=to))
+        spec = hf.child("from", hf.start(Babbler), isolation=isolation, recovery=recovery, bindings={"to": "/app/to"})
+        refused = await (await system.start(spec)).ask(Babble(), 60)
+        assert len(refused) == 8
+        for error, where in zip(refused, ["/app/to"] * 6 + ["/babble"] * 2, strict=True):
+            assert f"to {where}: " in error
+            assert "class MyMessage(hf.Message[...])" in error or "send an instance, Add(...)" in error
+        with pytest.raises(hf.BadMessage, match=r"to /babble: messages are instances of a class of their own"):
+            await system.publish("/babble", cast("Any", "hello"))
 
 
 async def test_a_refusal_ends_the_turn_well(system: hf.ActorSystem) -> None:

@@ -179,6 +179,25 @@ async def test_a_failed_sync_stops_it_for_good(engine: Any) -> None:
     assert [type(one) for one in events] == [hf.JournalStopped]
 
 
+async def test_without_a_thread_to_be_had_the_loop_itself_waits_for_the_disk(
+    engine: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*args: Any, **named: Any) -> None:
+        raise RuntimeError("can't start new thread")
+
+    engine.let_sync.set()
+    name = "_start_joinable_thread" if hasattr(threading, "_start_joinable_thread") else "_start_new_thread"
+    with monkeypatch.context() as patch:
+        patch.setattr(threading, name, refused)
+        async with hf.ActorSystem("app", log=False, store=engine, durability="fsync") as system:
+            doer = await start(system, "task", "doer", hf.start(Doer), recovery=hf.hybrid(interval=1000.0))
+            before = engine.syncs
+            assert await doer.ask(Note("one"), timeout=30.0) == 1
+            assert engine.syncs > before
+            patch.undo()
+            assert await doer.ask(Note("two"), timeout=30.0) == 2
+
+
 async def test_a_handler_that_does_not_come_is_done_without(engine: Any) -> None:
     done: list[str] = []
     woken: list[int] = []

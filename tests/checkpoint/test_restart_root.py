@@ -47,3 +47,15 @@ def test_all_that_was_accepted_is_there_once_after_kills_of_the_root(tmp_path: P
     assert first == sorted(set(first)), f"seed {SEED}: doubled or reordered"
     assert accepted <= set(first), f"seed {SEED}: lost {sorted(accepted - set(first))[:10]}"
     assert set(first) <= accepted | unsure
+
+
+def test_a_turn_that_raises_when_it_is_run_again_is_a_crash_and_no_failed_start(tmp_path: Path) -> None:
+    script = Path(__file__).with_name("raising_player.py")
+    environment = {**os.environ, "PYTHONPATH": PATHS}
+    for life, code in (("first", -9), ("second", 0)):
+        command = [sys.executable, str(script), str(tmp_path / "app.db"), life]
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+        assert ended.returncode == code, ended.stderr
+    pings, crashed, restarted = json.loads(ended.stdout)
+    assert pings == [1, 1, 1, 1], "what waited behind it was lost"
+    assert crashed == restarted == ["/app/here/below", "/app/process", "/app/task", "/app/there/below"]

@@ -15,10 +15,24 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.values import encode_value
 from holdfast.console import endpoint as endpoint_module
 from holdfast.console.endpoint import Endpoint, EndpointInUse, claimed, control_endpoint
 from holdfast.console.remote import NotReached, RemoteRef, RemoteSystem
-from holdfast.console.wire import LARGEST, RESPONSE, BadRequest, Request, Tree, WrongUser, frame, outcome
+from holdfast.console.wire import (
+    LARGEST,
+    RESPONSE,
+    BadRequest,
+    Control,
+    Packed,
+    Plain,
+    Request,
+    Transact,
+    Tree,
+    WrongUser,
+    frame,
+    outcome,
+)
 from tests.system.trees import Add, Counter, counter, picture, ref
 
 
@@ -119,6 +133,27 @@ async def test_what_is_no_socket_is_left_alone(system: hf.ActorSystem, tmp_path:
     assert where.read_text() == "mine"
 
 
+@pytest.mark.parametrize("what", ["content", "hard link", "link", "fifo"])
+async def test_a_lock_that_is_not_ours_is_left_alone(system: hf.ActorSystem, tmp_path: Path, what: str) -> None:
+    where, lock, foreign = tmp_path / "app.sock", tmp_path / "app.sock.lock", tmp_path / "foreign"
+    foreign.write_text("mine" if what == "content" else "")
+    match what:
+        case "content":
+            foreign.rename(lock)
+        case "hard link":
+            os.link(foreign, lock)
+        case "link":
+            lock.symlink_to(foreign)
+        case _:
+            os.mkfifo(lock)
+    before = os.lstat(lock)
+    with pytest.raises(EndpointInUse, match=r"no lock of ours|symbolic links"):
+        async with control_endpoint(system, where):
+            pass
+    assert os.path.samestat(os.lstat(lock), before)
+    assert not where.exists()
+
+
 async def test_another_user_is_not_served(system: hf.ActorSystem, tmp_path: Path) -> None:
     """The check asks the kernel who is there; here the endpoint serves a user that we are not."""
     endpoint = Endpoint(system, os.geteuid() + 1)
@@ -147,6 +182,29 @@ BAD = {
     "nesting without end": (lambda body: HEAD.pack(len(body)) + body)(b"\x81\xa3ask" * 300_000),
     "wrong type": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "whereis", "name": 5})),
 }
+
+
+@pytest.mark.parametrize(
+    ("request_", "problem"),
+    [
+        (Transact([("step", [Plain("x")])], dry_run=False, timeout=1.0), "there is no operation 'step'"),
+        (Transact([("compose", [])], dry_run=False, timeout=1.0), "compose lacks outside"),
+        (Transact([("update", [Plain("/app/left")])], dry_run=False, timeout=1.0), "update lacks role"),
+        (
+            Control("replace_state", "/app/left", [Packed("function", encode_value("os:system"))], 1.0),
+            r"is no function \(name, arguments",
+        ),
+    ],
+)
+async def test_a_request_that_cannot_be_read_is_answered(
+    system: hf.ActorSystem, path: Path, request_: Request, problem: str
+) -> None:
+    reader, writer = await asyncio.open_unix_connection(path)
+    writer.write(frame(request_))
+    (size,) = HEAD.unpack(await reader.readexactly(4))
+    with pytest.raises(hf.HoldfastError, match=problem):
+        outcome(RESPONSE.decode(await reader.readexactly(size)))
+    writer.close()
 
 
 @pytest.mark.parametrize("what", BAD)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.process import frames
 from tests.control.conftest import Starter
 from tests.control.players import (
     Account,
@@ -85,3 +86,40 @@ async def test_replaced_code_outlives_its_supervisor(system: hf.ActorSystem, way
                 if isinstance(event, hf.ActorStarted) and event.address == "/app/top":
                     break
     assert await system.ref("/app/top/inner/one", Cents).ask(Add(1), timeout=30.0) == 100
+
+
+async def test_a_process_that_dies_before_it_has_answered_comes_back_with_its_new_state_and_class(
+    system: hf.ActorSystem,
+) -> None:
+    """The new state was saved: the old class could not go on with it."""
+    one = await system.start(
+        hf.child("one", hf.start(Account), recovery=hf.hybrid(interval=3600.0), isolation="process")
+    )
+    assert await one.ask(Add(1)) == 1
+    await system.suspend(one)
+    worker: Any = system._workers.of(one._cell)
+    takers = worker.connection.takers
+
+    def dies(_: frames.Reply) -> None:
+        worker.forked.kill()
+
+    takers[frames.Reply] = dies
+    with pytest.raises(hf.AskFailed):
+        await system.replace_code(one, Cents)
+    assert await one.ask(Euros(), timeout=30.0) == 1
+    assert (await system.get_status(one)).kind == "tests.control.players.Cents"
+    one.kill()
+    assert await one.ask(Add(1), timeout=30.0) == 200
+
+
+async def test_code_of_a_recorded_actor_below_a_process_is_replaced(system: hf.ActorSystem) -> None:
+    spec = hf.child("one", hf.start(Account), recovery=hf.hybrid(interval=3600.0))
+    await system.start(hf.supervisor("top", children=[spec], intensity=1000, isolation="process"))
+    one = system.ref("/app/top/one", Account)
+    assert await one.ask(Add(1), timeout=30.0) == 1
+    await system.suspend(one)
+    await system.replace_code(one, Cents)
+    await system.resume(one)
+    assert await one.ask(Add(1), timeout=30.0) == 200
+    one.kill()
+    assert await one.ask(Add(1), timeout=30.0) == 300

@@ -13,14 +13,15 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.process.remote import ProcessHost
-from holdfast.ftm.bricks import After
+from holdfast.checkpoint.records import Snapshot
+from holdfast.ftm.bricks import After, Before
 from holdfast.ftm.events import MechanismAttached, MechanismDetached
 from holdfast.ftm.failover import FailoverManager
 from holdfast.ftm.host import GroupHost
-from holdfast.ftm.mechanism import MechanismRefused, Role
+from holdfast.ftm.mechanism import Mechanism, MechanismRefused, Role
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.messages import Done
+from holdfast.ftm.messages import Done, Work
 from tests.ftm.accounts import Account, Add, Closed, Counter, Fussy, Later, Load, Pay, Purse, Tags, Total
 from tests.ftm.test_failover import METHODS, group_of, pid_of, two_again
 
@@ -199,6 +200,52 @@ async def test_a_last_snapshot_that_died_with_whoever_led_is_asked_for_again(sys
             await asyncio.sleep(0)
     os.kill(pid, signal.SIGKILL)
     await detaching
+    assert await ref.ask(Tags()) == list(range(5))
+
+
+class HeldUp(Before):
+    """Keeps a batch without requests, as the first one of whoever leads from now on is, while a file is there."""
+
+    async def before(self, work: Work) -> Work:
+        assert isinstance(self.mechanism, SavesFirst)
+        while not work.requests and os.path.exists(self.mechanism.path):
+            await asyncio.sleep(0.005)
+        return work
+
+
+class Lets(After):
+    async def after(self, done: Done) -> Done:
+        assert isinstance(self.mechanism, SavesFirst)
+        if any(isinstance(one, Snapshot) for one in done.more):
+            os.unlink(self.mechanism.path)
+        return done
+
+
+@dataclasses.dataclass(frozen=True)
+class SavesFirst(Mechanism):
+    """Whoever leads from now on gives its snapshot before it has come to the end of what the last one has left it."""
+
+    name: ClassVar[str] = "saves first"
+    layer: ClassVar[str] = "repetition"
+    roles: ClassVar[dict[str, Role]] = {"single": Role(before=HeldUp, after=Lets)}
+
+    path: str = ""
+
+
+async def test_a_last_snapshot_that_a_new_leader_keeps_back_needs_no_request_to_come_home(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    held = tmp_path / "held"
+    stack = (PBR(), SavesFirst(path=str(held)))
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid(interval=1000.0), mechanism=stack))
+    for number in range(5):
+        await ref.ask(Add(number))
+    group = group_of(ref)
+    await two_again(ref)
+    held.touch()
+    os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+    await detach(system, ref)
+    assert not held.exists()
     assert await ref.ask(Tags()) == list(range(5))
 
 

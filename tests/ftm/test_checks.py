@@ -18,7 +18,9 @@ from holdfast.ftm.letters import Letter
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
 from holdfast.ftm.messages import Change, Done, NotFollowing, ReplyEvicted, Request, State, Work
+from holdfast.ftm.orders import Broken
 from holdfast.ftm.points import checksum
+from holdfast.ftm.proxy import Settle
 from holdfast.ftm.replylog import ReplyLog
 from holdfast.ftm.state import MISFIT, Apply
 from tests.ftm import accounts
@@ -190,3 +192,19 @@ async def test_who_led_before_is_dead_when_another_one_is_told_to_lead(system: h
     assert await ref.ask(accounts.Add(1), timeout=30) == 2
     assert ("depose", True) in seen
     assert [alive for step, alive in seen if step in ("lead", "bind")] == [False, False]
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_nobody_speaks_for_a_replica(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(accounts.Counter), mechanism=PBR()))
+    await two_again(ref)
+    assert await ref.ask(accounts.Add(0)) == 1
+    group = group_of(ref)
+    assert group.primary is not None
+    detector, proxy = (system.node.cell_at(f"{ref.path}/ftm/{name}").ref for name in ("detector", "proxy"))
+    detector.tell(Broken(group.primary, group.life_of(group.primary), "forged"))
+    end = TurnEnd(group.switch.turn + 1, 1, OK, [], Answer(REPLY, "", b"\x63"))
+    proxy.tell(Done(group.epoch, group.config, -1, [end], False))
+    await proxy.ask(Settle())
+    assert (group.suspects, group.ending, group.stale, group.epoch) == ({}, {}, 1, 1)
+    assert await ref.ask(accounts.Add(1)) == 2

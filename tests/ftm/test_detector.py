@@ -99,6 +99,9 @@ class Watched:
         self.suspects: list[tuple[str, int, float]] = []
         self.loop = asyncio.get_running_loop()
 
+    def place(self, name: str) -> str:
+        return f"/app/{name}"
+
     def life_of(self, name: str) -> int:
         return self.lives[name]
 
@@ -113,16 +116,51 @@ class Watched:
         self.suspects.append((name, life, self.loop.time()))
 
 
+class Speak(hf.Message[None]):
+    name: str
+
+
+class Voice(hf.Actor):
+    """Says that a replica is alive."""
+
+    def __init__(self, detector: hf.ActorRef[Detector]) -> None:
+        self._detector = detector
+
+    @hf.on(Speak)
+    def speak(self, message: Speak) -> None:
+        self._detector.tell(Beat(message.name, 1))
+
+
+async def voices(system: hf.ActorSystem, detector: hf.ActorRef[Detector]) -> list[hf.ActorRef[Voice]]:
+    return [await system.start(hf.child(name, hf.start(Voice, detector))) for name in ("r1", "r2")]
+
+
+async def test_nobody_beats_for_another_one() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        detector = system.spawn(Start(Detector, (watched,)))
+        _, r2 = await voices(system, detector)
+        detector.tell(Beat("r1", 1))
+        await r2.ask(Speak("r1"))
+        await r2.ask(Speak("r2"))
+        async with asyncio.timeout(10):
+            while "r2" not in watched.up:
+                await asyncio.sleep(0)
+        assert watched.up == {"r2": 1}
+        await system.stop(detector)
+
+
 @pytest.mark.asyncio(loop_factories=["virtual"])
 async def test_who_falls_silent_is_suspected_and_the_other_is_not() -> None:
     """A55, A56."""
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
+        r1, r2 = await voices(system, detector)
         for beat in range(100):
-            detector.tell(Beat("r1", 1))
+            r1.tell(Speak("r1"))
             if beat < 50:
-                detector.tell(Beat("r2", 1))
+                r2.tell(Speak("r2"))
             await asyncio.sleep(DETECTION.interval)
         assert [name for name, _, _ in watched.suspects] == ["r2"]
         assert watched.suspects[0][2] - 0.0 > 2.4
@@ -134,11 +172,12 @@ async def test_a_new_life_of_a_suspect_is_judged_anew() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
-        detector.tell(Beat("r1", 1))
+        r1, _ = await voices(system, detector)
+        r1.tell(Speak("r1"))
         await asyncio.sleep(2.0)
         assert [one[:2] for one in watched.suspects] == [("r1", 1)]
         watched.lives["r1"] = 2
-        detector.tell(Beat("r1", 1))
+        r1.tell(Speak("r1"))
         await asyncio.sleep(0.1)
         assert len(watched.suspects) == 1
         await asyncio.sleep(2.0)
@@ -151,17 +190,18 @@ async def test_an_observer_that_was_held_up_suspects_nobody() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
+        r1, _ = await voices(system, detector)
         loop = asyncio.get_running_loop()
         for _ in range(10):
-            detector.tell(Beat("r1", 1))
+            r1.tell(Speak("r1"))
             await asyncio.sleep(DETECTION.interval)
         end = loop.time() + 1.0
         while loop.time() < end:  # Nothing else runs in this process meanwhile: no beat can be heard.
             pass
-        detector.tell(Beat("r1", 1))
+        r1.tell(Speak("r1"))
         for _ in range(4):
             await asyncio.sleep(DETECTION.interval)
-            detector.tell(Beat("r1", 1))
+            r1.tell(Speak("r1"))
         assert watched.suspects == []
         await system.stop(detector)
 
@@ -196,7 +236,8 @@ async def test_a_killed_detector_suspects_nobody_any_more() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         watched = Watched()
         detector = system.spawn(Start(Detector, (watched,)))
-        detector.tell(Beat("r1", 1))
+        r1, _ = await voices(system, detector)
+        r1.tell(Speak("r1"))
         await asyncio.sleep(0.1)
         detector._cell.kill()
         await asyncio.sleep(10.0)

@@ -31,6 +31,7 @@ from holdfast.ftm.sec.authority import CertificationAuthority, Enrol, GetRoot
 from holdfast.ftm.sec.certificates import Trust, make_request
 from holdfast.ftm.sec.errors import EnrolmentRefused
 from holdfast.ftm.sec.handshake import Participant
+from holdfast.ftm.sec.identity import root_file
 from holdfast.ftm.sec.keys import SigningKey
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.sec.parties import Office
@@ -321,6 +322,48 @@ async def test_keys_are_files_of_ours_alone_and_in_no_recipe(secured: hf.ActorSy
         body = file.read_text().splitlines()[1]
         assert body not in said
     assert b"PRIVATE" not in said.encode()
+
+
+async def test_a_link_among_the_keys_is_refused_and_where_it_leads_nothing_changes(
+    secured: hf.ActorSystem, tmp_path: Path
+) -> None:
+    keys, foreign = tmp_path / "keys", tmp_path / "foreign"
+    keys.mkdir(mode=0o700)
+    foreign.write_text("mine")
+    root_file(str(keys), CA).symlink_to(foreign)
+    with pytest.raises(hf.HoldfastError, match=r"root is not used: .*symbolic links"):
+        await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(SEC(CA, keys=str(keys)), hf.PBR())))
+    assert root_file(str(keys), CA).is_symlink()
+    assert foreign.read_text() == "mine"
+
+
+def test_a_directory_of_keys_that_is_a_link_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "keys").mkdir(mode=0o700)
+    (tmp_path / "link").symlink_to(tmp_path / "keys")
+    with pytest.raises(MechanismRefused, match="links are not followed"):
+        SEC(CA, keys=str(tmp_path / "link")).check(Counter)
+
+
+def test_at_the_end_only_the_keys_of_the_start_are_removed(tmp_path: Path) -> None:
+    program = """
+import pathlib, sys
+import holdfast as hf
+from holdfast.ftm.sec.identity import key_file
+from holdfast.ftm.sec.keys import SigningKey
+folder = pathlib.Path(hf.SEC("/app/authority").keys)
+SigningKey.from_file(key_file(str(folder), "/app/c"))
+assert len(list(folder.iterdir())) == 1
+if "foreign" in sys.argv:
+    (folder / "mine").write_text("mine")
+print(folder)
+"""
+    for args, left in ([], []), (["foreign"], ["mine"]):
+        run = [sys.executable, "-c", program, *args]
+        done = subprocess.run(run, env={**os.environ, "TMPDIR": str(tmp_path)}, capture_output=True, check=True)
+        folder = Path(done.stdout.decode().strip())
+        assert folder.parent == tmp_path
+        assert folder.exists() is bool(left)
+        assert [file.name for file in folder.glob("*")] == left
 
 
 @pytest.mark.parametrize("mode", [0o755, 0o770])

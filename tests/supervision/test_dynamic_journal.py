@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -149,6 +153,24 @@ async def test_a_made_up_id_is_not_given_twice_for_whoever_had_it_is_recorded(
         assert await anew.ask(Seen()) == ["Bob of nowhere"]
 
 
+async def test_what_was_recorded_of_one_that_has_ended_can_be_erased(store: str | None, isolation: Any) -> None:
+    async with running(store) as system:
+        top = await system.start(school(PUPIL, isolation=isolation))
+        bob = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
+        await bob.ask(Note("secret"))
+        with pytest.raises(hf.NotSupported):
+            await top.ask(hf.DeleteChild("bob"))
+        await top.ask(hf.TerminateChild("bob"))
+        with pytest.raises(hf.NoSuchChild):
+            await top.ask(hf.DeleteChild("bob", erase=False))
+        await top.ask(hf.DeleteChild("bob"))
+        with pytest.raises(hf.NoSuchChild):
+            await top.ask(hf.DeleteChild("bob"))
+        await restarted(system)
+        again = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
+        assert await again.ask(Seen()) == ["Bob of nowhere"]
+
+
 async def test_a_start_that_fails_or_is_refused_leaves_nothing_in_the_journal(
     store: str | None, isolation: Any, tmp_path: Path
 ) -> None:
@@ -216,3 +238,19 @@ async def test_a_fresh_or_deleted_supervisor_has_no_children(store: str | None, 
 def test_journal_is_yes_or_no(journal: Any) -> None:
     with pytest.raises(hf.SpecError, match="journal must be True or False"):
         hf.dynamic("x", journal=journal)
+
+
+@pytest.mark.parametrize("place", ["task", "process"])
+def test_who_waits_at_a_made_up_id_when_the_root_dies_is_told_by_the_next(tmp_path: Path, place: str) -> None:
+    """Without a journal nobody comes back there: the ask of a recorded turn fails, the rest are dead letters."""
+    script = Path(__file__).with_name("made_up_player.py")
+    paths = os.pathsep.join(filter(None, (str(Path(hf.__file__).parents[1]), os.environ.get("PYTHONPATH"))))
+    for life, code in (("first", -9), ("second", 0)):
+        command = [sys.executable, str(script), str(tmp_path / "app.db"), life, place]
+        environment = {**os.environ, "PYTHONPATH": paths}
+        ended = subprocess.run(command, capture_output=True, text=True, timeout=60, env=environment)
+        assert ended.returncode == code, ended.stderr
+    outcome, dead, still_recorded = json.loads(ended.stdout)
+    assert outcome == "ActorStopped"
+    assert dead == ["Hold", "Ping"]
+    assert not still_recorded

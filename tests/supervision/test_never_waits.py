@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.waits import WAIT_STILL
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -35,9 +34,11 @@ def test_no_handler_of_a_supervisor_can_wait() -> None:
         f"{kind.__name__}.{handler.__name__}"
         for kind in supervisors()
         for handler in kind._table.values()
-        if inspect.iscoroutinefunction(handler) and kind.__name__ not in WAIT_STILL
+        if inspect.iscoroutinefunction(handler)
     }
     assert not found
+    starts = {kind for kind in supervisors() if inspect.iscoroutinefunction(vars(kind).get("on_start"))}
+    assert starts == {hf.Supervisor}  # Its own start is an errand, too.
     assert {"Supervisor", "DynamicSupervisor", "PoolSupervisor", "PartitionSupervisor"} <= {
         kind.__name__ for kind in supervisors()
     }

@@ -39,6 +39,10 @@ class TellOther(hf.Message[None]):
     last: int
 
 
+class SendSelf(hf.Message[int]):
+    last: int
+
+
 class Reader(hf.Actor):
     """Takes two turns for each item, so that others come in between."""
 
@@ -74,7 +78,7 @@ class Listener(Reader):
 
 
 class Writer(hf.Actor):
-    other: hf.Binding[Reader]
+    other: hf.Binding[hf.Actor]
 
     @hf.on(Publish)
     async def publish(self, message: Publish) -> int:
@@ -82,10 +86,23 @@ class Writer(hf.Actor):
             await self.ctx.publish(TOPIC, Item(n))
         return message.last - message.first
 
+    @hf.on(SendSelf)
+    async def send_self(self, message: SendSelf) -> int:
+        for n in range(message.last):
+            try:
+                await self.ctx.ref.send(Item(n))
+            except hf.MailboxFull:
+                return n
+        return message.last
+
     @hf.on(TellOther)
     def tell_other(self, message: TellOther) -> None:
         for n in range(message.first, message.last):
             self.other.tell(Item(n))
+
+
+class Echo(Writer, Listener):
+    """Hears what it says."""
 
 
 # -- pools -----------------------------------------------------------------------------------------------------------
@@ -163,6 +180,25 @@ async def test_a_publisher_waits_for_room(isolation: Any, recovery: Any, listene
         assert (taken, system.dead_letters) == (list(range(25)), 0)
 
 
+@everywhere
+async def test_a_full_recorded_subscriber_holds_the_publisher_back(isolation: Any, recovery: Any) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        full = await system.start(
+            hf.child("full", hf.start(Listener), recovery=hf.hybrid(), mailbox=hf.bounded(1)),
+        )
+        other = await system.start(hf.child("other", hf.start(Listener)))
+        writer = await system.start(hf.child("writer", hf.start(Writer), isolation=isolation, recovery=recovery))
+        await system.suspend(full)
+        published = writer.ask(Publish(0, 9), 60)
+        while 1 not in await other.ask(Taken(), 60):
+            assert not published.done()
+        for _ in range(50):
+            assert max(await other.ask(Taken(), 60)) < 5, "it has room for one, and one is on its way"
+        await system.resume(full)
+        await published
+        assert await full.ask(Taken(), 60) == list(range(9))
+
+
 @pytest.mark.parametrize("publisher", ["system", *NAMES])
 async def test_one_full_subscriber_holds_back_the_publisher_and_no_other_subscriber(publisher: str) -> None:
     """And who has left the topic meanwhile, or has begun a life that never was there, does not get it."""
@@ -191,6 +227,34 @@ async def test_one_full_subscriber_holds_back_the_publisher_and_no_other_subscri
         await asyncio.wait_for(published, 60)
         assert [await reader.ask(Taken(), 60) for reader in (full, leaving, other)] == [[0, 1], [0], [1]]
         assert system.dead_letters == 0
+
+
+@pytest.mark.parametrize(
+    ("below", "isolation", "recovery"),
+    [*((None, *place) for place in PLACES), *(("process", *place) for place in PLACES[:2])],
+    ids=[*NAMES, *(f"{name}-below-a-process" for name in NAMES[:2])],
+)
+async def test_who_is_full_of_its_own_messages_does_not_wait_for_itself(
+    below: Any, isolation: Any, recovery: Any
+) -> None:
+    """Its turn makes no room while it waits. What is not taken is a dead letter, and others get it all."""
+    async with hf.ActorSystem("app", log=False) as system:
+        with system.events() as events:
+            other = await system.start(hf.child("other", hf.start(Listener)))
+            echo = hf.child(
+                "echo", hf.start(Echo), isolation=isolation, recovery=recovery, mailbox=hf.bounded(2), start_timeout=60
+            )
+            await system.start(echo if below is None else hf.supervisor("below", children=[echo], isolation=below))
+            ref = system.ref("/app/echo" if below is None else "/app/below/echo", Echo)
+            assert await ref.ask(Publish(0, 9), 60) == 9
+            taken = [*await ref.ask(Taken(), 60)]
+            lost = [event.message.n for event in events.take() if isinstance(event, hf.DeadLetter)]
+            assert taken + lost == list(range(9))
+            assert bool(lost) == (recovery is None), "a recorded actor has room for what it says itself"
+            assert await other.ask(Taken(), 60) == list(range(9))
+            sent = await ref.ask(SendSelf(9), 60)
+            assert await ref.ask(Taken(), 60) == [*taken, *range(sent)]
+            assert sent == (2 if recovery is None and isolation == "task" else 9)
 
 
 # -- who waits, and does not take the room ----------------------------------------------------------------------------

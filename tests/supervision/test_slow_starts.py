@@ -10,7 +10,10 @@ from typing import Any, Literal
 import pytest
 
 import holdfast as hf
+from holdfast.actors.events import LogLine
+from holdfast.actors.overdue import BLOCKED
 from holdfast.testing import idle
+from tests.supervision.blockers import Blocker
 from tests.supervision.family import Boom, refused
 
 SECONDS = 60.0  # of real time, far more than any of it takes
@@ -347,3 +350,24 @@ async def test_the_pauses_of_a_paced_replay_are_not_counted() -> None:
             told = events.take()
         assert await states(system, "/app/top") == {"a": "running"}
         assert not [event for event in told if isinstance(event, hf.ChildStartFailed)]
+
+
+# -- it blocks ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", ["__init__", "on_start", "on_stop"])
+async def test_a_child_that_blocks_its_process_beyond_its_limit_ends_it(phase: str) -> None:
+    """No timer comes there any more; the process says where it is blocked."""
+    async with hf.ActorSystem(log=False) as system:
+        with system.events() as events:
+            top = await system.start(hf.supervisor("top", children=[], isolation="process"))
+            spec = hf.child("blocks", hf.start(Blocker, phase), start_timeout=0.5, shutdown=0.5)
+            order = top.ask(hf.StartChild(spec), SECONDS)
+            if phase == "on_stop":
+                await order
+                order = top.ask(hf.TerminateChild("blocks"), SECONDS)
+            assert str(BLOCKED) in str(await refused(order))
+            await top.ask(hf.WhichChildren(), SECONDS)  # It is there again.
+            told = "\n".join(event.text for event in events.take() if isinstance(event, LogLine))
+        assert f"/app/top/blocks had 0.5 s to {'stop' if phase == 'on_stop' else 'start'}" in told
+        assert "time.sleep" in told

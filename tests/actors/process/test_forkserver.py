@@ -302,6 +302,21 @@ async def test_death_of_the_server_kills_all_children() -> None:
         child.close()
 
 
+async def test_what_its_children_have_started_ends_with_the_server() -> None:
+    """But for what has left their process group."""
+    async with running() as fixture:
+        child = await fixture.server.fork()
+        gone = os.pidfd_open(int(await call(child, "sleeper()")))
+        left = os.pidfd_open(int(await call(child, "sleeper(start_new_session=True)")))
+        os.kill(fixture.server.pid, signal.SIGKILL)
+        await fixture.lost.wait()
+        wait_gone([gone])
+        assert is_alive(left)
+        signal.pidfd_send_signal(left, signal.SIGKILL)
+        wait_gone([left])
+        child.close()
+
+
 async def test_a_fork_under_way_fails_when_the_server_dies() -> None:
     fixture = Fixture()
     await fixture.server.start()

@@ -111,6 +111,17 @@ async def test_the_fork_server_killed_and_all_come_back(system: hf.ActorSystem) 
     assert not zombies()
 
 
+async def test_what_an_actor_has_started_ends_with_the_fork_server(system: hf.ActorSystem) -> None:
+    """The actor's process dies with the server that would have ended it; the next one finds its port free."""
+    worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process"))
+    program = psutil.Process(await worker.ask(Run("start_program"), timeout=60.0))
+    server = psutil.Process(system.pid_of(worker)).parent()
+    assert server is not None
+    server.kill()
+    await until(lambda: not program.is_running() or program.status() == psutil.STATUS_ZOMBIE)
+    assert await worker.ask(Total(), timeout=60.0) == 0
+
+
 @pytest.mark.parametrize("victim", ["server", "spare"])
 async def test_no_actor_is_given_a_process_that_is_about_to_end(system: hf.ActorSystem, victim: str) -> None:
     """A start attempt lost that way would count as a restart. Nothing runs here between the death and the taking."""

@@ -62,6 +62,18 @@ def test_a_key_that_others_could_get_at_is_refused(tmp_path: Path, mode: int) ->
         SigningKey.from_file(path)
 
 
+def test_a_key_with_a_second_name_is_refused_unless_its_maker_was_killed(tmp_path: Path) -> None:
+    path = tmp_path / "key"
+    made = SigningKey.from_file(path).fingerprint
+    os.link(path, tmp_path / ".key.half-made")
+    assert SigningKey.from_file(path).fingerprint == made
+    assert [file.name for file in tmp_path.iterdir()] == ["key"]
+    os.link(path, tmp_path / "other")
+    with pytest.raises(UnsafeKeyFile, match="several names"):
+        SigningKey.from_file(path)
+    assert (tmp_path / "other").exists()
+
+
 def test_what_is_no_key_file_is_refused_and_not_shown(tmp_path: Path) -> None:
     path = tmp_path / "key"
     SigningKey.from_file(path)

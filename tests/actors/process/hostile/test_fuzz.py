@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 from collections.abc import Callable
 
@@ -12,6 +13,10 @@ from tests.actors.process.hostile.conftest import World
 from tests.actors.process.hostile.corpus import corpus
 from tests.actors.process.hostile.forging import framed
 from tests.actors.process.hostile.players import Ping
+
+SESSIONS = int(os.environ.get("HOLDFAST_FUZZ", "25"))
+"""What one worker tries, for each seed; more in a campaign."""
+FIRST = int(os.environ.get("HOLDFAST_SEED", "0"))
 
 ODD = (b"\0", b"\x7f", b"\xc0", b"\xc3", b"\xff", b"\x90", b"\x80", b"\xcf" + b"\xff" * 8, b"\xcb\x7f\xf8" + bytes(6))
 
@@ -64,9 +69,9 @@ def test_the_corpus_has_every_kind_that_a_worker_sends() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 async def test_frames_that_are_a_little_wrong_hurt_nobody(world: World, seed: int) -> None:
-    draw = random.Random(seed)
-    for number in range(25):
-        world.trying(f"seed {seed}, session {number}")
+    draw = random.Random(seed + FIRST)
+    for number in range(SESSIONS):
+        world.trying(f"seed {seed + FIRST}, session {number}")
         await world.write(session(draw))
         try:
             await world.evil.ask(Ping(), timeout=60)
