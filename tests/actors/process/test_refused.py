@@ -67,7 +67,9 @@ async def test_a_refusal_is_told_and_keeps_the_fork_server(
 
 
 async def test_a_fork_server_that_was_replaced_ends_with_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(forkserver.ForkServer.__init__.__kwdefaults__, "fork_seconds", 1.0)
+    defaults = forkserver.ForkServer.__init__.__kwdefaults__
+    assert defaults is not None
+    monkeypatch.setitem(defaults, "fork_seconds", 1.0)
     async with hf.ActorSystem("app", log=False) as system:
         first = await system.start(account("first"))
         await warmed_up(system)
