@@ -26,8 +26,8 @@ SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
 WITHIN = 120.0
 """Seconds in which everything ends, on a busy machine, also if each process and each ask takes its longest time."""
 
-# Not among them: what uvloop itself cannot do without (eventfd, epoll), where it ends the process at once. Of epoll, see
-# `test_watches.py`.
+# Not among them: what uvloop itself cannot do without (eventfd, epoll), where it ends the process at once.
+# Of epoll, see `test_watches.py`.
 KINDS = {
     "sync": ("fsync,fdatasync", "EIO ENOSPC", 120),
     "write a file": ("pwrite64,pwritev,pwritev2", "ENOSPC EIO EDQUOT", 60),
