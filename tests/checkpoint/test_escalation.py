@@ -124,6 +124,9 @@ async def test_a_turn_that_has_let_something_out_ends_with_the_state_it_began_wi
         await two_snapshots(system)
         at(system).tell(Do(["tell out", "flush", f"gate {gate}", "tell never"], notes))
         await until(gate.exists)
+        async with asyncio.timeout(60.0):
+            while await notes.ask(Notes()) != ["out"]:  # It may still be on its way from the process.
+                pass
         dead = system.dead_letters
         with system.events() as stream:
             at(system).kill()
