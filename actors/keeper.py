@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from .errors import ControlFailed
+
 
 class Keeper(Protocol):
     """Keeps state and messages of addresses, and small facts; there is one for each node."""
@@ -17,6 +19,15 @@ class Keeper(Protocol):
 
         Raises:
             HoldfastError: the store refused. What is left is erased when it is opened again.
+        """
+        ...
+
+    def roll_back(self, path: str, why: str) -> None:
+        """Have the next life at an address, where nobody lives now, begin with the snapshot before the newest.
+
+        Raises:
+            ControlFailed: nothing is recorded there, somebody lives there, or there is no older snapshot.
+            HoldfastError: the store refused.
         """
         ...
 
@@ -55,6 +66,10 @@ class NothingKept:
         if below:
             for key in self.notes(child_key(path, "")):
                 del self._notes[key]
+
+    def roll_back(self, path: str, why: str) -> None:
+        """There is nothing to go back to."""
+        raise ControlFailed(path, "roll_back", "nothing was recorded of it in this run")
 
     def blame(self, path: str) -> None:
         """Nobody is brought back."""

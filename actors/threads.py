@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import asyncio
 import concurrent.futures
+import contextlib
 import contextvars
 import functools
 import inspect
+import math
 import queue
 import threading
+import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
@@ -34,6 +37,25 @@ T = TypeVar("T")
 
 MOST = 40
 """Threads of one node; what comes when all are busy waits for one."""
+
+LOOK_AGAIN = 0.5
+"""Seconds between two looks of a waiting thread at whether the event loop it waits for is still there."""
+
+
+def wait_on_loop(
+    loop: asyncio.AbstractEventLoop, outcome: concurrent.futures.Future[Any], seconds: float = math.inf
+) -> bool:
+    """Have a thread wait for what was handed to an event loop. False: it will not come.
+
+    What is handed over while a loop takes its last steps is neither refused nor ever done: so the wait is for the loop,
+    too, and ends when that has been closed, or after `seconds`.
+    """
+    end = time.monotonic() + seconds
+    while True:
+        is_last = loop.is_closed() or time.monotonic() > end  # Asked first: what was done until then has come.
+        concurrent.futures.wait((outcome,), 0.0 if is_last else LOOK_AGAIN)
+        if outcome.done() or is_last:
+            return outcome.done()
 
 
 class Threads(concurrent.futures.Executor):
@@ -163,12 +185,11 @@ class ThreadContext:
             return function(*args, **kwargs)
         done: concurrent.futures.Future[Any] = concurrent.futures.Future()
         work = functools.partial(_answer, done, functools.partial(self._checked, function, *args, **kwargs))
-        try:
-            self._ctx.cell.node.loop.call_soon_threadsafe(work, context=contextvars.copy_context())
-        except RuntimeError as error:  # The loop is closed: nobody is left to do it.
-            raise HoldfastError(
-                f"{self._ctx.path}: the system has ended, and with it the turn of this thread"
-            ) from error
+        loop = self._ctx.cell.node.loop
+        with contextlib.suppress(RuntimeError):  # The loop is closed: nobody is left to do it.
+            loop.call_soon_threadsafe(work, context=contextvars.copy_context())
+        if not wait_on_loop(loop, done):
+            raise HoldfastError(f"{self._ctx.path}: the system has ended, and with it the turn of this thread")
         return done.result()
 
     def _checked(self, function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:

@@ -11,7 +11,7 @@ import msgspec
 
 from ..actors import exits, links, lives
 from ..actors.cell import DOWN, RUNNING, Cell, Host
-from ..actors.errors import StartFailed, StartIgnored
+from ..actors.errors import ControlFailed, StartFailed, StartIgnored
 from ..actors.exits import ExitReason, pack_exit
 from ..actors.keeper import child_key
 from ..actors.mail import Envelope, Item
@@ -113,6 +113,12 @@ class GuestKeeper:
             for key in self.notes(child_key(path, "")):
                 del self._notes[key]
         self._say("erase", path, below=below)
+
+    def roll_back(self, path: str, why: str) -> None:
+        """Have the root let its next life begin with an older snapshot; if there is none, the root tells that."""
+        if not self.knows(path):
+            raise ControlFailed(path, "roll_back", "nothing was recorded of it in this run")
+        self._say("roll_back", path, why=why)
 
     def blame(self, path: str) -> None:
         """The supervisor above this address ends because of the actor there."""

@@ -297,6 +297,8 @@ class Endpoint:
                     raise BadRequest(f"there is no operation {verb!r}")
                 named = NAMED.get(verb, ())
                 at = len(args) - len(named)
+                if at < 0:
+                    raise BadRequest(f"{verb} lacks {', '.join(named[at:])}")
                 getattr(change, verb)(*args[:at], **dict(zip(named, args[at:], strict=True)))
         steps = [(step.number, step.verb, step.target, step.text) for step in change.steps]
         return {"steps": steps, "difference": list(change.difference)}

@@ -1,6 +1,7 @@
 """The failure detector: heartbeats judged by phi accrual, on a clock that stands still while the observer does.
 
-A late observer sees all heartbeats late. What it was late itself is no silence of theirs, so its lag is taken out.
+A late observer sees all heartbeats late. What it was late itself is no silence of theirs, so its lag is taken out. So
+is the time for which a replica had no processor to beat with.
 
 Source:
     Hayashibara, Defago, Yared and Katayama, "The phi accrual failure detector" (2004).
@@ -70,8 +71,8 @@ def _number(value: object) -> bool:
 class Accrual:
     """What is known of one replica's heartbeats, and how much its silence means."""
 
-    def __init__(self, detection: Detection, now: float) -> None:
-        self._detection, self._last = detection, now
+    def __init__(self, detection: Detection, now: float, starved: float = 0.0) -> None:
+        self._detection, self._last, self.starved = detection, now, starved
         self._gaps: deque[float] = deque(maxlen=KEPT)
         self._sum = self._squares = 0.0
 
@@ -80,9 +81,9 @@ class Accrual:
         """When it was heard of last."""
         return self._last
 
-    def heard(self, now: float) -> None:
-        """A heartbeat has come."""
-        gap, self._last = max(0.0, now - self._last), now
+    def heard(self, now: float, starved: float = 0.0) -> None:
+        """A heartbeat has come, from one that had no processor for so many seconds of its life."""
+        gap, self._last, self.starved = max(0.0, now - self._last), now, starved
         if len(self._gaps) == KEPT:
             oldest = self._gaps[0]
             self._sum -= oldest
@@ -140,9 +141,9 @@ class Detector(Actor):
         if accrual is None or group.up.get(beat.name) != life:  # Or it is another replica of that name.
             for old in [one for one in self._known if one[0] == beat.name]:
                 del self._known[old]
-            self._known[beat.name, life] = Accrual(group.detection, now)
+            self._known[beat.name, life] = Accrual(group.detection, now, group.starved(beat.name))
         else:
-            accrual.heard(now)
+            accrual.heard(now, group.starved(beat.name))
         group.heard(beat.name, life)
 
     @on(Broken)
@@ -160,7 +161,7 @@ class Detector(Actor):
         for name, life in self._group.watched():
             accrual = self._known.get((name, life))
             if accrual is None:  # Not heard yet by this life of ours.
-                self._known[name, life] = Accrual(self._group.detection, now)
-            elif accrual.is_suspect(now):
+                self._known[name, life] = Accrual(self._group.detection, now, self._group.starved(name))
+            elif accrual.is_suspect(now) and accrual.is_suspect(now - self._group.starved(name) + accrual.starved):
                 self._group.silent(name, life, f"no heartbeat for {now - accrual.last:.3f} s")
         self._timer = loop.call_later(self._period, self._look)

@@ -58,6 +58,14 @@ def is_blocked(pid: int) -> bool:
     return state == "S" or (state == "R" and os.getloadavg()[0] <= (os.cpu_count() or 1))
 
 
+def waited_for_processor(pid: int) -> float:
+    """Seconds for which the main thread of a process was ready and got no processor, so far; 0.0 if nobody knows."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError):  # It has ended, or the kernel does not count that.
+        return 0.0
+
+
 def is_within(place: str, sender: ActorRef[Any] | None) -> bool:
     """Whether a replica, or what is below it, has said this."""
     return sender is not None and f"{sender.path}/".startswith(f"{place}/")
@@ -195,10 +203,19 @@ class Members(Securing):
     def silent(self, name: str, life: int, why: str) -> None:
         """No sign of life has come from a replica for too long."""
         self.suspect(name, life, why)
+        pid = self._pid_of(name)
+        if pid is not None and is_blocked(pid):
+            self.at_fault(name, why, has_ended=False)
+
+    def starved(self, name: str) -> float:
+        """Seconds for which a replica was ready to go on and got no processor, so far."""
+        pid = self._pid_of(name)
+        return 0.0 if pid is None else waited_for_processor(pid)
+
+    def _pid_of(self, name: str) -> int | None:
         cell = self.cell_of(name)
         worker = cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None
-        if worker is not None and is_blocked(worker.pid):
-            self.at_fault(name, why, has_ended=False)
+        return None if worker is None else worker.pid
 
     def broken(self, name: str, life: int, why: str) -> None:
         """A replica ends by itself, and nobody needs to wait for that: no sign of life counts any more."""

@@ -147,13 +147,16 @@ class RestartChild(Order[Any]):
 
     With `fresh` what was recorded of it (of a supervisor: of all below it) is erased first. With `running` a child that
     runs is stopped first: from there to its start it is one call, which goes on if whoever has asked ends meanwhile.
-    With `unless_parked` a child that was stopped by order is refused (ChildParked): so asks repair.
+    With `unless_parked` a child that was stopped by order is refused (ChildParked): so asks repair. With `older` it
+    begins with its snapshot before the newest; if there is none, one that ran goes on as it was, and the reply is
+    ControlFailed.
     """
 
     id: str
     fresh: bool = False
     running: bool = False
     unless_parked: bool = False
+    older: bool = False
 
 
 class DeleteChild(Order[None]):

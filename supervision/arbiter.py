@@ -249,7 +249,7 @@ def _in_hands(above: Cell | None, name: str) -> InOtherHands | None:
         return None
     path, child, cell = f"{above.path}/{name}", keeper._listed().get(name), (above.children or {}).get(name)
     if child is None or child.state == STOPPED:
-        return InOtherHands(path, OPERATOR, "it was stopped by order") if name in keeper._all_parked() else None
+        return InOtherHands(path, OPERATOR, "it was stopped by order") if keeper._is_parked(name) else None
     if child.state != UP:
         return InOtherHands(path, SUPERVISOR, f"it is {'being restarted' if child.state in AGAIN else child.state}")
     if cell is not None and cell.state in (ENDING, DOWN):

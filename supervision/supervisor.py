@@ -51,6 +51,9 @@ from .inquiries import Inquiries
 from .intensity import admit_restart, recent_restarts
 from .spec import ChildSpec, Flags, Plan, check_spec
 
+DISMISSED = 1000
+"""Of the children that were stopped by order and whose specs are gone, so many are remembered, the newest."""
+
 
 class Supervisor(Inquiries):
     """Keeps its children alive. Built by `supervisor(...)`, or derived from, with an `init` that returns a `Plan`."""
@@ -62,6 +65,7 @@ class Supervisor(Inquiries):
     _restarts: tuple[float, ...]
     _planned: frozenset[str]
     _parked: set[str]
+    _dismissed: dict[str, None]
     _first: Errand | None = None  # the errand of our own start
     _errands: Sequence[Errand] = ()  # those that wait; some that are over may be among them
 
@@ -118,6 +122,7 @@ class Supervisor(Inquiries):
         self._flags = plan.flags
         self._children = {spec.id: Child(spec) for spec in plan.children}
         self._planned, self._parked = frozenset(self._children), set[str]()
+        self._dismissed = {}
         self._restarts = ()
         self._early: list[lives.ChildExit] = []
 
@@ -231,6 +236,7 @@ class Supervisor(Inquiries):
     def _is_up(self, one: Child) -> None:
         one.state = UP
         self._parked.discard(one.spec.id)
+        self._dismissed.pop(one.spec.id, None)
         one.row = None
         one.up_since = self.ctx.cell.node.loop.time()
 
@@ -304,8 +310,11 @@ class Supervisor(Inquiries):
         """The spec goes: the one way out of the list of children."""
         if self._children.get(one.spec.id) is one:
             del self._children[one.spec.id]
-            if one.spec.id not in self._planned:  # Nobody brings it back: not our next life, either.
-                self._parked.discard(one.spec.id)
+            if one.spec.id in self._parked and one.spec.id not in self._planned:
+                self._parked.discard(one.spec.id)  # Nobody brings it back: not our next life, either.
+                self._dismissed[one.spec.id] = None
+                if len(self._dismissed) > DISMISSED:
+                    del self._dismissed[next(iter(self._dismissed))]
 
     def _end_with_significant(self, one: Child, reason: ExitReason) -> None:
         """A child has ended by itself for good: if it was significant, that may be the end of us."""
@@ -447,8 +456,13 @@ class Supervisor(Inquiries):
                 self._has_ended(one)
             await child.node.stop_child(child)
 
+    def _is_parked(self, name: str) -> bool:
+        """Whether this child was stopped by order, and not started since; also if it is forgotten by now."""
+        dismissed: dict[str, None] = self.__dict__.get("_dismissed", {})
+        return name in self._all_parked() or name in dismissed
+
     def _all_parked(self) -> set[str]:
-        """The children that were stopped by order, and not started since; also if their spec was deleted."""
+        """The children that were stopped by order, and not started since, but would be with our next life."""
         parked: set[str] = self.__dict__.get("_parked", set[str]())
         return parked
 
@@ -553,11 +567,22 @@ class Supervisor(Inquiries):
             one.state = STOPPED
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
+        problem: HoldfastError | None = None
+        if message.older:
+            try:
+                self.ctx.cell.node.keeper.roll_back(self._path_of(one), "it was asked for")
+            except HoldfastError as error:
+                if not message.running:
+                    raise
+                problem = error
 
         def undo(one: Child) -> None:
             self._give_up_address(one, "it could not be started")
 
-        return await self._start_by_hand(one, lambda one: None, undo, fresh=message.fresh)
+        started = await self._start_by_hand(one, lambda one: None, undo, fresh=message.fresh)
+        if problem is not None:
+            raise problem
+        return started
 
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:

@@ -5,21 +5,18 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import math
-import time
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
 from ..actors.message import Message
 from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
+from ..actors.threads import LOOK_AGAIN, wait_on_loop
 
 if TYPE_CHECKING:
     from ..actors.node import Node
 
 R = TypeVar("R")
-
-LOOK_AGAIN = 0.5
-"""Seconds between two looks of a waiting thread at whether the system's event loop is still there."""
 
 
 class ThreadPortal:
@@ -44,6 +41,7 @@ class ThreadPortal:
 
         def call() -> None:
             try:
+                self._check(ref)
                 ref.tell(message)
             except BaseException as error:
                 outcome.set_exception(error)
@@ -77,11 +75,11 @@ class ThreadPortal:
 
     async def send_async(self, ref: ActorRef[Any], message: Message[Any]) -> None:
         """As `send`, awaited on the calling thread's own event loop."""
-        await asyncio.wrap_future(self._begin(ref, ref.send, message))
+        await self._come(ref, self._begin(ref, ref.send, message))
 
     async def ask_async(self, ref: ActorRef[Any], message: Message[R], timeout: float = DEFAULT_TIMEOUT) -> R:
         """As `ask`, awaited on the calling thread's own event loop. Cancelling it ends the wait, never the turn."""
-        return await asyncio.wrap_future(self._begin(ref, _ask, ref, message, timeout))
+        return await self._come(ref, self._begin(ref, _ask, ref, message, timeout))
 
     # -- on the system's loop ---------------------------------------------------------------------------------------
 
@@ -92,6 +90,12 @@ class ThreadPortal:
         outcome: concurrent.futures.Future[R] = concurrent.futures.Future()
 
         def begin() -> None:
+            try:
+                self._check(ref)
+            except ActorStopped as error:
+                if outcome.set_running_or_notify_cancel():
+                    outcome.set_exception(error)
+                return
             task = self._node.loop.create_task(call(*args), name=f"called from a thread: {ref.path}")
             self._tasks.add(task)
             task.add_done_callback(self._tasks.discard)
@@ -102,24 +106,43 @@ class ThreadPortal:
 
     def _wait(self, ref: ActorRef[Any], outcome: concurrent.futures.Future[R], seconds: float = math.inf) -> R:
         """Wait in the calling thread; no longer than the deadline, and not for a loop that has been closed."""
-        end = time.monotonic() + seconds + LOOK_AGAIN
-        while True:
-            done, _ = concurrent.futures.wait((outcome,), LOOK_AGAIN)
-            if done:
-                return outcome.result()
-            if self._node.loop.is_closed():
-                raise ActorStopped(ref.path, "its system has ended")
-            if time.monotonic() > end:
-                raise AskTimeout(ref.path, seconds)
+        loop = self._node.loop
+        if not wait_on_loop(loop, outcome, seconds + LOOK_AGAIN):
+            raise _ended(ref) if loop.is_closed() else AskTimeout(ref.path, seconds)
+        return outcome.result()
+
+    async def _come(self, ref: ActorRef[Any], outcome: concurrent.futures.Future[R]) -> R:
+        """Await it on the calling thread's event loop, but not for a loop that has been closed."""
+        coming = asyncio.wrap_future(outcome)
+        try:
+            while not coming.done():
+                is_last = self._node.loop.is_closed()
+                await asyncio.wait((coming,), timeout=LOOK_AGAIN)
+                if is_last and not coming.done():
+                    raise _ended(ref)
+            return coming.result()
+        finally:
+            coming.cancel()
+
+    def _check(self, ref: ActorRef[Any]) -> None:
+        """Refuse what comes after the system's end, whatever its event loop does after it."""
+        root = self._node.root
+        if root is None or root.is_dead:
+            raise _ended(ref)
 
     def _hand_over(self, ref: ActorRef[Any], call: Callable[[], None]) -> None:
         node = self._node
-        if node.is_own_thread():
+        # The thread that ran a loop which is closed now is one like any other, and another one may have its number.
+        if node.is_own_thread() and not node.loop.is_closed():
             raise HoldfastError(f"{ref.path}: the system's own thread must not wait for itself; use the ref")
         try:
             node.loop.call_soon_threadsafe(call)
         except RuntimeError as error:  # The loop is closed.
-            raise ActorStopped(ref.path, "its system has ended") from error
+            raise _ended(ref) from error
+
+
+def _ended(ref: ActorRef[Any]) -> ActorStopped:
+    return ActorStopped(ref.path, "its system has ended")
 
 
 async def _ask(ref: ActorRef[Any], message: Message[R], timeout: float) -> R:
@@ -127,7 +150,7 @@ async def _ask(ref: ActorRef[Any], message: Message[R], timeout: float) -> R:
 
 
 def _hand_back(done: asyncio.Task[R], outcome: concurrent.futures.Future[R], ref: ActorRef[Any]) -> None:
-    error = ActorStopped(ref.path, "its system has ended") if done.cancelled() else done.exception()
+    error = _ended(ref) if done.cancelled() else done.exception()
     if not outcome.set_running_or_notify_cancel():
         return  # Whoever waited has given up.
     if error is not None:

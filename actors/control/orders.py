@@ -312,7 +312,12 @@ def pack_function(function: Callable[..., Any], where: str, order: str) -> list[
 
 def unpack_function(packed: Any) -> Callable[..., Any]:
     """The function again. Imports its module."""
-    name, args, kwargs = packed
+    try:
+        name, args, kwargs = packed
+    except (TypeError, ValueError):
+        raise SpecError(
+            "control", f"{packed!r:.100} is no function: a name, its arguments, and the named ones"
+        ) from None
     try:
         function = _found(name)
     except BaseException as error:  # Importing a module runs it: it may raise anything.

@@ -21,13 +21,15 @@ from collections.abc import Callable, Sequence
 from ..errors import ProcessUnavailable
 from .boot import HEADER, Kind, receive
 from .children import signal_by
-from .forked import SOCKET_BYTES, Forked, ForkRequest, has_ended
+from .forked import SOCKET_BYTES, Forked, ForkRequest, check_can_watch, has_ended
 from .launch import check_can_start, inherited, server_command, server_config, server_environment
 
 FORK_SECONDS = 10.0  # a server that does not answer by then is stopped or stuck
 IMPORT_SECONDS = 120.0  # time for user modules to be imported
 FORKS_IN_FLIGHT = 32  # each holds eight descriptors here, and four more on their way
 PACKETS_PER_TICK = 64
+AGAIN_AFTER = 0.1
+"""Seconds until a socket is read again that could not be read for want of memory."""
 
 
 class ForkServer:
@@ -56,6 +58,8 @@ class ForkServer:
     ) -> None:
         self.preload_errors: dict[str, str] = {}
         """What could not be imported, and why; "__main__" is the program itself."""
+        self.is_deaf = False
+        """Whether it has hung up, or did not answer in time: nothing more can be asked of it."""
         self.threads = 0
         """Threads in the server when it was ready. All but one were started by modules; a fork does not copy them."""
         self._entry, self._preload = entry, list(preload)
@@ -129,6 +133,7 @@ class ForkServer:
             )
         try:
             self._pidfd = os.pidfd_open(self._process.pid)
+            check_can_watch(self._pidfd, ours.fileno())
             self._loop.add_reader(self._pidfd, self._on_death)
         except BaseException:
             self._process.kill()  # not reaped yet, so the pid is still its own
@@ -161,8 +166,8 @@ class ForkServer:
     def _on_death(self) -> None:
         """The server's pidfd is readable: it has ended."""
         assert self._process is not None
+        self._loop.remove_reader(self._pidfd)  # First: whatever fails below must not bring us here again for ever.
         self._read_packets(limit=None)  # deaths it had still reported
-        self._loop.remove_reader(self._pidfd)
         os.close(self._pidfd)
         self._pidfd = -1
         self._process.poll()  # reaps exactly this process; somebody else's waitpid(-1) may have been first
@@ -213,6 +218,7 @@ class ForkServer:
             async with asyncio.timeout(seconds), self._slots:
                 return await self._fork()
         except TimeoutError:
+            self.is_deaf = True
             raise ProcessUnavailable(f"the fork server (pid {self.pid}) did not answer within {seconds:g} s") from None
         except OSError as error:
             raise ProcessUnavailable(f"no process can be started: {error}") from error
@@ -287,6 +293,7 @@ class ForkServer:
         except BlockingIOError:
             raise
         except OSError as error:  # a dead server is told by its pidfd
+            self.is_deaf |= isinstance(error, ConnectionError)
             if isinstance(packet, ForkRequest) and not packet.outcome.done():
                 packet.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be reached: {error}"))
 
@@ -303,11 +310,34 @@ class ForkServer:
                 return
             except ConnectionError:
                 data, fds = b"", []
+            except (OSError, MemoryError) as error:
+                self._pause_reading(error)
+                return
             if not data:  # its end; what that means is told by the pidfd
+                self.is_deaf = True
                 self._loop.remove_reader(self._control.fileno())
                 return
             kind, number, value = HEADER.unpack_from(data)
             self._on_packet(Kind(kind), number, value, data[HEADER.size :].decode(), fds)
+
+    def _pause_reading(self, error: OSError | MemoryError) -> None:
+        """Nothing can be taken from the socket now; what is in it stays there. At once it would be as bad."""
+        control = self._control
+        assert control is not None
+        self._loop.remove_reader(control.fileno())
+        for request in list(self._requests.values()):
+            if not request.outcome.done():
+                request.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be heard: {error!r}"))
+        self._loop.call_later(AGAIN_AFTER, self._read_again, control)
+
+    def _read_again(self, control: socket.socket) -> None:
+        if self._control is not control:
+            return
+        try:
+            check_can_watch(control.fileno())
+            self._loop.add_reader(control.fileno(), self._on_readable)
+        except OSError as error:
+            self._pause_reading(error)
 
     def _on_packet(self, kind: Kind, number: int, value: int, text: str, fds: list[int]) -> None:
         match kind:

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from ..errors import ActorStopped, HoldfastError, ProcessUnavailable
 from ..exits import NORMAL, Exited, ExitReason, Hung, OutOfMemory, Signal
 from . import keeper
+from .forked import check_can_watch
 from .input import InputWriter
 from .limits import Limits
 from .output import OutputReader
@@ -116,21 +117,19 @@ class Kept:
             undo.callback(self._keeper.kill)
             self._pidfd = os.pidfd_open(self._keeper.pid)
             undo.callback(os.close, self._pidfd)
-            self._loop.add_reader(self._pidfd, self._bury)  # A virtual clock refuses.
+            check_can_watch(self._pidfd, self._control.fileno(), out, err)
+            loop = self._loop
+            for fd, heard in ((self._pidfd, self._bury), (self._control.fileno(), self._read)):
+                loop.add_reader(fd, heard)  # A virtual clock refuses.
+                undo.callback(loop.remove_reader, fd)
+            self._outputs: list[OutputReader] = []
+            for name, fd in (("stdout", out), ("stderr", err)):
+                part = None if on_part is None else functools.partial(on_part, name)
+                self._outputs.append(OutputReader(loop, fd, functools.partial(on_line, name), part))
+                undo.callback(loop.remove_reader, fd)
             undo.pop_all()
-        loop = self._loop
-        self._outputs = [
-            OutputReader(
-                loop,
-                fd,
-                functools.partial(on_line, name),
-                None if on_part is None else functools.partial(on_part, name),
-            )
-            for name, fd in (("stdout", out), ("stderr", err))
-        ]
         if into >= 0:
             self.input = InputWriter(loop, into)
-        loop.add_reader(self._control, self._read)
 
     # -- what is asked of it ----------------------------------------------------------------------------------------
 

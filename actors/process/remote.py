@@ -494,6 +494,8 @@ def keep(node: Node, frame: frames.Command) -> None:
         match frame.data["what"]:
             case "erase":
                 keeper.erase(path, below=bool(frame.data.get("below")))
+            case "roll_back":
+                keeper.roll_back(path, str(frame.data.get("why", "")))
             case "blame":
                 keeper.blame(path)
             case "returned":

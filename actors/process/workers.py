@@ -20,7 +20,7 @@ from ..exits import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, pack_
 from ..mail import Ask
 from . import frames
 from .connection import BadFrame, Connection
-from .forked import Forked, has_ended
+from .forked import Forked, check_can_watch, has_ended
 from .forkserver import ForkServer
 from .gate import Gate
 from .inner import Inner
@@ -71,7 +71,11 @@ class Worker(Peer):
     # -- its life ---------------------------------------------------------------------------------------------------
 
     async def connect(self) -> None:
-        """Take over the socket and the output pipes."""
+        """Take over the socket and the output pipes.
+
+        Raises:
+            OSError: the loop cannot watch them.
+        """
         loop, forked = self.node.loop, self.forked
         self.join(Connection(self._on_frame, self._on_lost, guarded=True))
         self.connection.takers = {
@@ -79,11 +83,11 @@ class Worker(Peer):
             frames.Failure: self.on_failure,
             frames.Forget: self.on_forget,
         }
+        check_can_watch(forked.sock.fileno(), forked.stdout_fd, forked.stderr_fd)
         await self.connection.open(forked.sock)
         for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
-            fd = getattr(forked, name)
+            self._outputs.append(OutputReader(loop, getattr(forked, name), functools.partial(self._on_line, stream)))
             setattr(forked, name, -1)
-            self._outputs.append(OutputReader(loop, fd, functools.partial(self._on_line, stream)))
 
     def is_alive(self) -> bool:
         """Whether it can be given an actor: a process ends with its fork server, but not in the same instant."""
@@ -413,6 +417,7 @@ class Workers:
         self.by_cell: dict[Cell, Worker] = {}
         self._entry, self._preload, self._warm = entry, list(preload), warm
         self._server: ForkServer | None = None
+        self._servers: list[ForkServer] = []  # all that live, also one that does not answer
         self._opening = asyncio.Lock()
         self._alive: dict[int, Worker] = {}
         self._ready: list[Worker] = []
@@ -461,24 +466,24 @@ class Workers:
         return await self._fork()
 
     async def _fork(self) -> Worker:
-        is_second = False
-        while True:
+        server = await self._open()
+        try:
+            forked = await server.fork()
+        except ProcessUnavailable:
+            if self._closed or not (server.is_deaf or server.has_ended()):
+                raise  # What it refuses another one could not do either.
+            if self._server is server:
+                self._server = None
             server = await self._open()
-            try:
-                forked = await server.fork()
-                break
-            except ProcessUnavailable:
-                if is_second or self._closed:
-                    raise
-                if self._server is server:  # It died under us: start another one, once.
-                    self._server = None
-                is_second = True
+            forked = await server.fork()
         worker = Worker(self, forked, server)
         self._alive[forked.pid] = worker
         try:
             await worker.connect()
-        except BaseException:  # Whoever asked for it does not want it any more.
+        except BaseException as error:  # Or whoever asked for it does not want it any more.
             worker.kill(KILLED)
+            if isinstance(error, OSError):
+                raise ProcessUnavailable(f"no process can be watched: {error}") from error
             raise
         return worker
 
@@ -493,6 +498,7 @@ class Workers:
                 await server.start()
                 keep_large_memory()
                 self._server = server
+                self._servers.append(server)
             return self._server
 
     def _refill(self) -> None:
@@ -515,6 +521,8 @@ class Workers:
 
     def _on_lost(self, server: ForkServer) -> None:
         """A fork server died: its children die with it, each is seen by its socket; the next fork starts another."""
+        if server in self._servers:
+            self._servers.remove(server)
         if self._server is server:
             self._server = None
         for worker in list(self._alive.values()):
@@ -555,6 +563,6 @@ class Workers:
         if graves:
             await asyncio.wait(graves, timeout=REAPED_WITHIN * 2)
         async with self._opening:  # Whoever is in the middle of starting one has given up, or has it now.
-            server, self._server = self._server, None
-        if server is not None:
+            servers, self._servers, self._server = self._servers, [], None
+        for server in servers:
             await server.stop()

@@ -8,7 +8,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import inspect
 import os
 import signal
 from collections.abc import Awaitable, Callable, Mapping, Sequence
@@ -89,16 +88,18 @@ def restart_subtree(
 
 def roll_back(
     addresses: Mapping[str, str],
-    back: Callable[[str], Awaitable[None] | None],
     *,
     name: str = "roll_back",
     cost: int = 10,
     timeout: float = PATIENCE,
     **options: Any,
 ) -> RepairAction:
-    """`roll_back(n)`: stop it, have `back(address)` put an older state in its place, and start it."""
-    run = functools.partial(_roll_back, addresses=addresses, back=back, timeout=timeout)
-    more = {"grace": 1.0, "timeout": 3 * timeout} | options
+    """`roll_back(n)`: have a recorded actor stopped and started with its snapshot before the newest, in one such call.
+
+    If there is no older snapshot the action has failed, and the actor goes on as it was.
+    """
+    run = functools.partial(_restart, addresses=addresses, timeout=timeout, older=True)
+    more = {"grace": 1.0, "timeout": 2 * timeout} | options
     return _action(name, run, addresses, more, pddl=_restart_text(name, cost))
 
 
@@ -145,28 +146,15 @@ async def _stop(act: Act, node: str, *, addresses: Mapping[str, str], timeout: f
     await keeper.ask(TerminateChild(child, parks=False), timeout)
 
 
-async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float) -> None:
+async def _restart(act: Act, node: str, *, addresses: Mapping[str, str], timeout: float, older: bool = False) -> None:
     address = addresses[node]
     keeper, child = _keeper(act, address)
     act.check()
+    order = RestartChild(child, running=True, unless_parked=True, older=older)
     try:
-        await _ordered(act, keeper, address, RestartChild(child, running=True, unless_parked=True), 2 * timeout)
+        await _ordered(act, keeper, address, order, 2 * timeout)
     except ChildBusy as error:
         raise InOtherHands(address, "its supervisor", f"it is {error.state}") from error
-
-
-async def _roll_back(
-    act: Act, node: str, *, addresses: Mapping[str, str], back: Callable[[str], Any], timeout: float
-) -> None:
-    act.check()
-    try:
-        await _stop(act, node, addresses=addresses, timeout=timeout)
-        act.check()
-        waiting = back(addresses[node])
-        if inspect.isawaitable(waiting):
-            await waiting
-    finally:  # Also if it could not be put back, or was taken from us meanwhile: it was running before.
-        await _start(act, node, addresses=addresses, timeout=timeout)
 
 
 async def _bind(act: Act, node: str, *, bindings: Mapping[str, tuple[str, str, str]]) -> None:

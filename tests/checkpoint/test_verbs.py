@@ -208,17 +208,28 @@ async def test_what_a_turn_does_is_in_force_once_after_each_crash(name: str, iso
         await told_of_the_ends(system, ref)
 
 
-@pytest.mark.parametrize("name", ["hybrid", "replay_only", "checkpoint_only"])
-async def test_what_on_recovered_does_is_in_force_once_after_each_crash(name: str, isolation: str, store: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "moment"),
+    [
+        ("hybrid", RECOVERED),
+        ("replay_only", RECOVERED),
+        ("checkpoint_only", RECOVERED),
+        ("hybrid", RESTORED),
+        ("checkpoint_only", RESTORED),
+    ],
+)
+async def test_what_only_a_later_life_does_is_in_force_once_after_each_crash(
+    name: str, moment: str, isolation: str, store: str
+) -> None:
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
         notes = await peers(system)
-        ref = await acting(system, isolation, name, RECOVERED)
+        ref = await acting(system, isolation, name, moment)
         await ref.ask(Act(), timeout=30.0)
         await snapshot(system, ref)
         for recovered in (1, 2):
             await struck(system, ref)
             await stands(system, ref, 1 if name == "checkpoint_only" else recovered)
-            assert await notes.ask(Notes()) == [RECOVERED] * recovered
+            assert await notes.ask(Notes()) == [moment] * recovered
         await told_of_the_ends(system, ref)
 
 

@@ -15,10 +15,24 @@ import msgspec
 import pytest
 
 import holdfast as hf
+from holdfast.actors.values import encode_value
 from holdfast.console import endpoint as endpoint_module
 from holdfast.console.endpoint import Endpoint, EndpointInUse, claimed, control_endpoint
 from holdfast.console.remote import NotReached, RemoteRef, RemoteSystem
-from holdfast.console.wire import LARGEST, RESPONSE, BadRequest, Request, Tree, WrongUser, frame, outcome
+from holdfast.console.wire import (
+    LARGEST,
+    RESPONSE,
+    BadRequest,
+    Control,
+    Packed,
+    Plain,
+    Request,
+    Transact,
+    Tree,
+    WrongUser,
+    frame,
+    outcome,
+)
 from tests.system.trees import Add, Counter, counter, picture, ref
 
 
@@ -168,6 +182,29 @@ BAD = {
     "nesting without end": (lambda body: HEAD.pack(len(body)) + body)(b"\x81\xa3ask" * 300_000),
     "wrong type": (lambda body: HEAD.pack(len(body)) + body)(msgspec.msgpack.encode({"ask": "whereis", "name": 5})),
 }
+
+
+@pytest.mark.parametrize(
+    ("request_", "problem"),
+    [
+        (Transact([("step", [Plain("x")])], dry_run=False, timeout=1.0), "there is no operation 'step'"),
+        (Transact([("compose", [])], dry_run=False, timeout=1.0), "compose lacks outside"),
+        (Transact([("update", [Plain("/app/left")])], dry_run=False, timeout=1.0), "update lacks role"),
+        (
+            Control("replace_state", "/app/left", [Packed("function", encode_value("os:system"))], 1.0),
+            "is no function: a name, its arguments",
+        ),
+    ],
+)
+async def test_a_request_that_cannot_be_read_is_answered(
+    system: hf.ActorSystem, path: Path, request_: Request, problem: str
+) -> None:
+    reader, writer = await asyncio.open_unix_connection(path)
+    writer.write(frame(request_))
+    (size,) = HEAD.unpack(await reader.readexactly(4))
+    with pytest.raises(hf.HoldfastError, match=problem):
+        outcome(RESPONSE.decode(await reader.readexactly(size)))
+    writer.close()
 
 
 @pytest.mark.parametrize("what", BAD)

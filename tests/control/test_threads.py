@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import queue
 import subprocess
 import sys
 import threading
@@ -293,6 +294,38 @@ def test_a_thread_that_hangs_does_not_keep_the_program_alive(tmp_path: Path) -> 
     script.write_text(HANGING)
     ended = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120, check=False)
     assert (ended.stdout, ended.returncode) == ("over\n", 0), ended.stderr
+
+
+def test_a_thread_does_not_wait_for_a_loop_that_was_closed() -> None:
+    """What it wants done came when the loop had taken its last step."""
+    loop = asyncio.new_event_loop()
+    begun, go_on, outcomes = threading.Event(), threading.Event(), queue.SimpleQueue[str]()
+
+    def work(actor: hf.Actor) -> None:
+        begun.set()
+        go_on.wait()
+        try:
+            actor.ctx.now()
+        except hf.HoldfastError as error:
+            outcomes.put(str(error))
+
+    async def main() -> None:
+        async with hf.ActorSystem("inner", log=False) as inner:
+            one = await inner.start(hf.child("one", hf.start(Blocks), shutdown=0.05))
+            one.tell(Do(work))
+            await loop.run_in_executor(None, begun.wait)
+
+    loop.run_until_complete(main())
+    hand_over = loop.call_soon_threadsafe
+
+    def closing(*args: Any, **kwargs: Any) -> Any:
+        handle = hand_over(*args, **kwargs)
+        loop.close()
+        return handle
+
+    loop.call_soon_threadsafe = closing  # type: ignore[assignment]
+    go_on.set()
+    assert "the system has ended" in outcomes.get(timeout=60.0)
 
 
 def test_only_a_plain_def_can_block() -> None:

@@ -8,7 +8,6 @@ import math
 import os
 import random
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +18,7 @@ import pytest
 
 import holdfast as hf
 from tests.faults.ledgers import NAMES, ROUNDS, Entered, Ledger, store_of, tree
+from tests.faults.traced import can_trace, end_all
 
 RUNS = int(os.environ.get("HOLDFAST_SYSCALLS", "0"))
 """Faults drawn by the seed; some that are always the same without it."""
@@ -27,6 +27,7 @@ WITHIN = 120.0
 """Seconds in which everything ends, on a busy machine, also if each process and each ask takes its longest time."""
 
 # Not among them: what uvloop itself cannot do without (eventfd, epoll), where it ends the process at once.
+# Of epoll, see `test_watches.py`.
 KINDS = {
     "sync": ("fsync,fdatasync", "EIO ENOSPC", 120),
     "write a file": ("pwrite64,pwritev,pwritev2", "ENOSPC EIO EDQUOT", 60),
@@ -95,15 +96,6 @@ PROGRAM = "import sys; sys.path.append(sys.argv.pop()); from tests.faults.ledger
 ROOT = Path(__file__).parents[2]
 
 
-def can_trace() -> bool:
-    """Whether strace is here, and may do its work."""
-    if shutil.which("strace") is None:
-        return False
-    return (
-        subprocess.run(["strace", "-qq", "-e", "trace=none", "true"], capture_output=True, check=False).returncode == 0
-    )
-
-
 pytestmark = pytest.mark.skipif(not can_trace(), reason="needs strace, and the right to trace")
 
 
@@ -143,9 +135,7 @@ def run(fault: Fault, folder: Path) -> Outcome:
         except subprocess.TimeoutExpired:
             pytest.fail(f"a process is left behind: {_end(folder)}")
     finally:
-        for process in (program, tracer):
-            process.kill()
-            process.communicate()
+        end_all(program, tracer, folder)
     text = out.decode() + (folder / "said").read_text(errors="replace")
     memory = notes.read_bytes()
     acknowledged = [[number for number in range(ROUNDS) if memory[at * ROUNDS + number]] for at in range(len(NAMES))]

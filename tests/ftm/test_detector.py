@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import random
+import subprocess
+import sys
 from typing import Any
 
 import pytest
@@ -19,7 +22,7 @@ from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.orders import Beat
 from tests.ftm.accounts import Counter
-from tests.ftm.test_failover import group_of, two_again
+from tests.ftm.test_failover import group_of, pid_of, two_again
 
 DETECTION = Detection(interval=0.05, threshold=8.0, pause=0.2, spread=0.01)
 
@@ -96,6 +99,7 @@ class Watched:
         self.detection = DETECTION
         self.up: dict[str, int] = {}
         self.lives = {"r1": 1, "r2": 1}
+        self.starving = {"r1": 0.0, "r2": 0.0}
         self.suspects: list[tuple[str, int, float]] = []
         self.loop = asyncio.get_running_loop()
 
@@ -111,6 +115,9 @@ class Watched:
     def watched(self) -> list[tuple[str, int]]:
         known = {(name, life) for name, life, _ in self.suspects}
         return [one for one in self.up.items() if one not in known]
+
+    def starved(self, name: str) -> float:
+        return self.starving[name]
 
     def silent(self, name: str, life: int, why: str) -> None:
         self.suspects.append((name, life, self.loop.time()))
@@ -204,6 +211,45 @@ async def test_an_observer_that_was_held_up_suspects_nobody() -> None:
             r1.tell(Speak("r1"))
         assert watched.suspects == []
         await system.stop(detector)
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_replica_without_a_processor_is_not_suspected_until_it_had_one_and_said_nothing() -> None:
+    """T3."""
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        watched.starving["r1"] = watched.starving["r2"] = 5.0  # Of the time before: no excuse.
+        detector = system.spawn(Start(Detector, (watched,)))
+        for voice, name in zip(await voices(system, detector), ("r1", "r2"), strict=True):
+            voice.tell(Speak(name))
+        await asyncio.sleep(DETECTION.interval)
+        for _ in range(40):
+            watched.starving["r1"] += DETECTION.interval
+            await asyncio.sleep(DETECTION.interval)
+        assert [name for name, _, _ in watched.suspects] == ["r2"]
+        await asyncio.sleep(1.0)
+        assert [name for name, _, _ in watched.suspects] == ["r2", "r1"]
+        await system.stop(detector)
+
+
+async def test_what_a_replica_waits_for_a_processor_is_read_of_its_process(system: hf.ActorSystem) -> None:
+    """T3: one that shares a processor with a busy process has waited."""
+    ref = await system.start(hf.child("one", hf.start(Counter), mechanism=PBR()))
+    await two_again(ref)
+    group, name = group_of(ref), "r1"
+    pid = pid_of(system, ref, name)
+    processor = min(os.sched_getaffinity(pid))
+    before = group.starved(name)
+    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    try:
+        for one in (pid, busy.pid):
+            os.sched_setaffinity(one, {processor})
+        async with asyncio.timeout(60):
+            while group.starved(name) == before:
+                await asyncio.sleep(0.005)  # It beats, and has to wait for that.
+    finally:
+        busy.kill()
+        busy.wait()
 
 
 class QuickTR(TR):

@@ -337,8 +337,8 @@ CHECKS = {
     ),
     "a supervisor in a process hears what its child is protected by now": Check(
         "ftm/subtree.py",
-        "                self._port.to_life(Respec(self.described()))\n",
-        "                pass\n",
+        "            self._port.to_life(Respec(self.described()))\n",
+        "            pass\n",
         "tests/ftm/test_subtree_changes.py",
         "test_the_new_stack_holds",
     ),
@@ -365,8 +365,8 @@ CHECKS = {
     ),
     "nobody waits for the end of a replica with a broken brick": Check(
         "ftm/detector.py",
-        "        if self._group.life_of(message.name) == message.life:\n",
-        "        if False:\n",
+        "        if group.life_of(message.name) == message.life and is_within(",
+        "        if False and is_within(",
         "tests/ftm/test_failover_turns.py",
         "test_nobody_waits_for_the_turn_in_hand",
     ),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import functools
 import threading
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from typing import Any
 
 import pytest
@@ -116,7 +117,7 @@ async def test_threads_reach_actors_through_a_portal_in_order(system: hf.ActorSy
 
 
 async def test_errors_arrive_as_what_they_are(system: hf.ActorSystem) -> None:
-    book = await system.start(hf.child("book", hf.start(Notebook)))
+    book = await system.start(hf.child("book", hf.start(Notebook), shutdown=0.1))
     portal = system.from_thread()
     with pytest.raises(No, match="not today"):
         await in_thread(lambda: portal.ask(book, Refuse()))
@@ -139,33 +140,143 @@ async def test_another_event_loop_awaits(system: hf.ActorSystem) -> None:
     assert await in_thread(lambda: asyncio.run(elsewhere())) == 3
 
 
-@pytest.mark.asyncio(loop_factories=["asyncio"])  # The outer loop is only the place of the test.
-async def test_when_the_system_ends_nobody_waits_for_ever() -> None:
-    """Neither whoever waits then, nor whoever calls after it."""
-    asked, outcomes = threading.Event(), []
-    portals: list[tuple[hf.ThreadPortal, hf.ActorRef[Any]]] = []
-    ready = threading.Event()
+class Waiter(hf.Actor):
+    """Tells, in a thread-safe way, when it has been asked, and holds its end until it is let go."""
+
+    deterministic = False
+
+    def __init__(self, moments: Moments) -> None:
+        self.moments = moments
+
+    @hf.on(Hold)
+    async def hold(self, message: Hold) -> None:
+        self.moments.asked.set()
+        await asyncio.Event().wait()
+
+    @hf.on(Note)
+    def note(self, message: Note) -> None: ...
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        self.moments.stops.set()
+        await asyncio.get_running_loop().run_in_executor(None, self.moments.called.wait)
+
+
+class Moments:
+    """What the threads of a test tell each other."""
+
+    def __init__(self) -> None:
+        self.asked, self.stops, self.called = threading.Event(), threading.Event(), threading.Event()
+
+
+async def begun(waiting: Coroutine[Any, Any, Any], moments: Moments) -> Any:
+    """What comes of a call; the moments hear when it has been handed to the other loop."""
+    task = asyncio.ensure_future(waiting)
+    await asyncio.sleep(0)
+    moments.called.set()
+    return await task
+
+
+def name_of(call: Callable[[], Any]) -> str:
+    """The class of the library's own error that comes of a call; what else it raises is raised."""
+    try:
+        call()
+    except hf.HoldfastError as error:
+        return type(error).__name__
+    return "nothing"
+
+
+Calls = Callable[[hf.ThreadPortal, "hf.ActorRef[Any]"], Any]
+
+CALLS: dict[str, Calls] = {
+    "tell": lambda portal, ref: portal.tell(ref, Note(0, 0)),
+    "send": lambda portal, ref: portal.send(ref, Note(0, 0)),
+    "ask": lambda portal, ref: portal.ask(ref, Hold(), timeout=3600.0),
+    "send_async": lambda portal, ref: asyncio.run(portal.send_async(ref, Note(0, 0))),
+    "ask_async": lambda portal, ref: asyncio.run(portal.ask_async(ref, Hold(), timeout=3600.0)),
+}
+own_loops = pytest.mark.asyncio(loop_factories=["asyncio"])
+"""The loop of the test is only the place for it: the systems run on loops of their own, in threads."""
+
+
+@own_loops
+@pytest.mark.parametrize("ask", ["ask", "ask_async"])
+async def test_who_waits_when_the_system_ends_hears_of_it(ask: str) -> None:
+    moments = Moments()
+    moments.called.set()
+
+    async def main() -> str:
+        async with hf.ActorSystem("inner", log=False) as inner:
+            waiter = await inner.start(hf.child("waiter", hf.start(Waiter, moments), shutdown=0.05))
+            portal = inner.from_thread()
+            waiting = asyncio.ensure_future(in_thread(lambda: name_of(lambda: CALLS[ask](portal, waiter))))
+            await in_thread(moments.asked.wait)
+        return await waiting
+
+    assert await in_thread(lambda: asyncio.run(main())) == "AskFailed"  # Its turn was cut off.
+
+
+@own_loops
+async def test_who_calls_while_the_system_ends_hears_of_it() -> None:
+    moments = Moments()
+
+    async def main() -> str:
+        async with hf.ActorSystem("inner", log=False) as inner:
+            waiter = await inner.start(hf.child("waiter", hf.start(Waiter, moments)))
+            portal = inner.from_thread()
+
+            def call() -> str:
+                moments.stops.wait()
+                return name_of(lambda: asyncio.run(begun(portal.ask_async(waiter, Hold(), timeout=3600.0), moments)))
+
+            calling = asyncio.ensure_future(in_thread(call))
+        return await calling
+
+    assert await in_thread(lambda: asyncio.run(main())) == "ActorStopped"
+
+
+@own_loops
+@pytest.mark.parametrize("call", CALLS)
+async def test_who_calls_after_the_system_is_refused(call: str) -> None:
+    """Whether its event loop goes on, or is closed: also by the thread that ran it."""
+    found: list[tuple[hf.ThreadPortal, hf.ActorRef[Any]]] = []
+
+    async def main() -> str:
+        async with hf.ActorSystem("inner", log=False) as inner:
+            book = await inner.start(hf.child("book", hf.start(Notebook)))
+            found.append((inner.from_thread(), book))
+        return await in_thread(lambda: name_of(lambda: CALLS[call](*found[0])))
+
+    with concurrent.futures.ThreadPoolExecutor(1) as one:  # The very thread that has run the system.
+        assert await asyncio.wrap_future(one.submit(lambda: asyncio.run(main()))) == "ActorStopped"
+        after = one.submit(lambda: name_of(lambda: CALLS[call](*found[0])))
+        assert await asyncio.wrap_future(after) == "ActorStopped"
+    assert await in_thread(lambda: name_of(lambda: CALLS[call](*found[0]))) == "ActorStopped"
+
+
+@own_loops
+@pytest.mark.parametrize("call", CALLS)
+async def test_what_a_closed_loop_never_did_is_not_waited_for(call: str) -> None:
+    """It was handed over when the loop had taken its last step."""
+    ended = asyncio.new_event_loop()
+    found: list[tuple[hf.ThreadPortal, hf.ActorRef[Any]]] = []
 
     async def main() -> None:
         async with hf.ActorSystem("inner", log=False) as inner:
             book = await inner.start(hf.child("book", hf.start(Notebook)))
-            portals.append((inner.from_thread(), book))
-            ready.set()
-            await asyncio.get_running_loop().run_in_executor(None, asked.wait)
+            found.append((inner.from_thread(), book))
 
-    def wait() -> None:
-        ready.wait()
-        portal, book = portals[0]
-        asked.set()
-        try:
-            portal.ask(book, Hold(), timeout=3600.0)
-        except hf.HoldfastError as error:
-            outcomes.append(type(error))
+    handed_over = threading.Event()
+    hand_over = ended.call_soon_threadsafe
 
-    waiting = asyncio.get_running_loop().run_in_executor(None, wait)
-    await in_thread(lambda: asyncio.run(main()))
-    await waiting
-    assert outcomes[0] in (hf.ActorStopped, hf.AskFailed)
-    portal, book = portals[0]
-    with pytest.raises(hf.ActorStopped):
-        await in_thread(lambda: portal.ask(book, Noted()))
+    def handing_over(*args: Any, **kwargs: Any) -> asyncio.Handle:
+        handle = hand_over(*args, **kwargs)
+        handed_over.set()
+        return handle
+
+    with concurrent.futures.ThreadPoolExecutor(1) as own:  # Its thread is never the one that calls.
+        await asyncio.wrap_future(own.submit(ended.run_until_complete, main()))
+        ended.call_soon_threadsafe = handing_over  # type: ignore[assignment]
+        calling = asyncio.ensure_future(in_thread(lambda: name_of(lambda: CALLS[call](*found[0]))))
+        await in_thread(handed_over.wait)
+        ended.close()
+    assert await calling == "ActorStopped"

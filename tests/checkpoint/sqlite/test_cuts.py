@@ -248,6 +248,28 @@ def test_the_wal_is_brought_into_the_database_meanwhile(path: Path, monkeypatch:
     assert numbers(reopened(path)) == list(range(count))
 
 
+def test_a_wal_that_has_grown_long_begins_anew_although_writers_never_rest(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 16)
+    monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
+
+    def begun() -> int:
+        """How often the WAL was begun anew, which its header counts."""
+        with open(f"{path}-wal", "rb") as wal:
+            return int.from_bytes(wal.read(16)[12:], "big")
+
+    with closing(SqliteJournal(path)) as journal:
+        journal.append(inputs(1))
+        first, count = begun(), 1
+        while begun() < first + 3:
+            assert count < 40_000, "the WAL only grows"
+            for number in range(count, count + 100):
+                journal.append(inputs(1, start=number))
+            count += 100
+    assert numbers(reopened(path)) == list(range(count))
+
+
 def test_a_broken_off_transaction_leaves_no_trace(store: SqliteJournal, monkeypatch: pytest.MonkeyPatch) -> None:
     positions = store.append(inputs(2))
     for interrupted in (Chain, Claim):

@@ -2,7 +2,8 @@
 
 import asyncio
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable, Coroutine
+from typing import Any, Literal
 
 import pytest
 
@@ -158,17 +159,42 @@ class Slow(hf.Actor):
         await ends.wait()
 
 
+RESTARTS = pytest.mark.parametrize("restart", [restart_child, roll_back])
+
+
+async def start_slow(system: hf.ActorSystem, ending: list[asyncio.Event], intensity: int = 3) -> str:
+    """A recorded actor with two snapshots, and another one, below a supervisor below another one."""
+
+    class SlowNotes(Notes):
+        async def on_stop(self, reason: hf.ExitReason) -> None:
+            began, ends = ending
+            began.set()
+            await ends.wait()
+
+    slow = hf.child("a", hf.start(SlowNotes), recovery=hf.hybrid(interval=1000.0), shutdown=LONG)
+    low = hf.supervisor("low", children=[slow, hf.child("b", hf.start(Node))], intensity=intensity)
+    await system.start(hf.supervisor("s", children=[low]))
+    notes = system.ref("/t/s/low/a", Notes)
+    for text in ("a", "b"):
+        await notes.ask(Note(text))
+        await system.checkpoint(notes)
+    await notes.ask(Note("c"))
+    return "/t/s/low/a"
+
+
+@RESTARTS
 @pytest.mark.parametrize("who", ["its caller is killed", "its caller is cancelled"])
-async def test_a_restart_that_has_begun_is_carried_out_whoever_ends_meanwhile(system: hf.ActorSystem, who: str) -> None:
+async def test_a_restart_that_has_begun_is_carried_out_whoever_ends_meanwhile(
+    system: hf.ActorSystem, who: str, restart: Callable[[dict[str, str]], RepairAction]
+) -> None:
     # T63: between the stop and the start nobody has the actor but its supervisor.
     ending = [asyncio.Event(), asyncio.Event()]
-    await system.start(hf.supervisor("s", children=[hf.child("a", hf.start(Slow, ending))]))
-    path = "/t/s/a"
+    path = await start_slow(system, ending)
 
     class Repairing(hf.Actor):
         async def on_start(self, restored: bool) -> None:
-            act = Act(Step("restart_child", ("a",)), 1, "a test", self.ctx, lambda: None)
-            self.work = self.ctx.create_task(restart_child({"a": path})(act, "a"))
+            act = Act(Step("restart", ("a",)), 1, "a test", self.ctx, lambda: None)
+            self.work = self.ctx.create_task(restart({"a": path})(act, "a"))
 
     caller = system.spawn(hf.start(Repairing))
     async with asyncio.timeout(LONG):
@@ -182,7 +208,41 @@ async def test_a_restart_that_has_begun_is_carried_out_whoever_ends_meanwhile(sy
         with pytest.raises(InOtherHands, match="its supervisor"):
             arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else")
         ending[1].set()
-        assert await system.ref(path, Slow).ask(Who()) == 2
+        kept = ["a", "b"] if restart is roll_back else ["a", "b", "c"]  # Its end in good order has saved all three.
+        assert await system.ref(path, Notes).ask(Read()) == kept
+
+
+@RESTARTS
+async def test_a_supervisor_that_gives_up_in_the_middle_of_a_restart_leaves_nobody_stopped(
+    system: hf.ActorSystem, restart: Callable[[dict[str, str]], RepairAction]
+) -> None:
+    """The restart has failed, for whoever asked for it; the one above brings all back."""
+    ending = [asyncio.Event(), asyncio.Event()]
+    path = await start_slow(system, ending, intensity=0)
+    async with asyncio.timeout(LONG), asyncio.TaskGroup() as group:
+        restarting = group.create_task(failing(do(system, restart({"a": path}), "a")))
+        await ending[0].wait()
+        with system.events() as events:
+            system.ref("/t/s/low/b", Node).kill()
+            async for event in events:
+                if isinstance(event, hf.SupervisorGaveUp):
+                    break
+            with pytest.raises(InOtherHands, match="its supervisor"):
+                arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else")
+            ending[1].set()
+            await restarting
+            async for event in events:
+                if isinstance(event, hf.ActorStarted) and event.address == "/t/s/low/b":
+                    break
+        assert await system.ref(path, Notes).ask(Read()) == ["a", "b", "c"]
+        assert await life(system, "/t/s/low/b") == 1
+        assert await states(system) == {"a": "running", "b": "running"}
+        arbiter_of(system.node).release(arbiter_of(system.node).claim(path, Hand.REPAIR, "somebody else"))
+
+
+async def failing(work: Coroutine[Any, Any, None]) -> None:
+    with pytest.raises(hf.HoldfastError):
+        await work
 
 
 async def test_what_an_operator_has_stopped_is_started_by_an_operator_only(system: hf.ActorSystem) -> None:
@@ -225,6 +285,37 @@ async def test_a_child_of_a_dynamic_supervisor_is_restarted_where_it_is(system: 
     assert await life(system, "/t/d/a") == 2
 
 
+async def test_repair_leaves_those_alone_that_an_operator_has_stopped_and_that_are_forgotten(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("holdfast.supervision.supervisor.DISMISSED", 2)
+    arbiter = arbiter_of(system.node)
+
+    def is_free(address: str) -> bool:
+        try:
+            arbiter.release(arbiter.claim(address, Hand.REPAIR, "a test"))
+        except InOtherHands:
+            return False
+        return True
+
+    top = await system.start(hf.supervisor("s", children=[hf.child("b", hf.start(Node))]))
+    dynamic = await system.start(hf.dynamic("d"))
+    cases: list[tuple[hf.ActorRef[Any], Literal["temporary", "permanent"]]]
+    cases = [(top, "temporary"), (dynamic, "permanent")]
+    for keeper, restart in cases:
+        for name in ("x", "y", "z"):
+            await keeper.ask(hf.StartChild(hf.child(name, hf.start(Node), restart=restart)))
+            await keeper.ask(hf.TerminateChild(name, parks=name != "y"))
+        assert [is_free(f"{keeper.path}/{name}") for name in "xyz"] == [False, True, False]
+        assert is_free(keeper.path), "nobody of them would come back with it"
+        await keeper.ask(hf.StartChild(hf.child("x", hf.start(Node), restart=restart)))
+        assert is_free(f"{keeper.path}/x"), "it was started by order"
+        for name in ("y", "v"):
+            await keeper.ask(hf.StartChild(hf.child(name, hf.start(Node), restart=restart)))
+            await keeper.ask(hf.TerminateChild(name))
+        assert [is_free(f"{keeper.path}/{name}") for name in "zyv"] == [True, False, False], "the oldest is forgotten"
+
+
 async def test_restart_subtree(system: hf.ActorSystem) -> None:
     addresses = await tree(system)
     cells = {name: system.ref(path, Node)._cell for name, path in addresses.items()}
@@ -250,18 +341,6 @@ async def test_rebind(system: hf.ActorSystem) -> None:
     assert await system.ref(addresses["a"], Node).ask(Ask()) == "/t/standin"
 
 
-async def test_roll_back_stops_goes_back_and_starts(system: hf.ActorSystem) -> None:
-    addresses = await tree(system)
-    seen: list[tuple[str, str]] = []
-
-    async def back(address: str) -> None:
-        seen.append((address, (await states(system))["a"]))
-
-    await do(system, roll_back(addresses, back), "a")
-    assert seen == [("/t/s/low/a", "stopped")]
-    assert (await states(system))["a"] == "running"
-
-
 async def test_roll_back_to_an_older_snapshot(system: hf.ActorSystem) -> None:
     path = "/t/s/notes"
     spec = hf.child("notes", hf.start(Notes), recovery=hf.hybrid(interval=1000.0))
@@ -271,22 +350,19 @@ async def test_roll_back_to_an_older_snapshot(system: hf.ActorSystem) -> None:
         await notes.ask(Note(text))
         if text != "c":
             await system.checkpoint(notes)
-    await do(system, roll_back({"n": path}, system.roll_back), "n")
+    await do(system, roll_back({"n": path}), "n")
     # The stop in good order has taken one more snapshot, with all three.
     assert await system.ref(path, Notes).ask(Read()) == ["a", "b"]
     with pytest.raises(hf.ControlFailed, match="stop it first"):
         system.roll_back(path)
 
 
-async def test_if_there_is_nothing_to_go_back_to_the_actor_runs_again(system: hf.ActorSystem) -> None:
-    addresses = await tree(system)
-
-    def back(address: str) -> None:
-        raise ActionFailed("roll_back(a)", "there is no older snapshot")
-
-    with pytest.raises(ActionFailed, match="no older snapshot"):
-        await do(system, roll_back(addresses, back), "a")
-    assert (await states(system))["a"] == "running"
+@pytest.mark.parametrize("recovery", [None, hf.hybrid(interval=1000.0)], ids=["unrecorded", "recorded"])
+async def test_if_there_is_nothing_to_go_back_to_the_actor_runs_again(system: hf.ActorSystem, recovery: Any) -> None:
+    await system.start(hf.supervisor("s", children=[hf.child("notes", hf.start(Notes), recovery=recovery)]))
+    with pytest.raises(hf.ControlFailed, match="roll_back of /t/s/notes failed"):
+        await do(system, roll_back({"n": "/t/s/notes"}), "n")
+    assert await system.ref("/t/s/notes", Notes).ask(Read()) == []
 
 
 async def test_change_a_mechanism(system: hf.ActorSystem) -> None:
