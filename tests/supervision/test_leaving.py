@@ -44,7 +44,7 @@ async def test_what_would_end_the_program_ends_one_life(place: str, error: str) 
             top = await system.start(hf.supervisor("top", isolation=isolation, children=[], intensity=len(PHASES)))
             for phase in PHASES:
                 if place == "protected" and phase in ("task", "pipe"):
-                    continue  # What its background work raises ends a replica, not the life: `tests/ftm`.
+                    continue  # Its background work is that of a replica: not tried here.
                 spec = hf.child("x", hf.start(Leaver, phase, error), **PLACES[place])
                 started = top.ask(hf.StartChild(spec, fresh=True), SECONDS)
                 if phase.startswith(("__init__", "on_start")):
