@@ -132,7 +132,7 @@ async def test_money_is_moved_once_while_mechanisms_change(system: hf.ActorSyste
 
 async def test_compose_and_detach_a_layer(system: hf.ActorSystem) -> None:
     ref = await protected(system)
-    load = Load(ref)
+    load, events = Load(ref), system.events()
     async with system.transaction(timeout=30) as change:
         change.compose(ref, TR())
     assert stack(ref) == ("pbr", "tr")
@@ -150,7 +150,9 @@ async def test_compose_and_detach_a_layer(system: hf.ActorSystem) -> None:
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
         change.transition(ref, PBR())  # In the place of the one of its sort.
-    assert stack(ref) == ("pbr", "tr")
+    settled = [event for event in events.take() if isinstance(event, hf.MechanismSettled)]
+    assert stack(ref) == ("pbr", "tr"), settled
+    events.close()
     await load.reached(20)
     await load.stop()
     load.check(await ref.ask(Tags()))
