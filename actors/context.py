@@ -28,8 +28,10 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-class StashError(HoldfastError):
+class StashError(HoldfastError, text="{why}"):
     """Only a message can be stashed, once per turn."""
+
+    why: str
 
 
 class ActorContext:

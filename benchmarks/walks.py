@@ -19,7 +19,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Generator
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -34,7 +34,7 @@ BESIDE = tuple(PACKAGE + name + os.sep for name in ("tests", "benchmarks", "exam
 
 
 @contextmanager
-def traced() -> Iterator[list[str]]:
+def traced() -> Generator[list[str]]:
     """Note each file of the library that is entered meanwhile, in this thread or a new one."""
     entered: dict[str, None] = {}
 

@@ -26,8 +26,10 @@ COSTLY = 0.01
 PeerState = Literal["none", "joining", "live"]
 
 
-class PeerLost(HoldfastError):
+class PeerLost(HoldfastError, text="{why}"):
     """The other replica does not count any more: nobody waits for it."""
+
+    why: str
 
 
 class Standing:

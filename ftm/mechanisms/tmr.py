@@ -39,8 +39,10 @@ TRIES = 4
 """How often a replica is asked, if others join or go meanwhile."""
 
 
-class OutvotedHere(HoldfastError):
+class OutvotedHere(HoldfastError, text="{why}"):
     """The other replicas agree on something else: this one begins again with their state."""
+
+    why: str
 
 
 class Computing(Helping):

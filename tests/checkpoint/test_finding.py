@@ -126,7 +126,5 @@ async def test_a_binding_that_was_changed_below_a_process_is_not_known_to_a_repl
                 assert await ref.ask(Tell(""), timeout=30.0) == 3
             else:
                 async with asyncio.timeout(30.0):
-                    async for event in events:
-                        if isinstance(event, hf.RecoveryFailed):
-                            break
-                assert "diverged" in str(event)
+                    failed = await anext(event async for event in events if isinstance(event, hf.RecoveryFailed))
+                assert "diverged" in str(failed)
