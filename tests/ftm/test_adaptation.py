@@ -146,6 +146,7 @@ async def test_compose_and_detach_a_layer(system: hf.ActorSystem) -> None:
         change.compose(ref, LFR(), outside=True)
     assert stack(ref) == ("lfr", "tr")
     await two_again(ref)
+    await change.settled()  # A death on probation could be taken for its fault.
     os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
