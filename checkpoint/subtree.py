@@ -22,7 +22,7 @@ from ..actors.mailbox import Bound
 from ..actors.process import frames
 from ..actors.process.inner import know
 from ..actors.process.limits import Limits
-from ..actors.process.remote import ProcessHost
+from ..actors.process.remote import Elsewhere, ProcessHost
 from ..actors.process.workers import Worker, Workers
 from .controller import RemoteLife, records_of
 from .homes import HomeHost, Homes, seen
@@ -115,7 +115,7 @@ class Slots:
         return self._by_path[path]
 
 
-class SubtreeHome(HomeHost):
+class SubtreeHome(HomeHost, Elsewhere):
     """The host of one recorded address below a supervisor in another process.
 
     Of a child that a mechanism protects the lives are lived at the root: its host is another one, and this only hands
@@ -342,10 +342,15 @@ class SubtreeHome(HomeHost):
         if worker is self._worker and self._group is not None and self.cell is not None:
             self._group.lost(self.cell, reason)
         elif worker is self._worker and self._wanted is not None:
-            running = int(worker.page[self._slot]) - 1
-            self._closed(reason, running, ordered=reason == KILLED, noticed=worker.noticed_at)
+            self._closed(reason, self.running(self.cell), ordered=reason == KILLED, noticed=worker.noticed_at)
 
     # -- what a host does -------------------------------------------------------------------------------------------
+
+    def worker_of(self, cell: Cell) -> Worker | None:
+        return self._worker if cell.state is RUNNING else None
+
+    def running(self, cell: Cell | None) -> int:
+        return -1 if self._worker is None or self._wanted is None else int(self._worker.page[self._slot]) - 1
 
     def start(self, cell: Cell) -> None:
         raise HoldfastError(f"{cell.path} is started by its supervisor, which is in another process")

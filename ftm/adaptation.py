@@ -29,7 +29,6 @@ from .messages import ConfigMismatch, StaleEpoch
 from .orders import Abort, Commit, Prepare, Quiesce, Stand
 from .trial import TRIAL, TrialFailed, tried, until_given_up
 from .trial import ended as ended_trial
-from .unkept import is_unkept
 
 if TYPE_CHECKING:
     from .group import Group
@@ -42,6 +41,10 @@ ABORTED_WITHIN = 5.0
 """Seconds that it may take to end them again, before it is ended."""
 SECURED_WITHIN = 15.0
 """Seconds within which the authority has to have certified everybody."""
+WHOLE_WITHIN = 30.0
+"""Seconds for which replicas are waited for that are being replaced, before the others prepare."""
+COPIED_WITHIN = 5.0
+"""Seconds that a batch may take behind which the root gets the state."""
 REST_WITHIN = 5.0
 """Seconds within which what is inside has to come to its end; requests wait meanwhile."""
 COMMITTED_WITHIN = 5.0
@@ -195,7 +198,7 @@ class AdaptationEngine(Actor):
         except HoldfastError as error:
             change.give_up(str(error))
             return
-        if not group.is_steady():
+        if not await self._is_safe(change):
             return
         self._step("start")
         try:
@@ -224,6 +227,19 @@ class AdaptationEngine(Actor):
         change.is_preparing = False
         if change.stage is PREPARING:  # Else a failover has brought the stack before back meanwhile.
             change.prepared, change.epoch, change.stage = members, epoch, RESTING
+
+    async def _is_safe(self, change: Reconfiguration) -> bool:
+        """Whether new bricks may run where the state is: others have it too, as far as somebody else can.
+
+        What a trial does not show may end, or block, any replica that prepares, and another may die meanwhile.
+        """
+        group, end = self._group, self._now() + WHOLE_WITHIN
+        while not group.whole_since()[0] and self._now() < end and not change.why:
+            await self._wait_for_change(LOOK_AGAIN)
+        if not (change.is_back or change.why):
+            copied = group.keep_copy(change)
+            await asyncio.wait((copied, change.given_up), timeout=COPIED_WITHIN, return_when=asyncio.FIRST_COMPLETED)
+        return group.is_steady() and not change.why
 
     async def _try(self, change: Reconfiguration) -> None:
         """See, where it hurts nobody, whether the bricks start and pass a batch on, and whether links can be secured.
@@ -316,8 +332,7 @@ class AdaptationEngine(Actor):
             return False
         self._step("quiesce")
         # All at once, and behind the batch that is out: requests wait for one way there and back, not for one each.
-        wants_copy = not change.is_back and is_unkept(group.switch.method)
-        order, seconds = Quiesce(group.epoch, group.config, wants_copy), change.rest_within + 1.0
+        order, seconds = Quiesce(group.epoch, group.config), change.rest_within + 1.0
         asked = {name: group.protocol(name).ask(order, seconds) for name in change.prepared}
         for future in asked.values():
             future.add_done_callback(_heard)  # If this is given up, nobody looks at it.
@@ -332,8 +347,6 @@ class AdaptationEngine(Actor):
                 return False
         stands: dict[str, Stand] = {name: future.result() for name, future in asked.items()}
         self._check_stands(change, stands, primary)
-        if stands[primary].turn == group.switch.turn:
-            group.take_copy(stands[primary].copy)
         return not change.why and self._is_as_prepared(change)
 
     def _check_stands(self, change: Reconfiguration, stands: dict[str, Stand], primary: str) -> None:
@@ -439,6 +452,7 @@ class AdaptationEngine(Actor):
 
     def _over(self, change: Reconfiguration) -> None:
         change.stage = OVER
+        self._group.untrusted.discard(change)
         if self._group.change is change:
             self._group.change = None
 

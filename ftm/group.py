@@ -41,6 +41,7 @@ from .members import Members
 from .messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
 from .strays import Strays
 from .stuck import Stuck
+from .unkept import forget_ended, is_unkept
 
 if TYPE_CHECKING:
     from ..checkpoint.switch import Switch
@@ -83,7 +84,8 @@ class Group(Members):
         self.is_again = False  # another leader has not been sent all there is
         self.is_live = self.has_gone = False
         self.copy: Meta | None = None  # the state that home keeps while the mechanism is not trusted
-        self.wants_copy = False
+        self.untrusted: set[object] = set()  # those for whose sake it is kept
+        self._copying: list[asyncio.Future[None]] = []
         self._pieces: list[bytes] = []
         self.is_held = False  # nothing new goes in: nobody could take over yet
         self.is_suspended = self.is_stopping = False
@@ -197,7 +199,7 @@ class Group(Members):
         if not requests and go is None and not self.is_again:
             return None
         self.number += 1
-        self.out = Work(self.epoch, self.config, self.number, requests, go, self.is_again, self.wants_copy)
+        self.out = Work(self.epoch, self.config, self.number, requests, go, bool(self.untrusted))
         if not self.waiting or not requests:
             self.is_again = False
         return self.out
@@ -293,6 +295,11 @@ class Group(Members):
         out = self.out
         if done.is_last and out is not None and out.number == done.number:
             self.out = None
+            if out.copy:
+                copying, self._copying = self._copying, []
+                for future in copying:
+                    if not future.done():
+                        future.set_result(None)
             ended = {one.feed.id for one in out.requests}
             self.careful -= ended
             self._ended(ended)
@@ -309,6 +316,22 @@ class Group(Members):
                 meta = meta_now(self.switch, record.turn, record.stash, state)
                 self.copy = msgspec.structs.replace(meta, traps=record.traps)
                 put(self.switch, self.copy, 1)
+
+    def keep_copy(self, sake: object) -> asyncio.Future[None]:
+        """For the sake of something that is not trusted, home has a copy of a state that it would not keep otherwise.
+
+        Returns:
+            What ends when it has one, or cannot have it, as of a moment from now on.
+        """
+        future: asyncio.Future[None] = self.node.loop.create_future()
+        if is_unkept(self.switch.method):
+            self.untrusted.add(sake)
+            self._copying.append(future)
+            self.is_again = True  # It comes behind a batch, which may be empty.
+            self.poke()
+        else:
+            future.set_result(None)
+        return future
 
     def quiet(self) -> asyncio.Future[None]:
         """A future that ends when nothing is inside any more; somebody has seen to it that nothing new goes in."""
@@ -406,11 +429,6 @@ class Group(Members):
         if switch.method.replays or switch.method.snapshots or len(switch.turns) < KEPT_TURNS:
             return
         forget_ended(switch)
-
-
-def forget_ended(switch: Switch) -> None:
-    """Forget all ended turns of an actor that would begin afresh."""
-    put(switch, meta_now(switch, switch.turn, sorted(switch.stashed() & switch.open.keys())), 1)
 
 
 def without_deadline(feed: Feed) -> Feed:

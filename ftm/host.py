@@ -199,7 +199,7 @@ class GroupHost(Steered):
         group.on_start_failed = lambda end: self._start_failed(cell, end)
         group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
         group.on_joined = self._has_joined
-        group.on_fault = lambda name, why, has_ended: self._at_fault(group, name, why, has_ended=has_ended)
+        group.on_fault = lambda name, why: self._at_fault(group, name, why)
         group.drops = lambda end: self.probation is not None and self.probation.drops(end)
         group.back_to = lambda: self._back_to(group)
         group.went_back = lambda back: self._went_back(cell, group, back)
@@ -294,10 +294,10 @@ class GroupHost(Steered):
             is_wanted = not probation.settled.result().is_kept and earlier is not None and not earlier.is_over
             self.probation = earlier if is_wanted else None
 
-    def _at_fault(self, group: Group, name: str, why: str, *, has_ended: bool) -> None:
-        """A replica ends by its own doing: what it prepares is given up; a stack that is new gives way."""
-        if has_ended and group.change is not None and group.change.is_preparing and not group.change.is_back:
-            group.change.give_up(f"{name} has ended when it prepared it: {why}")
+    def _at_fault(self, group: Group, name: str, why: str) -> None:
+        """A replica fails by its own doing: what it prepares is given up; a stack that is new gives way."""
+        if group.change is not None and group.change.is_preparing and not group.change.is_back:
+            group.change.give_up(f"{name} has failed when it prepared it: {why}")
         if self.probation is not None and group is self.group:
             self.probation.failed(f"{name}: {why}")
 

@@ -104,7 +104,7 @@ class Members(Securing):
         self.is_over = False
         self._stirred: list[asyncio.Future[None]] = []
         self._was_whole, self._whole_since = False, time.time()
-        self.on_fault: Callable[[str, str, bool], None] = lambda name, why, has_ended: None
+        self.on_fault: Callable[[str, str], None] = lambda name, why: None
 
     def cell_of(self, name: str) -> Cell | None:
         """The cell of an actor of the mechanism, if there is one now."""
@@ -195,17 +195,17 @@ class Members(Securing):
             self.why, self.noticed = why, time.monotonic()
         self.wake()
 
-    def at_fault(self, name: str, why: str, *, has_ended: bool = True) -> None:
-        """A replica has ended by what its own code has done, or only looks as if it had."""
+    def at_fault(self, name: str, why: str) -> None:
+        """A replica has ended by what its own code has done, or looks as if it had."""
         if name in self.names and not self.is_over:
-            self.on_fault(name, why, has_ended)
+            self.on_fault(name, why)
 
     def silent(self, name: str, life: int, why: str) -> None:
         """No sign of life has come from a replica for too long."""
         self.suspect(name, life, why)
         pid = self._pid_of(name)
         if pid is not None and is_blocked(pid):
-            self.at_fault(name, why, has_ended=False)
+            self.at_fault(name, why)
 
     def starved(self, name: str) -> float:
         """Seconds for which a replica was ready to go on and got no processor, so far."""

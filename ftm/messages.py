@@ -116,17 +116,13 @@ Logged = tuple[str, int, int, TurnEnd]
 
 
 class Work(Message):
-    """A batch of requests on its way in. `again`: some may have been handled before (failover).
-
-    `copy`: home wants the state behind it too.
-    """
+    """A batch of requests on its way in. `copy`: home wants the state behind it too."""
 
     epoch: int
     config: int
     number: int
     requests: list[Request]
     go: Go | None = None  # replay is over behind these
-    again: bool = False
     copy: bool = False
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from ..actors.message import Message
-from ..checkpoint.records import Snapshot, TurnEnd
+from ..checkpoint.records import TurnEnd
 from .mechanism import Description
 
 
@@ -69,18 +69,13 @@ class Stand(msgspec.Struct, array_like=True):
     config: int
     turn: int
     leads: bool
-    copy: list[Snapshot] = []
 
 
 class Quiesce(Message[Stand]):
-    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in.
-
-    `copy`: home wants the state of the one that leads too.
-    """
+    """Answered when nothing is inside, and the other replica has all that it was sent. Nothing new may be sent in."""
 
     epoch: int
     config: int
-    copy: bool = False
 
 
 class Prepare(Message[None]):

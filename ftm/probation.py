@@ -15,7 +15,6 @@ from .events import MechanismSettled
 from .mechanism import NOTHING
 from .messages import RequestDropped
 from .orders import Computes, Doing
-from .unkept import is_unkept
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -93,7 +92,7 @@ class Probation:
     def moved(self, group: Group) -> None:
         """Another group goes on with the same stack."""
         self._group = group
-        group.wants_copy = is_unkept(group.switch.method)
+        group.keep_copy(self)
 
     def failed(self, why: str) -> bool:
         """Something has gone wrong which may be the fault of this stack. Whether the one before has to come back."""
@@ -129,7 +128,7 @@ class Probation:
         self.settled.set_result(event)
         if node.watched:
             node.emit(event)
-        self._group.wants_copy = False
+        self._group.untrusted.discard(self)
         self._on_over(is_kept)
         self._over(self)
 

@@ -143,7 +143,7 @@ class RequestProtocol(Transfer):
             self._standing.inside.update((one.feed.id, one) for one in left)
             self._current, self._copies = work.number, work.copy
             self._turn, self._came_out, self._behind = self._standing.server.turn, 0, ([], [])
-            self.before.tell(Work(work.epoch, work.config, work.number, left, work.go, work.again))
+            self.before.tell(Work(work.epoch, work.config, work.number, left, work.go))
 
     def _split(self, work: Work) -> tuple[list[TurnEnd], list[Request]]:
         """The outcomes that are known, in turn order, and the requests that were never handled."""
@@ -418,8 +418,7 @@ class RequestProtocol(Transfer):
             await self._quiet()
             await self.proceed.ask(Flush(), timeout=FOREVER)
             await self._drain_bricks()
-            copy = standing.server.copied() if message.copy and standing.leads else []
-            handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads, copy))
+            handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads))
         except HoldfastError as error:
             handle.fail(error)
         finally:
@@ -458,10 +457,13 @@ class RequestProtocol(Transfer):
         return self._answer(self._rehearsed())
 
     async def _rehearsed(self) -> None:
-        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody."""
+        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody.
+
+        In each role, and both ways into it: from the other one, and made in it.
+        """
         standing = self._standing
-        for leads in (True, False):
-            await self._order(Play(leads))
+        for leads, is_new in ((True, False), (True, True), (False, False), (False, True)):
+            await self._order(Play(leads, is_new))
             self._current = self._marker = CANARY
             self.before.tell(Work(standing.epoch, standing.config, CANARY, []))
             await self._quiet()

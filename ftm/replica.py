@@ -525,7 +525,10 @@ class Replica(Supervisor):
         old, standing = self._woven, self._standing
         standing.leads = message.leads
         places = weave(old.layers, leads=message.leads)
-        await self._end_bricks([name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]])
+        for slot, place in list(old.places.items()):
+            if place[:2] != places[slot][:2] or (message.is_new and slot != PROTOCOL):
+                await self._end_bricks([old.names.pop(slot)])
+                del old.places[slot]
         woven = self._woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         self._bind_all(woven)

@@ -17,6 +17,8 @@ MOST_COPIED: Final = 16_000_000
 class Reports(Points):
     """Collects it until a part is handed over, or until somebody comes for it (`on_more`)."""
 
+    _is_large = False  # for copies: it is not gone through again for that
+
     def tell_more(self, record: Beside) -> None:
         """Something goes home behind the ends of the part at hand, or by itself."""
         self.more.append(record)
@@ -60,7 +62,7 @@ class Reports(Points):
     def copied(self) -> list[Snapshot]:
         """The state as it is between two turns, for a home that keeps nothing otherwise; [] if it cannot be had."""
         life, more = self.life, self.more
-        if life is None or life.feed is not None or not life.is_live or not self.has_access:
+        if life is None or life.feed is not None or not life.is_live or not self.has_access or self._is_large:
             return []
         self.more = []
         try:
@@ -69,7 +71,8 @@ class Reports(Points):
         except Exception:  # What the user's own `get_state` raises: there is no copy then.
             found = []
         self.more = more
-        return found if sum(len(one.data) for one in found) <= MOST_COPIED else []
+        self._is_large = sum(len(one.data) for one in found) > MOST_COPIED
+        return [] if self._is_large else found
 
     def last_snapshot(self) -> None:
         """The life ends in good order."""

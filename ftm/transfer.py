@@ -40,9 +40,13 @@ class Assume(Message[None]):
 
 
 class Play(Message[None]):
-    """To a replica that is no part of a group yet: have the bricks of this role, but not the protected actor."""
+    """To a replica that is no part of a group yet: have the bricks of this role, but not the protected actor.
+
+    `is_new`: all of them are made anew.
+    """
 
     leads: bool
+    is_new: bool
 
 
 class Astray(Message[None]):

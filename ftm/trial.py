@@ -74,7 +74,7 @@ async def rehearsed(group: Group, name: str) -> None:
     try:
         await group.entry(name).ask(Rehearse(), PASSED_WITHIN)
     except AskTimeout:
-        why = f"one of its bricks did not pass on an empty batch within {PASSED_WITHIN:g} s"
+        why = f"one of its bricks did not start, or pass on an empty batch, within {PASSED_WITHIN:g} s"
         raise TrialFailed(group.path, why) from None
     except HoldfastError as error:
         raise TrialFailed(group.path, await why_ended(group, name, life, error)) from error

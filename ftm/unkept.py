@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from ..actors.errors import AskFailed
 from ..checkpoint.method import Method
-from .group import forget_ended
+from ..checkpoint.saved import meta_now, put
 
 if TYPE_CHECKING:
     from ..checkpoint.saved import Meta
@@ -19,6 +19,11 @@ UNKEPT = Method("protected", durability="memory")
 def is_unkept(method: Method) -> bool:
     """Whether the actor has a home for as long as it is protected, and begins afresh."""
     return method.name == UNKEPT.name
+
+
+def forget_ended(switch: Switch) -> None:
+    """Forget all ended turns of an actor that would begin afresh."""
+    put(switch, meta_now(switch, switch.turn, sorted(switch.stashed() & switch.open.keys())), 1)
 
 
 def begin_afresh(switch: Switch) -> None:

@@ -30,7 +30,7 @@ from ..actors.exits import SHUTDOWN, ExitReason
 from ..actors.process.limits import Limits
 from ..actors.process.recipe import unpack_recipe
 from ..actors.process.relay import OutsideHost
-from ..actors.process.remote import ProcessHost
+from ..actors.process.remote import Elsewhere
 from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
 from ..checkpoint.outputs import switch_of
 from ..checkpoint.switch import Switch
@@ -140,7 +140,7 @@ class Controls:
         host = cell.host
         if isinstance(host, OutsideHost):
             return cast("Status", await ask_status(host.peer, cell, timeout))
-        if not isinstance(host, ProcessHost):
+        if not isinstance(host, Elsewhere):
             return status_of(cell)
         own, worker = status_of(cell), host.worker_of(cell)
         if worker is None:
@@ -180,7 +180,7 @@ class Controls:
         """
         cell = self._living(ref)
         counts = cast("Statistics | None", await self._order(ref, Look(on, None), timeout))
-        if not isinstance(cell.host, ProcessHost):
+        if not isinstance(cell.host, Elsewhere):
             return counts
         own = tap_of(cell).switch(on, None)
         if own is None or counts is None:
@@ -196,9 +196,9 @@ class Controls:
         tap = tap_of(cell)
         await self._order(ref, Look(None, True), timeout)
         stream = tap.listen()
-        if isinstance(cell.host, ProcessHost):
+        if isinstance(cell.host, Elsewhere):
             tap.attach()
-        if isinstance(cell.host, (ProcessHost, OutsideHost)):
+        if isinstance(cell.host, (Elsewhere, OutsideHost)):
             tap.forget = lambda: _no_more(cell)
         return stream
 

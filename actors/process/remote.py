@@ -207,7 +207,15 @@ def _check_codable(cell: Cell, item: Any) -> None:
         cell.node.codec.encode(message, cell.path)
 
 
-class ProcessHost:
+class Elsewhere:
+    """What hosts have in common whose lives are lived in another process: what one does is known there."""
+
+    def worker_of(self, cell: Cell) -> Worker | None:
+        """The process that the present life is lived in, if there is one now."""
+        raise NotImplementedError
+
+
+class ProcessHost(Elsewhere):
     """The host of actors with a process of their own; one per such address."""
 
     takes_parcels = True
@@ -410,7 +418,6 @@ class ProcessHost:
         return queued + int(outlet.sent - outlet.worker.page[1])
 
     def worker_of(self, cell: Cell) -> Worker | None:
-        """The actor's process, if it has one now."""
         return self._workers.of(cell)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:

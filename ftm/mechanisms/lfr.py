@@ -108,7 +108,7 @@ class Forwarding(Before, Sender):
             return work
         now = standing.node.loop.time()
         requests = [decided(one, now) for one in work.requests]
-        work = Work(work.epoch, work.config, work.number, requests, work.go, work.again)
+        work = Work(work.epoch, work.config, work.number, requests, work.go)
         if requests or work.go is not None:
             looks = standing.server.has_access and standing.looking.is_due(requests, now, self._every)
             standing.forwarded.append(self.send_peer(Forward(work, looks)))
@@ -144,7 +144,7 @@ class Handling(Before):
         standing.inside.update((one.feed.id, one) for one in left)
         if message.looks:
             standing.looking.name(left)
-        self.next.tell(Work(standing.epoch, work.config, standing.forwarded_as, left, work.go, work.again))
+        self.next.tell(Work(standing.epoch, work.config, standing.forwarded_as, left, work.go))
 
 
 class Computing(Proceed, Sender):

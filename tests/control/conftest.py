@@ -22,6 +22,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "recorded task": {"recovery": hf.hybrid(interval=3600.0)},
     "recorded process": {"recovery": hf.hybrid(interval=3600.0), "isolation": "process"},
     "in a subtree": {},
+    "recorded in a subtree": {"recovery": hf.hybrid(interval=3600.0)},
 }
 
 Starter = Callable[..., Awaitable[hf.ActorRef[Any]]]
@@ -46,7 +47,7 @@ def start_one(system: hf.ActorSystem, way: str) -> Starter:
 
     async def start(recipe: hf.Start[Any], **options: Any) -> hf.ActorRef[Any]:
         spec = hf.child("one", recipe, **{**WAYS[way], **options})
-        if way != "in a subtree":
+        if "subtree" not in way:
             return await system.start(spec)
         await system.start(hf.supervisor("top", children=[spec], intensity=1000, isolation="process"))
         return system.ref("/app/top/one", recipe.kind)

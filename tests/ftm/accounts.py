@@ -194,7 +194,9 @@ class Load:
         """Nothing lost, nothing wrong, nothing doubled."""
         assert not self.failed, f"lost: {list(self.failed.items())[:3]}"
         assert len(tags) == len(set(tags)), "handled twice"
-        assert sorted(tags) == list(range(self.sent)), "lost or invented"
+        lost, invented = sorted(set(range(self.sent)) - set(tags)), sorted(set(tags) - set(range(self.sent)))
+        assert not lost, f"lost {len(lost)} of {self.sent}: {lost[:5]} to {lost[-1]}"
+        assert not invented, f"invented: {invented[:5]}"
         place = {tag: index + 1 for index, tag in enumerate(tags)}
         wrong = {tag: (reply, place[tag]) for tag, reply in self.answered.items() if reply != place[tag]}
         assert not wrong, f"wrong answers: {list(wrong.items())[:3]}"

@@ -56,7 +56,7 @@ class Striking(Before):
         if mechanism.what != "message":
             return work
         requests = [self._garbled(one) if self._hits(one) else one for one in work.requests]
-        return Work(work.epoch, work.config, work.number, requests, work.go, work.again)
+        return Work(work.epoch, work.config, work.number, requests, work.go)
 
     def _hits(self, request: Request) -> bool:
         return request.feed.kind == MESSAGE and request.feed.name.endswith(":Add") and self._is_hit()
