@@ -373,7 +373,8 @@ class AdaptationEngine(Actor):
             found = {name: error for name, error in found.items() if name not in done}
         change.behind = {name for name, turn in turns.items() if turn != change.turn}
         for name, error in found.items():
-            if group.life_of(name) == change.prepared[name]:
+            # One that has refused has what it had, which all go on with if none has changed.
+            if group.life_of(name) == change.prepared[name] and (turns or isinstance(error, AskTimeout)):
                 change.failed[name] = change.prepared[name]
                 group.suspect(name, change.prepared[name], f"it did not change its mechanism: {error}")
         if not turns:

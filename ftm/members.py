@@ -21,7 +21,6 @@ from .securing import Securing
 if TYPE_CHECKING:
     from ..actors.ref import ActorRef
     from .detector import Detection
-    from .stuck import Stuck
 
 
 FROM_OUTSIDE: Final = frozenset({1, 2, 3, 9, 15, 19, 20})
@@ -78,8 +77,6 @@ class Look(Message):
 class Members(Securing):
     """The part of a group that knows its replicas."""
 
-    stuck: Stuck
-
     def __init__(self, cell: Cell, names: tuple[str, ...], epoch: int, detection: Detection) -> None:
         self.node, self.cell, self.path = cell.node, cell, cell.path
         self.names, self.detection = names, detection
@@ -97,7 +94,7 @@ class Members(Securing):
         self.up: dict[str, int] = {}  # name to life, of those heard of
         self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}  # name to life
-        self.ending: dict[str, int] = {}  # lives that end by themselves: nobody waits for them
+        self.silences: dict[str, int] = {}  # name to life, of those suspected for their silence alone
         self.renewing: str | None = None  # the primary, if it is to lead anew, with other bricks
         self.suspected_at = 0.0  # when the primary was, on the loop's clock
         self.wrong = 0  # suspicions
@@ -155,9 +152,9 @@ class Members(Securing):
 
     def heard(self, name: str, life: int) -> None:
         """A replica has given a sign of life."""
-        if self.stuck.holds(name, life) or self.ending.get(name) == life:
-            return
         if self.suspects.get(name) == life:
+            if self.silences.get(name) != life:
+                return  # Something else is wrong with it.
             self.wrong += 1
             del self.suspects[name]
             self.node.emit(WrongSuspicion(self.path, name, self.wrong))
@@ -184,11 +181,15 @@ class Members(Securing):
 
         The lives of each are counted from one.
         """
-        for known in (self.up, self.suspects, self.ending, self.joining):
+        for known in (self.up, self.suspects, self.silences, self.joining):
             known.pop(name, None)
 
     def suspect(self, name: str, life: int, why: str) -> None:
-        """A replica is silent for too long."""
+        """A replica must be replaced; no sign of life changes that."""
+        self.silences.pop(name, None)
+        self._suspect(name, life, why)
+
+    def _suspect(self, name: str, life: int, why: str) -> None:
         self.suspects[name] = life
         self.suspected_at = self.node.loop.time()
         if name in (self.primary, self.leading):
@@ -201,8 +202,9 @@ class Members(Securing):
             self.on_fault(name, why)
 
     def silent(self, name: str, life: int, why: str) -> None:
-        """No sign of life has come from a replica for too long."""
-        self.suspect(name, life, why)
+        """No sign of life has come from a replica for too long: unless one comes in time, it is replaced."""
+        self.silences[name] = life
+        self._suspect(name, life, why)
         pid = self._pid_of(name)
         if pid is not None and is_blocked(pid):
             self.at_fault(name, why)
@@ -218,8 +220,7 @@ class Members(Securing):
         return None if worker is None else worker.pid
 
     def broken(self, name: str, life: int, why: str) -> None:
-        """A replica ends by itself, and nobody needs to wait for that: no sign of life counts any more."""
-        self.ending[name] = life
+        """A replica ends by itself, and nobody needs to wait for that."""
         self.suspect(name, life, why)
         if OUTVOTED not in why:
             self.at_fault(name, why)

@@ -33,7 +33,6 @@ class Stuck:
         self._group = group
         self._counted: set[tuple[int, int]] = set()  # epoch and input
         self._given_up: set[int] = set()
-        self._suspected: dict[str, int] = {}  # name to life
         self._telling: asyncio.Future[Any] | None = None
 
     def told(self, stalled: Stalled) -> None:
@@ -64,12 +63,7 @@ class Stuck:
             self._tell(name, number, again=True)
 
     def _suspect(self, name: str, life: int, number: int) -> None:
-        self._suspected[name] = life
         self._group.suspect(name, life, f"it does not end the turn of input {number}")
-
-    def holds(self, name: str, life: int) -> bool:
-        """Whether it was for that that this replica is suspected: then its heartbeats mean nothing."""
-        return self._suspected.get(name) == life
 
     def _tell(self, name: str, number: int, *, again: bool) -> None:
         """Have it end the turn; if that gets lost, it will be heard of again."""

@@ -36,7 +36,7 @@ class Guard(Before):
                     return None
                 case -3:
                     rest = [other for other in work.requests if other is not one]
-                    work = Work(work.epoch, work.config, work.number, rest, work.go, work.again)
+                    work = Work(work.epoch, work.config, work.number, rest, work.go)
         return work
 
 

@@ -206,5 +206,5 @@ async def test_nobody_speaks_for_a_replica(system: hf.ActorSystem) -> None:
     end = TurnEnd(group.switch.turn + 1, 1, OK, [], Answer(REPLY, "", b"\x63"))
     proxy.tell(Done(group.epoch, group.config, -1, [end], False))
     await proxy.ask(Settle())
-    assert (group.suspects, group.ending, group.stale, group.epoch) == ({}, {}, 1, 1)
+    assert (group.suspects, group.stale, group.epoch) == ({}, 1, 1)
     assert await ref.ask(accounts.Add(1)) == 2

@@ -331,13 +331,31 @@ async def test_a_primary_that_wakes_up_before_it_is_killed_was_suspected_wrongly
     events = system.events()
     group = group_of(ref)
     backup = other(group)
-    group.suspects[backup] = group.members[backup]  # As the detector does it, but nobody was told yet.
+    group.suspects[backup] = group.silences[backup] = group.members[
+        backup
+    ]  # As the detector does it, but nobody was told yet.
     async with asyncio.timeout(10):
         while not any(isinstance(event, WrongSuspicion) for event in events.take()):
             await asyncio.sleep(0.005)
     assert group.wrong == 1
     assert await ref.ask(Add(0)) == 1
     events.close()
+
+
+async def test_no_sign_of_life_saves_a_replica_that_has_to_be_replaced(system: hf.ActorSystem) -> None:
+    ref = await started(system)
+    group = group_of(ref)
+    await two_again(ref)
+    name = group.primary
+    assert name is not None
+    life = group.members[name]
+    group.suspect(name, life, "a test wants it")
+    group.heard(name, life)  # Before anybody has acted on that.
+    async with asyncio.timeout(30):
+        while group.primary in (None, name):
+            await asyncio.sleep(0.001)
+    assert group.wrong == 0
+    assert await ref.ask(Add(0)) == 1
 
 
 async def test_what_asks_in_the_middle_of_its_turns_moves_no_money_twice(system: hf.ActorSystem) -> None:

@@ -39,7 +39,7 @@ PATHS = os.pathsep.join(filter(None, [str(Path(__file__).parents[2]), os.environ
 
 async def taken_back(change: Any) -> MechanismSettled:
     """How a change went that has to be taken back."""
-    async with asyncio.timeout(120):
+    async with asyncio.timeout(60):
         (outcome,) = await change.settled()
     assert not outcome.is_kept
     return outcome
@@ -146,7 +146,7 @@ class Drops(Before):
             self.count += 1
             if self.count % 3:
                 kept.append(one)
-        return Work(work.epoch, work.config, work.number, kept, work.go, work.again)
+        return Work(work.epoch, work.config, work.number, kept, work.go)
 
 
 @dataclasses.dataclass(frozen=True)
