@@ -333,7 +333,7 @@ async def test_a_primary_that_wakes_up_before_it_is_killed_was_suspected_wrongly
     backup = other(group)
     group.suspects[backup] = group.silences[backup] = group.members[
         backup
-    ]  # As the detector does it, but nobody was told yet.
+    ]  # Nobody was told.
     async with asyncio.timeout(10):
         while not any(isinstance(event, WrongSuspicion) for event in events.take()):
             await asyncio.sleep(0.005)
