@@ -138,6 +138,8 @@ class RequestProtocol(Transfer):
         goes_in = bool(left) or work.go is not None
         if known or self._later or not goes_in:
             more, self._later = self._later, []
+            if work.copy and not goes_in:
+                more += self._standing.server.copied()
             self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in, None, more))
         if goes_in:
             self._standing.inside.update((one.feed.id, one) for one in left)

@@ -177,6 +177,20 @@ async def test_failover_does_not_wait_for_a_change_that_hangs(system: hf.ActorSy
     assert stack(ref) == ("pbr",)
 
 
+async def test_a_kill_while_a_change_blocks_the_other_replica_loses_nothing(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
+    assert [await ref.ask(Add(tag)) for tag in range(5)] == [1, 2, 3, 4, 5]
+    await two_again(ref)
+    host: Any = ref._cell.host
+    pid = pid_of(system, ref, group_of(ref).primary or "")
+    host.on_step = lambda step: os.kill(pid, signal.SIGKILL) if step == "prepare" and ref._cell.life == 1 else None
+    with pytest.raises(hf.TransactionFailed, match=r"has failed when it prepared it|has ended"):
+        async with system.transaction(timeout=60) as change:
+            change.compose(ref, Wrong("hang", "init", "before", "other"), outside=True)
+    assert await ref.ask(Tags(), timeout=60) == [0, 1, 2, 3, 4]
+    assert stack(ref) == ("pbr",)
+
+
 @pytest.mark.parametrize("address", ["/app/nobody", "/app/other"])
 async def test_links_that_nobody_certifies_are_refused(system: hf.ActorSystem, address: str) -> None:
     await system.start(hf.child("other", hf.start(Counter)))
