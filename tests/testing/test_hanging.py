@@ -44,7 +44,14 @@ async def test_it(system):
 def ran(folder: Path, program: str, seconds: int = 2) -> subprocess.CompletedProcess[str]:
     """A run of pytest, in which nothing may take longer."""
     (folder / "test_hangs.py").write_text(program, "utf-8")
-    options = ["-o", f"faulthandler_timeout={seconds}", "-o", "faulthandler_exit_on_timeout=true", "-o", "asyncio_mode=auto"]
+    options = [
+        "-o",
+        f"faulthandler_timeout={seconds}",
+        "-o",
+        "faulthandler_exit_on_timeout=true",
+        "-o",
+        "asyncio_mode=auto",
+    ]
     command = [sys.executable, "-m", "pytest", "-q", "-p", "holdfast.testing.hanging", *options, "--rootdir", "."]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
 
