@@ -271,7 +271,7 @@ class RequestProtocol(Transfer):
                 raise
 
     async def _quiet(self) -> None:
-        """Wait until nothing is inside. Whoever calls has raised `_holds`."""
+        """Wait until nothing is inside, or another epoch has begun. Whoever calls has raised `_holds`."""
         while self._current is not None:
             idle: asyncio.Future[None] = self._standing.node.loop.create_future()
             self._idle.append(idle)
@@ -301,8 +301,10 @@ class RequestProtocol(Transfer):
     @on(Lead)
     def _lead(self, message: Lead) -> Any:
         self._check(message.epoch, message.config)
-        if self._standing.leads and self._standing.leading != message.epoch and self._marker is None:
-            self._current = None  # The bricks have kept what was inside, and are others now: it is asked for again.
+        if self._standing.leads and self._standing.leading != message.epoch:
+            # The bricks have kept what was inside, and are others now: it is asked for again. Whoever waits for its
+            # end was told so in another epoch.
+            self._current = self._marker = None
             self._go_on()
         return self._answer(self._begin_to_lead(message))
 
@@ -388,9 +390,11 @@ class RequestProtocol(Transfer):
         return self._answer(self._give_out())
 
     async def _give_out(self) -> Exported:
+        epoch = self._standing.epoch
         self._holds += 1
         try:
             await self._quiet()
+            self._standing.check(epoch)
             server = self._standing.server
             await server.ensure()
             await server.until_work_is_back()
