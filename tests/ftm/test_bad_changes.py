@@ -202,7 +202,7 @@ async def test_the_stack_before_comes_back_to_one_that_leads_while_bricks_keep_w
         change.compose(ref, Wrong("hang", "peer", "before", "other"), outside=True)
     group, seconds = group_of(ref), 0.2
     async with asyncio.timeout(30):
-        while (await group.protocol(group.backups()[0]).ask(Computes(group.switch.turn, seconds))).passes:
+        while (await group.protocol(group.backups()[0]).ask(Computes(group.switch.turn, seconds), 5.0)).passes:
             await asyncio.sleep(0)
     os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
     async with asyncio.timeout(90):
