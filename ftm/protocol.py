@@ -460,19 +460,15 @@ class RequestProtocol(Transfer):
     def _rehearse(self, message: Rehearse) -> Any:
         if self._standing.epoch >= 0:  # It has a part: whoever says this, plain, must not take it from there.
             raise Refused(path=self._standing.path, reason="plain")
-        return self._answer(self._rehearsed())
+        return self._answer(self._rehearsed(message))
 
-    async def _rehearsed(self) -> None:
-        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody.
-
-        In each role, and both ways into it: from the other one, and made in it.
-        """
+    async def _rehearsed(self, message: Rehearse) -> None:
+        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody."""
         standing = self._standing
-        for leads, is_new in ((True, False), (True, True), (False, False), (False, True)):
-            await self._order(Play(leads, is_new))
-            self._current = self._marker = CANARY
-            self.before.tell(Work(standing.epoch, standing.config, CANARY, []))
-            await self._quiet()
+        await self._order(Play(message.leads, message.is_new))
+        self._current = self._marker = CANARY
+        self.before.tell(Work(standing.epoch, standing.config, CANARY, []))
+        await self._quiet()
 
     @on(Finish)
     def _finish(self, message: Finish) -> Any:
