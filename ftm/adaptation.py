@@ -241,9 +241,11 @@ class AdaptationEngine(Actor):
         What a trial does not show may end, or block, any replica that prepares, and another may die meanwhile.
         """
         group, end = self._group, self._now() + WHOLE_WITHIN
+        if change.is_back:
+            return group.is_steady()  # Whoever is not there comes with bricks that are not wanted.
         while not group.whole_since()[0] and self._now() < end and not change.why:
             await self._wait_for_change(LOOK_AGAIN)
-        if not (change.is_back or change.why):
+        if not change.why:
             copied = group.keep_copy(change)
             await asyncio.wait((copied, change.given_up), timeout=COPIED_WITHIN, return_when=asyncio.FIRST_COMPLETED)
         return group.is_steady() and not change.why
@@ -346,7 +348,13 @@ class AdaptationEngine(Actor):
         if not await self._ends(group.quiet(), change, end, "a turn of it has not ended"):
             return False
         for name, future in asked.items():
-            if not await self._ends(future, change, end, f"{name} has not come to rest"):
+            if change.is_back and name != primary:  # What keeps it may be what is to go: it is replaced.
+                await asyncio.wait((future,), timeout=max(0.0, end - self._now()))
+                if not future.done():
+                    group.suspect(name, change.prepared[name], "it has not come to rest")
+            elif not await self._ends(future, change, end, f"{name} has not come to rest"):
+                return False
+            if not future.done():
                 return False
             if (error := future.exception()) is not None:
                 if isinstance(error, (ConfigMismatch, StaleEpoch)):
