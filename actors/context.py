@@ -247,7 +247,7 @@ class ActorContext:
         """
         self._alive()
         tasks = self.cell.extra().tasks
-        task = self.cell.node.loop.create_task(self._pipe(work, then, failed), name=f"pipe of {self.path}")
+        task = self.cell.node.loop.create_task(contained(self._pipe(work, then, failed)), name=f"pipe of {self.path}")
         tasks.add(task)
         task.add_done_callback(tasks.discard)
 
@@ -427,8 +427,7 @@ class ActorContext:
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         self.cell.extra().tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
-            cause = error.__cause__
-            self.cell.push(Piped(None, cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error))
+            self.cell.push(Piped(None, uncontained(error)))
 
 
 async def contained(work: Coroutine[Any, Any, T]) -> T:
@@ -441,6 +440,12 @@ async def contained(work: Coroutine[Any, Any, T]) -> T:
         return await work
     except (SystemExit, KeyboardInterrupt) as error:
         raise remote_crash(error) from error
+
+
+def uncontained(error: BaseException) -> BaseException:
+    """What was raised in `contained` work that has failed with `error`."""
+    cause = error.__cause__
+    return cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error
 
 
 class Stashed(Envelope, eq=False):
