@@ -118,14 +118,15 @@ class _Source:
             self._is_over = True
             return []
         except RemoteCrash as error:
-            raise uncontained(error)
+            raise uncontained(error) from error.__cause__
 
     def pulling(self, there: Callable[[object], None]) -> asyncio.Task[Any] | None:
         """Pull the next item, and call `there` when it is there; None if there will be none, or it is there."""
         if self._async is None or self._is_over:
             return None
         if self._pulling is None:
-            self._pulling = asyncio.get_running_loop().create_task(contained(_next(self._async)), name="pull of a stream")
+            pull = contained(_next(self._async))
+            self._pulling = asyncio.get_running_loop().create_task(pull, name="pull of a stream")
             self._pulling.add_done_callback(there)
         return self._pulling
 

@@ -8,7 +8,10 @@ from typing import Any
 import holdfast as hf
 
 LEAVING = {kind.__name__: kind for kind in (KeyboardInterrupt, SystemExit, GeneratorExit, asyncio.CancelledError)}
-PHASES = ("__init__", "on_start", "on_start later", "turn", "turn later", "def turn", "on_stop", "task", "pipe", "ended task", "ended pipe")
+PHASES = (
+    *("__init__", "on_start", "on_start later", "turn", "turn later", "def turn", "on_stop"),
+    *("task", "pipe", "ended task", "ended pipe"),
+)
 
 
 class Go(hf.Message[str]):
