@@ -331,9 +331,7 @@ async def test_a_primary_that_wakes_up_before_it_is_killed_was_suspected_wrongly
     events = system.events()
     group = group_of(ref)
     backup = other(group)
-    group.suspects[backup] = group.silences[backup] = group.members[
-        backup
-    ]  # Nobody was told.
+    group.suspects[backup] = group.silences[backup] = group.members[backup]  # Nobody was told.
     async with asyncio.timeout(10):
         while not any(isinstance(event, WrongSuspicion) for event in events.take()):
             await asyncio.sleep(0.005)
