@@ -426,7 +426,7 @@ class ActorContext:
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         """A background task that ends with this life; an exception in it crashes the actor."""
         self._alive()
-        task = self._beside(contained(work), "task")
+        task = self._beside(work, "task")
         task.add_done_callback(self._task_done)
         task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
         return task
@@ -435,15 +435,14 @@ class ActorContext:
         """A task of this life, which knows in what turn it was begun."""
         tasks, context = self.cell.extra().tasks, copy_context()
         context.run(begun_in.set, self.item)
-        task = self.cell.node.loop.create_task(work, name=f"{what} of {self.path}", context=context)
+        task = self.cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
         tasks.add(task)
         task.add_done_callback(tasks.discard)
         return task
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:
         if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
-            cause = error.__cause__
-            self.cell.push(Piped(None, cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error))
+            self.cell.push(Piped(None, uncontained(error)))
 
 
 async def contained(work: Coroutine[Any, Any, T]) -> T:
@@ -456,6 +455,12 @@ async def contained(work: Coroutine[Any, Any, T]) -> T:
         return await work
     except (SystemExit, KeyboardInterrupt) as error:
         raise remote_crash(error) from error
+
+
+def uncontained(error: BaseException) -> BaseException:
+    """What was raised in `contained` work that has failed with `error`."""
+    cause = error.__cause__
+    return cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error
 
 
 class Stashed(Envelope, eq=False):
