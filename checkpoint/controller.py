@@ -153,7 +153,7 @@ class LocalHome:
     def closed(self) -> None:
         if self._is_open:
             self.shut()
-            self._host.over(self._cell, -1, ENDED, ordered=True)
+            self._host.over(self._cell, self._host.running(self._cell), ENDED, ordered=True)
 
     def shut(self) -> None:
         """What the life says from now on is not heard, nor its end: it has been moved away."""

@@ -71,11 +71,15 @@ class Ends:
     def drop_all(self, why: str, *, keep_tells: bool = False) -> None:
         """Nobody lives here any more: whoever waits is told, the rest goes to dead letters.
 
+        What has begun, and what is to be answered later, fails otherwise than what has surely not.
+
         `keep_tells`: it is the actor's supervisor that has ended. Both may be started again, so what nobody waits for
         stays for the next life.
         """
         home = self._home
         batch, stopped = Batch(), ActorStopped(home.path, why)
+        reason = None if home.cell is None else home.cell.extra().reason
+        ended = AskFailed(home.path, why if reason is None else str(reason))
         if home.live is not None and not home.live.done():
             home.live.cancel()
         home.timers.pause()
@@ -87,12 +91,12 @@ class Ends:
             if source.ask is None and source.kind == MESSAGE:
                 self.lost(source.name, source.body, why)
             if source.id == home.partial_id and home.partial:
-                self.begun(source, stopped, batch)
+                self.begun(source, ended, batch)
             else:
-                self.without_turn(source, self._failure(stopped), batch)
+                self.without_turn(source, self._failure(ended if source.was_cut else stopped), batch)
         batch.commit(home.journal)
         for ask in home.later.values():
-            ask.fail(stopped)
+            ask.fail(ended)
         home.later.clear()
         home.limit.wake()
         home.due.abandon(why)

@@ -44,6 +44,7 @@ class Input(msgspec.Struct, gc=False, eq=False):
     origin: str = ""  # the timer or pipe it comes from
     positions: list[int] = NO_POSITIONS
     held: bool = False  # not as safe yet as it has to be: it must not be fed
+    was_cut: bool = False  # a life has ended in its turn
 
     def feed(
         self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False, was_asked: bool = False

@@ -482,5 +482,5 @@ class Life:
         self.asks.clear()
         for call in self.postponed:  # The next life's.
             self.cell.urge(call)
-        self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.
         self.port.closed()
+        self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.

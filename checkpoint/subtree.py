@@ -157,7 +157,7 @@ class SubtreeHome(HomeHost, Elsewhere):
             elif self._group is not None:
                 self._group.closed(record)
             elif self._wanted is not None and record.number == self._wanted.number:
-                self._closed(unpack_exit(record.reason), recovers=record.recovers)
+                self._closed(unpack_exit(record.reason), self.running(self.cell), recovers=record.recovers)
         elif self.arriving is not None:
             self.arriving(record)
         elif self.switch is not None and self._wanted is not None:

@@ -391,6 +391,8 @@ class Switch:
         if self.bound is not None:
             self.bound.restart()
         source = self.open.get(running)
+        if source is not None:
+            source.was_cut = True
         if source is None or ordered or source.kind == START:
             return
         source.deliveries += 1

@@ -23,6 +23,9 @@ class End(hf.Message):
     how: str
 
 
+class Hang(hf.Message[None]): ...
+
+
 class Promises(hf.Actor):
     """Answers later, if ever."""
 
@@ -42,6 +45,10 @@ class Promises(hf.Actor):
     @hf.on(Count)
     def count(self, message: Count) -> int:
         return len(self.waiting)
+
+    @hf.on(Hang)
+    async def hang(self, message: Hang) -> None:
+        await asyncio.Event().wait()
 
     @hf.on(End)
     def end(self, message: End) -> None:
@@ -75,10 +82,15 @@ async def end(system: hf.ActorSystem, ref: hf.ActorRef[Promises], how: str) -> N
             ref.tell(End(how))
 
 
-async def promise_and_end(system: hf.ActorSystem, place: str, restart: Any, how: str) -> None:
-    child = hf.child("a", hf.start(Promises), restart=restart, isolation="process" if place == "process" else "task")
+async def started(system: hf.ActorSystem, place: str, restart: Any, recovery: Any) -> hf.ActorRef[Promises]:
+    isolation: Any = "process" if place == "process" else "task"
+    child = hf.child("a", hf.start(Promises), restart=restart, isolation=isolation, recovery=recovery)
     await system.start(hf.supervisor("top", children=[child], isolation="process" if place == "subtree" else "task"))
-    ref = system.ref("/t/top/a", Promises)
+    return system.ref("/t/top/a", Promises)
+
+
+async def promise_and_end(system: hf.ActorSystem, place: str, restart: Any, how: str, recovery: Any = None) -> None:
+    ref = await started(system, place, restart, recovery)
     asked = [ref.ask(Question(), LONG) for _ in range(3)]
     assert await ref.ask(Count(), LONG) == 3
     await end(system, ref, how)
@@ -98,6 +110,30 @@ async def test_a_promised_reply_fails_with_the_end(system: hf.ActorSystem, resta
 @pytest.mark.parametrize("place", ["process", "subtree"])
 async def test_so_does_one_in_another_process(system: hf.ActorSystem, place: str, how: str) -> None:
     await promise_and_end(system, place, "permanent", how)
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("how", ["stop", "kill", "its supervisor", "the system"])
+@pytest.mark.parametrize("place", ["task", "process", "subtree"])
+async def test_so_does_one_of_a_recorded_actor_that_ends_for_good(system: hf.ActorSystem, place: str, how: str) -> None:
+    await promise_and_end(system, place, "temporary", how, hf.hybrid(3600.0))
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("place", ["task", "process", "subtree"])
+async def test_what_a_recorded_actor_had_begun_and_what_waited_fail_otherwise(
+    system: hf.ActorSystem, place: str
+) -> None:
+    ref = await started(system, place, "temporary", hf.hybrid(3600.0))
+    begun = ref.ask(Hang(), LONG)
+    while (await system.get_status(ref)).turn is None:
+        await asyncio.sleep(0)
+    waits = ref.ask(Question(), LONG)
+    ref.kill()
+    with pytest.raises(hf.AskFailed, match="killed"):
+        await begun
+    with pytest.raises(hf.ActorStopped):
+        await waits
 
 
 async def test_on_stop_may_still_answer(system: hf.ActorSystem) -> None:
