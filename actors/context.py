@@ -257,10 +257,7 @@ class ActorContext:
                 crashes this actor. What `then` or `failed` raises does too, and so does what is no message of its.
         """
         self._alive()
-        tasks = self.cell.extra().tasks
-        task = self.cell.node.loop.create_task(self._pipe(work, then, failed), name=f"pipe of {self.path}")
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
+        self._beside(self._pipe(work, then, failed), "pipe")
 
     async def _pipe(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> None:
         try:
@@ -429,16 +426,21 @@ class ActorContext:
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         """A background task that ends with this life; an exception in it crashes the actor."""
         self._alive()
-        context = copy_context()
-        context.run(begun_in.set, self.item)
-        task = self.cell.node.loop.create_task(contained(work), name=f"task of {self.path}", context=context)
-        self.cell.extra().tasks.add(task)
+        task = self._beside(contained(work), "task")
         task.add_done_callback(self._task_done)
         task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
         return task
 
+    def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
+        """A task of this life, which knows in what turn it was begun."""
+        tasks, context = self.cell.extra().tasks, copy_context()
+        context.run(begun_in.set, self.item)
+        task = self.cell.node.loop.create_task(work, name=f"{what} of {self.path}", context=context)
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+        return task
+
     def _task_done(self, task: asyncio.Task[Any]) -> None:
-        self.cell.extra().tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
             cause = error.__cause__
             self.cell.push(Piped(None, cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error))

@@ -268,8 +268,12 @@ async def test_an_actor_whose_turn_has_ended_can_be_asked_by_whom_it_asked(syste
     assert await heard == "not busy"
 
 
-async def test_a_background_task_asks_beside_a_turn_that_does_not_wait_for_it(system: hf.ActorSystem) -> None:
+@pytest.mark.parametrize("how", ["task", "pipe"])
+async def test_background_work_asks_beside_a_turn_that_does_not_wait_for_it(system: hf.ActorSystem, how: str) -> None:
     """Whoever waits for that later turn is asked when it is done waiting; so is the actor itself."""
+
+    class Told(hf.Message):
+        answers: list[str]
 
     class Owner(hf.Actor):
         def __init__(self, way: list[hf.ActorRef[Any]]) -> None:
@@ -277,14 +281,24 @@ async def test_a_background_task_asks_beside_a_turn_that_does_not_wait_for_it(sy
 
         @hf.on(Work)
         def work(self, message: Work) -> str:
-            self.ctx.create_task(self._report())
+            if how == "task":
+                self.ctx.create_task(self._tell())
+            else:
+                self.ctx.pipe_to_self(self._report(), Told)
             return "begun"
 
-        async def _report(self) -> None:
+        async def _tell(self) -> None:
+            heard.set_result(await self._report())
+
+        @hf.on(Told)
+        def told(self, message: Told) -> None:
+            heard.set_result(message.answers)
+
+        async def _report(self) -> list[str]:
             await asked.wait()
             answers = [one.ask(Quick(one.path)) for one in (*self._way, self.ctx.ref)]
             gate.set()
-            heard.set_result(await asyncio.gather(*answers))
+            return await asyncio.gather(*answers)
 
         @hf.on(Ring)
         async def ring(self, message: Ring) -> str:
