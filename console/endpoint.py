@@ -205,14 +205,14 @@ class Endpoint:
         self._loop.add_reader(sock, self._accept, sock)
 
     def _accept(self, sock: socket.socket) -> None:
-        """Connections wait. Each is tried before the loop is given it: uvloop ends the program if it cannot be watched."""
+        """Connections wait. Each is tried before the loop has it: uvloop ends the program if it cannot be watched."""
         for _ in range(MOST_CLIENTS):
             try:
                 client, _ = sock.accept()
             except (BlockingIOError, ConnectionAbortedError):
                 return
             except OSError:  # There are no descriptors, or no memory: whoever waits is served when there are.
-                self._pause()
+                self._pause(sock)
                 return
             client.setblocking(False)
             try:
@@ -224,10 +224,10 @@ class Endpoint:
             self._connecting.add(task)
             task.add_done_callback(self._connecting.discard)
 
-    def _pause(self) -> None:
+    def _pause(self, sock: socket.socket) -> None:
         if self._is_watched:
             self._is_watched = False
-            self._loop.remove_reader(self._socket)
+            self._loop.remove_reader(sock)
         self._loop.call_later(LINGER, self._go_on)
 
     def _go_on(self) -> None:
@@ -237,7 +237,7 @@ class Endpoint:
         try:
             self.listen(sock)
         except OSError:
-            self._pause()
+            self._pause(sock)
 
     def _turn_away(self, client: socket.socket, error: OSError) -> None:
         """Tell a client why it is not served; what it sends meanwhile is not read, and must not cut off our answer."""

@@ -56,8 +56,8 @@ async def test_nothing_stays_of_a_snapshot_that_cannot_be_written(call: str) -> 
              "-e", f"trace={call}", "-e", f"inject={call}:error=ENOMEM"],
             stderr=subprocess.PIPE,
         )  # fmt: skip
+        assert tracer.stderr is not None
         try:
-            assert tracer.stderr is not None
             assert b"attached" in tracer.stderr.readline()
             with system.events() as stream:
                 with pytest.raises(hf.HoldfastError, match="Cannot allocate memory"):

@@ -120,6 +120,7 @@ async def test_a_supervisor_is_up_when_all_its_children_are() -> None:
         assert log == ["+a", "+b", "+c"]
 
 
+@virtual
 @pytest.mark.parametrize("how", ["StartChild", "its own start"])
 async def test_a_supervisor_escalates_while_a_child_starts(how: str) -> None:
     """Whoever waits for the start hears of it, and the child that was starting is over."""

@@ -271,6 +271,7 @@ def test_a_wal_that_has_grown_long_begins_anew_although_writers_never_rest(
             count += 100
     assert numbers(reopened(path)) == list(range(count))
 
+
 def test_a_checkpoint_that_leaves_a_long_wal_is_done_again_while_no_writer_goes_on(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
