@@ -55,7 +55,7 @@ class RecordedGuest:
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
-        return self.port_of(path).take
+        return lambda frame: self.port_of(path).take(frame)
 
     def port_of(self, path: str) -> Port:
         """The way home from an address."""
@@ -63,6 +63,10 @@ class RecordedGuest:
         if port is None:
             port = self._ports[path] = Port(self._guest, path)
         return port
+
+    def vacated(self, path: str) -> None:
+        """Nobody lives at an address any more: whoever does so again is given a new way."""
+        self._ports.pop(path, None)
 
     def start(self, cell: Cell, options: dict[str, Any]) -> None:
         """Begin the life that a launch asks for, of the process's own actor.
@@ -159,12 +163,12 @@ class Port:
             case Restore():
                 self._state.append(record)
             case Begin():
-                assert self.on_begin is not None
-                self.on_begin(record)
+                if self.on_begin is not None:  # Else its address has gone meanwhile.
+                    self.on_begin(record)
                 self._state.clear()
             case Started():
-                assert self.on_started is not None
-                self.on_started(record)
+                if self.on_started is not None:
+                    self.on_started(record)
             case Over() | Respec():
                 if self.on_group is not None:
                     self.on_group(record)
@@ -387,6 +391,7 @@ class InnerLifeHost(LifeHost):
         if cell.queue:
             cell.queue.clear()  # Its home has these.
         self._guest.tell_gone(cell)
+        self._guest.recovery.vacated(cell.path)
 
     def _admit(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: the home numbers and journals, and feeds it back."""

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from ..actors.process.forked import check_can_watch
 from .image import IMAGE_BYTES, Imager, Key, estimate
 from .keys import state_of, variables
 from .records import Kept, Marked, Shared, Snapshot, Unsaved
@@ -87,15 +88,20 @@ class Imaging:
         number = new_number()
         file = memory_file(number)
         job = _Job(life.turn, [fed.feed.id for fed in life.stash], number, file, life.traps)
+        writer: Writer | None = None
         try:
             if self._may_fork and self._should_fork(estimate(actor, variables(actor))) and is_alone():
-                self._writer = Writer(self, job, state)
+                writer = Writer(self, job, state)
                 life.port.to_home(Marked(life.turn))
+                self._writer = writer
                 job.pause = time.perf_counter() - begin
                 return
             layout = self.write(job, state)
         except BaseException:
-            os.close(file)
+            if writer is not None:
+                writer.kill()
+            else:
+                os.close(file)
             raise
         job.pause = time.perf_counter() - begin
         self._hand_over(job, layout)
@@ -115,19 +121,37 @@ class Imaging:
         self._writer = None
         try:
             self._hand_over(job, layout)
-        except OSError as error:
-            self.failed(job, str(error))
+        except Exception as error:  # Nobody else would hear of it.
+            self._unsaved(str(error))
 
     def failed(self, job: _Job, problem: str) -> None:
         """A forked writer is not."""
         self._writer = None
         os.close(job.file)
+        self._unsaved(problem)
+
+    def _unsaved(self, problem: str) -> None:
         self._life.port.to_home(Unsaved(problem))
         self._once_more()
 
     def _hand_over(self, job: _Job, layout: Layout) -> None:
-        segment = Segment(job.number, job.file)
+        """Tell the home of an image; if that raises, nothing of it stays."""
+        try:
+            segment = Segment(job.number, job.file)
+        except BaseException:
+            os.close(job.file)
+            raise
         self._written = segment, layout
+        try:
+            self._tell_home(job, segment, layout)
+        except BaseException:
+            if self._written is not None:  # Else the home has it already.
+                self._written = None
+                segment.close()
+                self._life.image_lost()
+            raise
+
+    def _tell_home(self, job: _Job, segment: Segment, layout: Layout) -> None:
         life, places = self._life, places_of(layout)
         self.last_bytes = sum(length for _, _, length in places)
         new = sum(length for number, _, length in places if number == job.number)
@@ -214,7 +238,18 @@ class Writer:
         if self.pid == 0:
             _write_and_exit(imaging, job, state, out, parent)
         os.close(out)
-        self._life = os.pidfd_open(self.pid)
+        try:
+            self._life = os.pidfd_open(self.pid)
+            try:
+                check_can_watch(self._report, self._life)
+            except OSError:
+                os.close(self._life)
+                raise
+        except OSError:
+            os.kill(self.pid, signal.SIGKILL)
+            os.waitpid(self.pid, 0)
+            os.close(self._report)
+            raise
         self._loop.add_reader(self._report, self._read)
         self._loop.add_reader(self._life, self._reap)
 

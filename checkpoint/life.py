@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import time
-import zlib
 from collections.abc import Callable
 from typing import Any, Protocol
 
@@ -52,6 +51,7 @@ from .records import (
     pieces,
 )
 from .strict import Guard
+from .timers import said_by
 from .turns import INIT, STOP, Fed, GoLive, Hook, TakeSnapshot
 
 
@@ -107,7 +107,7 @@ class Life:
         self._saved_variables: list[str] = []
         self.variables: list[str] = []  # of the actor, when `__init__` had run; none if it says itself what is saved
         self._has_state = self._traps = False
-        self._named: dict[int, int] = {}  # how many timers of hooks say this, by its checksum
+        self._named: dict[str, int] = {}  # how many timers of hooks say this, by its checksum
         self._restore_seconds = 0.0
         self._snapshot_wanted = self._snapshot_postponed = False
         self.images = Imaging(self, may_fork=may_fork)
@@ -318,9 +318,9 @@ class Life:
         if known is not None:
             del self.timers[known]
             return known
-        said = zlib.crc32(body, zlib.crc32(f"{name}|{interval}".encode()))
+        said = said_by(*clock)
         self._named[said] = number = self._named.get(said, 0) + 1
-        return f"{self.turn}{self.hook}{said:08x}.{number}"
+        return f"{self.turn}{self.hook}{said}.{number}"
 
     def cancel_timer(self, key: str) -> None:
         """Ticks that are queued here, or on their way, are dropped here and at home."""

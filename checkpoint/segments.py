@@ -59,11 +59,15 @@ class Segment:
     def of(cls, number: int, blocks: Iterable[tuple[int, bytes]]) -> Segment:
         """Blocks in memory of their own, each at its offset: for engines that have read them."""
         file, end = memory_file(number), 0
-        for offset, block in blocks:
-            os.pwrite(file, block, offset)
-            end = max(end, offset + len(block))
-        os.ftruncate(file, -(-end // PAGE) * PAGE)
-        return cls(number, file)
+        try:
+            for offset, block in blocks:
+                os.pwrite(file, block, offset)
+                end = max(end, offset + len(block))
+            os.ftruncate(file, -(-end // PAGE) * PAGE)
+            return cls(number, file)
+        except BaseException:
+            os.close(file)
+            raise
 
     def block(self, offset: int, length: int) -> memoryview:
         """One block, where it lies."""

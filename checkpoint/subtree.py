@@ -7,7 +7,6 @@ When the process dies, the homes keep what they hold until the subtree has been 
 from __future__ import annotations
 
 import asyncio
-import itertools
 from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -63,6 +62,7 @@ class SubtreeHost(ProcessHost):
         super().__init__(workers, limits)
         self._homes, self._protect = homes, protect
         self._below: dict[str, SubtreeHome] = {}
+        self._slots: Slots | None = None
 
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
         worker, recipe = await super().take(cell)
@@ -70,10 +70,21 @@ class SubtreeHost(ProcessHost):
         file = self._homes.file
         more = {} if file is None else {"recovery_file": file.data()}
         self._options = {"kept": kept, "known": self._homes.known(cell.path), **more}
-        slots = Slots(len(worker.page))
+        slots = self._slots = Slots(len(worker.page))
+
+        def joined(path: str) -> SubtreeHome:
+            home = self.at(path)
+            home.joined(cell, worker, slots.of(path))
+            return home
 
         def taker(path: str) -> frames.TakeRecord:
-            return self.at(path).joined(cell, worker, slots.of(path))
+            joined(path)
+
+            def taken(record: ToHome) -> None:
+                home = self._below.get(path) or joined(path)  # It was vacated, and somebody is wanted there again.
+                home.from_life(worker, record)
+
+            return records_of(worker, taken)
 
         worker.record_taker = taker
         return worker, recipe
@@ -85,6 +96,14 @@ class SubtreeHost(ProcessHost):
             home = self._below[path] = SubtreeHome(self._homes, path, self._protect)
         return home
 
+    def vacated(self, home: SubtreeHome) -> None:
+        """Nobody lives at an address below any more: what is known of it here goes, and its place on the page."""
+        if self._below.get(home.path) is not home:
+            return
+        del self._below[home.path]
+        if self._slots is not None:
+            self._slots.give_back(home.path)
+
     def died(self, cell: Cell, reason: ExitReason) -> None:
         worker = self._workers.of(cell)
         if worker is not None:
@@ -94,7 +113,7 @@ class SubtreeHost(ProcessHost):
 
     def retired(self, cell: Cell) -> None:
         super().retired(cell)
-        for home in reversed(self._below.values()):
+        for home in reversed(list(self._below.values())):
             if home.cell is not None:
                 home.cell.host.told(home.cell, "gone", {"with_parent": True})
                 lives.retire(home.cell, "its supervisor has stopped")
@@ -105,14 +124,24 @@ class Slots:
     """Places on the page: which input each recorded life in a process is handling. The first two are taken."""
 
     def __init__(self, count: int) -> None:
-        self._free = itertools.chain(range(2, count), itertools.repeat(0))
+        self._unused = iter(range(2, count))
+        self._free: list[int] = []  # given back
         self._by_path: dict[str, int] = {}
 
     def of(self, path: str) -> int:
         """The place of an address; 0 when there is none left."""
-        if path not in self._by_path:
-            self._by_path[path] = next(self._free)
-        return self._by_path[path]
+        slot = self._by_path.get(path)
+        if slot is None:
+            slot = self._free.pop() if self._free else next(self._unused, 0)
+            if slot:
+                self._by_path[path] = slot
+        return slot
+
+    def give_back(self, path: str) -> None:
+        """Nobody lives at an address any more."""
+        slot = self._by_path.pop(path, 0)
+        if slot:
+            self._free.append(slot)
 
 
 class SubtreeHome(HomeHost, Elsewhere):
@@ -140,10 +169,9 @@ class SubtreeHome(HomeHost, Elsewhere):
         self._slot = 0
         self._wanted: Wanted | None = None
 
-    def joined(self, top: Cell, worker: Worker, slot: int) -> frames.TakeRecord:
+    def joined(self, top: Cell, worker: Worker, slot: int) -> None:
         """The process that the next lives are lived in."""
         self._top, self._worker, self._slot = top, worker, slot
-        return records_of(worker, lambda record: self.from_life(worker, record))
 
     def from_life(self, worker: Worker, record: ToHome) -> None:
         """Take what the life, or the supervisor that wants one, says."""
@@ -388,3 +416,11 @@ class SubtreeHome(HomeHost, Elsewhere):
             self._starting.cancel()  # Else it ends by itself, and tells how the recovery went.
         topics = self._wanted.topics if self._wanted is not None else ()
         self.give_up(cell, topics, restarting=self.restarting)
+        self.vacate(cell)
+
+    def vacate(self, cell: Cell) -> None:
+        """The address is free: nothing need be known of it here, unless something is under way."""
+        top = self._top
+        is_idle = self.cell is cell and self._next is None and self.arriving is None
+        if is_idle and top is not None and isinstance(top.host, SubtreeHost):
+            top.host.vacated(self)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import re
+import zlib
+from typing import TYPE_CHECKING, Final
 
 import msgspec
 
@@ -15,6 +17,16 @@ if TYPE_CHECKING:
 
 Saved = tuple[str, bytes, float, float]
 """A timer in a snapshot: type name and body of its message, seconds left, interval."""
+
+
+HOOKS: Final = re.compile(r"(?P<turn>\d+)[a-z_]*?(?P<said>[0-9a-f]{8})\.\d+")
+"""The key of a timer that a hook wants: the turn behind which it ran, which hook, and what the timer says."""
+BEGUN: Final = re.compile(r"\d+")
+
+
+def said_by(name: str, body: bytes, interval: float) -> str:
+    """What a timer says, in short."""
+    return f"{zlib.crc32(body, zlib.crc32(f'{name}|{interval}'.encode())):08x}"
 
 
 class Timers:
@@ -56,7 +68,21 @@ class Timers:
     def known_as(self, out: Out) -> Out:
         """The same order, for the timer that it means."""
         key = self._same.get(out.to)
+        if key is None and out.to not in self._states and out.to not in self._made:
+            key = self._meant(out.to)
         return out if key is None else msgspec.structs.replace(out, to=key)
+
+    def _meant(self, key: str) -> str | None:
+        """What a hook was given before this process began, for a timer that ran already: the one that says the same."""
+        made = HOOKS.fullmatch(key)
+        clocks = self.running()
+        if made is None or key in clocks:
+            return None
+        for other, clock in clocks.items():
+            begun = BEGUN.match(other)
+            if begun is not None and int(begun[0]) <= int(made["turn"]) and said_by(*clock) == made["said"]:
+                return other
+        return None
 
     def made_again(self, key: str) -> None:
         """The journal has this one."""

@@ -17,6 +17,7 @@ import msgspec
 
 from ..actors.actor import Actor
 from ..actors.errors import HoldfastError
+from ..actors.process.forked import check_can_watch
 from ..actors.values import encode_value
 from ..system.script import check_folders
 from ..system.system import ActorSystem
@@ -28,6 +29,7 @@ from .wire import (
     AnyRequest,
     BadRequest,
     Control,
+    NotServed,
     Response,
     Transact,
     Tree,
@@ -57,7 +59,7 @@ NAMED = {"compose": ("outside",), "transition": ("whole",), "update": ("mechanis
 
 
 class EndpointInUse(HoldfastError, text="control endpoint {path}: {why}"):
-    """A live process listens at this socket, or it is no socket."""
+    """A live process listens at this socket, it is no socket, or the system cannot watch one more."""
 
     path: str
     why: str
@@ -71,19 +73,22 @@ async def control_endpoint(system: ActorSystem, path: str | os.PathLike[str]) ->
     a dead process has left is replaced.
 
     Raises:
-        EndpointInUse: a live process has it, or there is something else. UntrustedFile: others may write the folder.
+        EndpointInUse: a live process has it, there is something else, or the system cannot watch one more descriptor.
+        UntrustedFile: others may write the folder.
     """
     where = absolute(path)
     with claimed(where):
         sock, inode = listen(where)
         endpoint = Endpoint(system, os.geteuid())
-        server = await asyncio.start_unix_server(endpoint.serve, sock=sock, limit=64 * 1024)
         try:
+            try:
+                endpoint.listen(sock)
+            except OSError as error:
+                raise EndpointInUse(str(where), error.strerror or str(error)) from error
             yield where
         finally:
-            server.close()
             await endpoint.close()
-            await server.wait_closed()
+            sock.close()
             remove(where, inode)
 
 
@@ -185,15 +190,90 @@ class Endpoint:
 
     def __init__(self, system: ActorSystem, uid: int) -> None:
         self._system, self._uid = system, uid
+        self._loop = asyncio.get_running_loop()
         self._clients: set[asyncio.Task[Any]] = set()
+        self._connecting: set[asyncio.Task[None]] = set()
+        self._socket: socket.socket | None = None  # on which we listen
+        self._is_watched = False  # it is
+        self._turned_away: dict[socket.socket, asyncio.TimerHandle] = {}
         self._idle: dict[asyncio.Task[Any], None] = {}  # those that have asked for nothing, the longest first
+
+    def listen(self, sock: socket.socket) -> None:
+        """Serve whoever connects to a listening socket. Raises OSError: the system cannot watch one more."""
+        check_can_watch(sock.fileno())
+        self._socket, self._is_watched = sock, True
+        self._loop.add_reader(sock, self._accept, sock)
+
+    def _accept(self, sock: socket.socket) -> None:
+        """Connections wait. Each is tried before the loop has it: uvloop ends the program if it cannot be watched."""
+        for _ in range(MOST_CLIENTS):
+            try:
+                client, _ = sock.accept()
+            except (BlockingIOError, ConnectionAbortedError):
+                return
+            except OSError:  # There are no descriptors, or no memory: whoever waits is served when there are.
+                self._pause(sock)
+                return
+            client.setblocking(False)
+            try:
+                check_can_watch(client.fileno())
+            except OSError as error:
+                self._turn_away(client, error)
+                continue
+            task = self._loop.create_task(self._connect(client))
+            self._connecting.add(task)
+            task.add_done_callback(self._connecting.discard)
+
+    def _pause(self, sock: socket.socket) -> None:
+        if self._is_watched:
+            self._is_watched = False
+            self._loop.remove_reader(sock)
+        self._loop.call_later(LINGER, self._go_on)
+
+    def _go_on(self) -> None:
+        sock = self._socket
+        if sock is None:
+            return
+        try:
+            self.listen(sock)
+        except OSError:
+            self._pause(sock)
+
+    def _turn_away(self, client: socket.socket, error: OSError) -> None:
+        """Tell a client why it is not served; what it sends meanwhile is not read, and must not cut off our answer."""
+        with contextlib.suppress(OSError):
+            client.send(frame(failure(NotServed(error.strerror or str(error)))))
+            client.shutdown(socket.SHUT_WR)
+        self._turned_away[client] = self._loop.call_later(LINGER, self._let_go, client)
+
+    def _let_go(self, client: socket.socket) -> None:
+        self._turned_away.pop(client).cancel()
+        client.close()
+
+    async def _connect(self, client: socket.socket) -> None:
+        reader = asyncio.StreamReader(64 * 1024, self._loop)
+        try:
+            await self._loop.connect_accepted_socket(
+                lambda: asyncio.StreamReaderProtocol(reader, self.serve, self._loop), client
+            )
+        except OSError:
+            client.close()  # It has gone.
+        except BaseException:
+            client.close()
+            raise
 
     async def close(self) -> None:
         """End all connections; what they have asked for and is not done is undone."""
-        for task in list(self._clients):
-            task.cancel()
-        if self._clients:
-            await asyncio.wait(self._clients)
+        if self._socket is not None:
+            if self._is_watched:
+                self._loop.remove_reader(self._socket)
+            self._socket, self._is_watched = None, False
+        for client in list(self._turned_away):
+            self._let_go(client)
+        while tasks := {*self._clients, *self._connecting}:
+            for task in tasks:
+                task.cancel()
+            await asyncio.wait(tasks)
 
     async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """One connection, from its first request to its end."""

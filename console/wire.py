@@ -31,6 +31,12 @@ class BadRequest(HoldfastError, text="this is no request: {problem}"):
     problem: str
 
 
+class NotServed(HoldfastError, text="the system cannot watch another connection now: {why}"):
+    """The kernel watches no more descriptors for the system: connect again when it has room."""
+
+    why: str
+
+
 class WrongUser(HoldfastError, text="the other end runs as the user with uid {uid}, and only uid {expected} is served"):
     """The other end of the control endpoint belongs to another user."""
 

@@ -150,6 +150,7 @@ class InnerGroupHost:
         if cell.queue:
             cell.queue.clear()  # Its home has these.
         self._guest.tell_gone(cell)
+        self._guest.recovery.vacated(cell.path)
 
     def progress(self, cell: Cell) -> object:
         return object()  # It waits for the root.

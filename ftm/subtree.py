@@ -189,6 +189,11 @@ class SubtreeGroup(GroupHost):
     def retired(self, cell: Cell) -> None:
         self._wanted = None
         super().retired(cell)
+        left = self.left()
+        if left:
+            asyncio.gather(*left, return_exceptions=True).add_done_callback(lambda _: self.place.vacate(cell))
+        else:
+            self.place.vacate(cell)
 
     def is_restarting(self, cell: Cell) -> bool:
         return self._is_restarting

@@ -77,7 +77,7 @@ class DynamicSupervisor(Supervisor):
                 self._again(one, exits.crash(error))
 
     def _lose(self, name: str) -> None:
-        """A child of our last life whose id nobody knows: whoever waits for it is told, what was recorded is erased."""
+        """A child is over whose id nobody will use again: whoever waits for it is told, what was recorded is erased."""
         path, keeper = f"{self.ctx.path}/{name}", self.ctx.cell.node.keeper
         try:
             keeper.erase(path, below=True)
@@ -112,7 +112,10 @@ class DynamicSupervisor(Supervisor):
 
     def _forget(self, one: Child) -> None:
         super()._forget(one)
-        if not self._flags.journal and not self._is_lost_with_us(one):
+        if self._is_lost_with_us(one):
+            self._lose(one.spec.id)
+            return
+        if not self._flags.journal:
             return
         node = self.ctx.cell.node
         try:

@@ -509,9 +509,9 @@ class Supervisor(Inquiries):
 
     def _unlist(self, one: Child) -> None:
         """A child could not be started for the first time."""
-        self._forget(one)
         if one.cell is not None:
             lives.retire(one.cell, "it could not be started")
+        self._forget(one)
 
     def _enlist(self, one: Child) -> None:
         """A child is to be started for the first time. Raises HoldfastError if that cannot be."""

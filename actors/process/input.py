@@ -6,6 +6,9 @@ import asyncio
 import os
 from collections import deque
 
+from .forked import check_can_watch
+from .output import UNWATCHED_SECONDS
+
 MOST_WAITING = 1024 * 1024
 """Bytes that may wait for a program that does not read; what would be more is refused."""
 PIECE = 64 * 1024
@@ -23,6 +26,7 @@ class InputWriter:
         self._loop, self._fd = loop, fd
         self._pieces: deque[memoryview] = deque()
         self._is_waiting = False
+        self._retry: asyncio.TimerHandle | None = None
         self.waiting = 0
         self.is_open = True
 
@@ -47,6 +51,8 @@ class InputWriter:
         if self._fd < 0:
             return
         self._wait(False)
+        if self._retry is not None:
+            self._retry.cancel()
         os.close(self._fd)
         self._fd = -1
         self._pieces.clear()
@@ -75,8 +81,18 @@ class InputWriter:
         if not self.is_open:
             self.close()
 
+    def _again(self) -> None:
+        self._retry = None
+        self._go_on()
+
     def _wait(self, wanted: bool) -> None:
         if wanted and not self._is_waiting:
+            try:
+                check_can_watch(self._fd)
+            except OSError:  # Then we look now and then whether it takes more.
+                if self._retry is None:
+                    self._retry = self._loop.call_later(UNWATCHED_SECONDS, self._again)
+                return
             self._loop.add_writer(self._fd, self._go_on)
         elif self._is_waiting and not wanted:
             self._loop.remove_writer(self._fd)

@@ -8,10 +8,14 @@ import time
 from collections import deque
 from collections.abc import Callable
 
+from .forked import check_can_watch
+
 LONGEST = 16 * 1024
 """Bytes after which a line without an end is passed on in pieces."""
 SLICE_SECONDS = 0.002
 """How long lines are handed on before everybody else has a turn."""
+UNWATCHED_SECONDS = 0.05
+"""How often a pipe is looked into that the system cannot watch."""
 LAST_READS = 16
 """How often a pipe is read at the end: a descendant that writes without end must not hold us up."""
 
@@ -19,7 +23,8 @@ LAST_READS = 16
 class OutputReader:
     """Reads a pipe and hands on each line, a slice at a time: whoever prints without end does not hold up the others.
 
-    While lines wait nothing more is read, so the writer waits.
+    While lines wait nothing more is read, so the writer waits. A pipe that the system cannot watch is looked into now
+    and then.
 
     Args:
         on_line: called with each line, or piece of a very long one.
@@ -37,15 +42,16 @@ class OutputReader:
         self._rest = b""
         self._before = b""  # the last piece, if it was not the end of its line
         self._lines: deque[tuple[bytes, bytes]] = deque()  # with what came before of the same line
-        self._is_closed = self._is_paused = False
+        self._is_closed, self._is_paused = False, True
         self._then: Callable[[], None] | None = None
         self._slice: asyncio.Handle | None = None
-        loop.add_reader(fd, self._read)
+        self._watch()
 
     def _read(self) -> None:
         try:
             data = os.read(self._fd, 64 * 1024)
         except BlockingIOError:
+            self._watch()
             return
         except OSError:
             data = b""
@@ -86,8 +92,23 @@ class OutputReader:
             if then is not None:
                 then()
         elif self._is_paused:
-            self._is_paused = False
-            self._loop.add_reader(self._fd, self._read)
+            self._watch()
+
+    def _watch(self) -> None:
+        """Read, or read again: when there is something, or now and then while the system cannot watch the pipe."""
+        if self._is_closed or not self._is_paused:
+            return
+        try:
+            check_can_watch(self._fd)
+        except OSError:
+            self._loop.call_later(UNWATCHED_SECONDS, self._read_unwatched)
+            return
+        self._is_paused = False
+        self._loop.add_reader(self._fd, self._read)
+
+    def _read_unwatched(self) -> None:
+        if not self._is_closed and self._slice is None:
+            self._read()
 
     def _pause(self) -> None:
         """Read no more for now."""

@@ -241,3 +241,16 @@ async def test_a_child_whose_restore_fails_again_and_again_goes_back_the_second_
             event = await back(stream, hf.RolledBack)
         assert "2 time(s)" in event.reason
         assert await seen(system) == ["a"]
+
+
+async def test_a_child_is_started_with_an_older_snapshot_by_hand(store: str | None, isolation: str) -> None:
+    async with running(store) as system:
+        await system.start(tree(isolation, doing(isolation), doing(isolation, "new")))
+        await two_snapshots(system)
+        await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
+        with system.events() as stream:
+            await top(system).ask(hf.RestartChild("doer", older=True), timeout=20.0)
+            async with asyncio.timeout(60.0):
+                event = await back(stream, hf.RolledBack)
+        assert await seen(system) == ["a", "b"], "it was saved when it was stopped, and before"
+        assert event.from_turn > event.to_turn > 0

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import pytest
 
+from tests.faults.served import BYTES
 from tests.faults.traced import can_trace, end_all
 from tests.faults.watches import KINDS
 
-PROGRAM = "import sys; sys.path.append(sys.argv.pop()); from tests.faults.watches import main; main()"
+PROGRAM = "import sys; sys.path.append(sys.argv.pop()); from tests.faults.{} import main; main()"
 ROOT = Path(__file__).parents[2]
 
 pytestmark = pytest.mark.skipif(not can_trace(), reason="needs strace, and the right to trace")
@@ -36,22 +37,21 @@ def say(program: subprocess.Popen[bytes]) -> None:
     program.stdin.flush()
 
 
-@pytest.mark.parametrize("process", ["first", "further"])
-@pytest.mark.parametrize(("loop", "error"), [("asyncio", "ENOMEM"), ("uvloop", "ENOSPC")])
-def test_nothing_more_can_be_watched(error: str, loop: str, process: str, tmp_path: Path) -> None:
-    with open(tmp_path / "errors", "wb") as errors:
+def run(name: str, arguments: list[str], fault: str, folder: Path) -> tuple[list[str], list[str]]:
+    """What a program says between its first and second wait for a word, with the fault, and what after them."""
+    with open(folder / "errors", "wb") as errors:
         program = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, loop, process, str(ROOT)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=tmp_path,
+            [sys.executable, "-c", PROGRAM.format(name), *arguments, str(ROOT)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, cwd=folder,
         )  # fmt: skip
     tracer: subprocess.Popen[bytes] | None = None
     try:
         said_until_ready(program)
-        option = f"inject=epoll_ctl:error={error}:when=2+"  # one has room, and then none
         tracer = subprocess.Popen(
-            ["strace", "-p", str(program.pid), "-o", "/dev/null", "-e", "trace=epoll_ctl", "-e", option],
+            ["strace", "-p", str(program.pid), "-o", "/dev/null", "-e", "trace=epoll_ctl",
+             "-e", f"inject=epoll_ctl:{fault}"],
             stderr=subprocess.PIPE,
-        )
+        )  # fmt: skip
         assert tracer.stderr is not None
         assert b"attached" in tracer.stderr.readline()
         say(program)
@@ -59,15 +59,34 @@ def test_nothing_more_can_be_watched(error: str, loop: str, process: str, tmp_pa
         tracer.terminate()
         tracer.wait()
         say(program)
-        after = program.communicate(timeout=60)[0].decode()
+        after = program.communicate(timeout=60)[0].decode().splitlines(keepends=True)
     finally:
-        end_all(program, tracer, tmp_path)
+        end_all(program, tracer, folder)
+    assert not (folder / "errors").read_text()
+    assert program.returncode == 0
+    return said, after
+
+
+@pytest.mark.parametrize("process", ["first", "further"])
+@pytest.mark.parametrize(("loop", "error"), [("asyncio", "ENOMEM"), ("uvloop", "ENOSPC")])
+def test_nothing_more_can_be_watched(error: str, loop: str, process: str, tmp_path: Path) -> None:
+    said, after = run("watches", [loop, process], f"error={error}:when=2+", tmp_path)  # one has room, and then none
     refused = [line for line in said if "started" not in line.split()]
     for kind in KINDS:
         assert any(line.startswith(kind) for line in refused), said
     for line in refused:
         assert "StartFailed" in line
         assert os.strerror(getattr(errno, error)) in line
-    assert after.split("\n")[:-1] == [f"{kind}3 started" for kind in KINDS]
-    assert not (tmp_path / "errors").read_text()
-    assert program.returncode == 0
+    assert after == [f"{kind}3 started\n" for kind in KINDS]
+
+
+@pytest.mark.parametrize(("loop", "error"), [("asyncio", "ENOSPC"), ("uvloop", "ENOMEM")])
+def test_neither_clients_nor_pipes_can_be_watched(error: str, loop: str, tmp_path: Path) -> None:
+    """Clients hear why they are not served; what a program prints and reads is slower, and whole."""
+    said, after = run("served", [loop], f"error={error}", tmp_path)
+    assert len(said) == 3
+    for line in said[:2]:
+        assert line.startswith("NotServed: ")
+        assert os.strerror(getattr(errno, error)) in line
+    assert said[2] == f"got {BYTES} True\n"
+    assert after == ["served\n"]

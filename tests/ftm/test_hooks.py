@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -49,3 +50,41 @@ async def test_a_timer_of_on_start_is_there_once_after_failovers(recovery: hf.Me
             os.kill(system.pid_of(system.ref(f"/app/ticking/ftm/{primary}", hf.Actor)), signal.SIGKILL)
             assert await ref.ask(Count(), timeout=60.0) == count
             assert [interval for *_, interval in host.switch.timers.saved().values()] == [3600.0]
+
+
+class Halt(hf.Message[None]): ...
+
+
+class Holding(Ticking):
+    """Keeps the handle that it is given for the timer of its first life, once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.timer: Any = None
+
+    def on_start(self, restored: bool) -> None:
+        if self.timer is None:
+            timer = self.ctx.every(3600.0, Tick())
+            self.timer = timer if restored else None
+
+    @hf.on(Halt)
+    def halt(self, message: Halt) -> None:
+        self.timer.cancel()
+
+
+async def test_a_handle_of_on_start_is_good_after_a_failover_and_a_restart_of_the_root(tmp_path: Path) -> None:
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    spec = hf.child("it", hf.start(Holding), recovery=hf.hybrid(interval=3600.0), mechanism=hf.PBR())
+    async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
+        ref = await system.start(spec)
+        host: Any = ref._cell.host
+        assert await ref.ask(Count(), timeout=30.0) == 1
+        await until(lambda: len(host.group.members) > 1)
+        os.kill(system.pid_of(system.ref(f"/app/it/ftm/{host.group.primary}", hf.Actor)), signal.SIGKILL)
+        assert await ref.ask(Count(), timeout=60.0) == 2
+    async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
+        ref = await system.start(spec)
+        host = ref._cell.host
+        assert len(host.switch.timers.saved()) == 1
+        await ref.ask(Halt(), timeout=60.0)
+        assert host.switch.timers.saved() == {}

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import holdfast as hf
+from holdfast.actors.process import forked
 
 
 class Item(hf.Message[None]):
@@ -104,3 +106,67 @@ async def test_what_waits_at_a_made_up_address_is_told_if_nobody_comes_back_ther
         if not journal:
             await supervisor.ask(hf.StartChild(id="given"), 60)
         assert await (await keeper(system, given)).ask(Taken(), 60) == [10, 11, 12]
+
+
+class Leave(hf.Message[None]):
+    to: hf.ActorRef[Keeper]
+
+
+class Leaver(Keeper):
+    """Says something in its last turn."""
+
+    @hf.on(Leave)
+    def leave(self, message: Leave) -> None:
+        message.to.tell(Item(len(self.taken)))
+        self.ctx.stop()
+
+
+async def none_left(supervisor: hf.ActorRef[hf.Supervisor], but: int) -> None:
+    async with asyncio.timeout(60.0):
+        while len(await supervisor.ask(hf.WhichChildren(), 60)) > but:
+            await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_nothing_stays_of_a_made_up_child_that_has_ended_but_what_it_said(tmp_path: Path, isolation: Any) -> None:
+    template = hf.child(None, hf.start(Leaver), recovery=hf.hybrid(), restart="transient")
+    store = f"sqlite:{tmp_path / 'app.db'}"
+    async with hf.ActorSystem("app", log=False, store=store) as system:
+        supervisor = await system.start(hf.dynamic("d", template=template, intensity=9, isolation=isolation))
+        given = await supervisor.ask(hf.StartChild(id="given"), 60)
+        made_up = [await supervisor.ask(hf.StartChild(), 60) for _ in range(4)]
+        for n, child in enumerate(made_up):
+            for _ in range(n):
+                await child.send(Item(n))
+        for child in made_up[:3]:
+            child.tell(Leave(given))
+        await supervisor.ask(hf.TerminateChild(made_up[3].path.rpartition("/")[2]), 60)
+        await none_left(supervisor, 1)
+        async with asyncio.timeout(60.0):
+            while len(taken := await given.ask(Taken(), 60)) < 3:
+                await asyncio.sleep(0)
+        assert sorted(taken) == [0, 1, 2]
+        await system.homes.settled()
+        assert system.homes.known("/app/d") == [given.path]
+        with pytest.raises(hf.NoSuchActor):
+            system.ref(made_up[0].path, Leaver)
+    async with hf.ActorSystem("app", log=False, store=store) as system:
+        assert system.homes.known("/app/d") == [given.path]
+
+
+async def test_a_process_takes_more_recorded_children_in_its_life_than_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forked, "PAGE_BYTES", 8 * 8)  # six places
+    template = hf.child(None, hf.start(Leaver), recovery=hf.hybrid(), restart="temporary")
+    async with hf.ActorSystem("app", log=False) as system:
+        supervisor = await system.start(hf.dynamic("d", template=template, isolation="process"))
+        given = await supervisor.ask(hf.StartChild(id="given"), 60)
+        for round_number in range(4):
+            children = [await supervisor.ask(hf.StartChild(), 60) for _ in range(5)]
+            with pytest.raises(hf.StartFailed, match="as many recorded actors as it can"):
+                await supervisor.ask(hf.StartChild(), 60)
+            for child in children:
+                child.tell(Leave(given))
+            await none_left(supervisor, 1)
+            async with asyncio.timeout(60.0):
+                while len(await given.ask(Taken(), 60)) < 5 * (round_number + 1):
+                    await asyncio.sleep(0)

@@ -120,6 +120,37 @@ async def test_a_supervisor_is_up_when_all_its_children_are() -> None:
         assert log == ["+a", "+b", "+c"]
 
 
+@virtual
+@pytest.mark.parametrize("how", ["StartChild", "its own start"])
+async def test_a_supervisor_escalates_while_a_child_starts(how: str) -> None:
+    """Whoever waits for the start hears of it, and the child that was starting is over."""
+    gate = asyncio.Event()
+    free = asyncio.Event()
+    free.set()
+    async with hf.ActorSystem(log=False, intensity=9) as system:
+        first = slow(free, "first")
+        start: asyncio.Future[Any]
+        if how == "StartChild":
+            top = await system.start(hf.supervisor("top", children=[first], intensity=0))
+            start = top.ask(hf.StartChild(slow(gate)), SECONDS)
+        else:
+            spec = hf.supervisor("top", children=[first, slow(gate)], intensity=0)
+            start = asyncio.ensure_future(system.start(spec))
+        await begun(system, "/app/top/slow")
+        with system.events() as events:
+            system.ref("/app/top/first", hf.Actor).kill()
+            error = await refused(start)
+            gave_up = [one for one in events.take() if isinstance(one, hf.SupervisorGaveUp)]
+        assert isinstance(error, hf.AskFailed if how == "StartChild" else hf.StartFailed)
+        assert [one.address for one in gave_up] == ["/app/top"]
+        if how == "StartChild":
+            async with asyncio.timeout(SECONDS):
+                while (await states(system, "/app")).get("top") != "running":
+                    await asyncio.sleep(0)
+            assert await states(system, "/app/top") == {"first": "running"}
+        assert "/app/top/slow" not in system.tree()
+
+
 @pytest.mark.parametrize("strategy", ["one_for_one", "one_for_all", "rest_for_one"])
 async def test_a_sibling_that_crashes_meanwhile_is_restarted(strategy: Any) -> None:
     """With a group strategy when the start is over: the group has to be complete."""

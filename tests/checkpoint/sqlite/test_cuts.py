@@ -8,6 +8,7 @@ import random
 import shutil
 import sqlite3
 import stat
+import struct
 import threading
 from contextlib import closing
 from pathlib import Path
@@ -248,25 +249,64 @@ def test_the_wal_is_brought_into_the_database_meanwhile(path: Path, monkeypatch:
     assert numbers(reopened(path)) == list(range(count))
 
 
+def wal_number(path: Path) -> int:
+    """How often the WAL was begun anew, which its header counts."""
+    with open(f"{path}-wal", "rb") as wal:
+        return int.from_bytes(wal.read(16)[12:], "big")
+
+
 def test_a_wal_that_has_grown_long_begins_anew_although_writers_never_rest(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 16)
     monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
 
-    def begun() -> int:
-        """How often the WAL was begun anew, which its header counts."""
-        with open(f"{path}-wal", "rb") as wal:
-            return int.from_bytes(wal.read(16)[12:], "big")
-
     with closing(SqliteJournal(path)) as journal:
         journal.append(inputs(1))
-        first, count = begun(), 1
-        while begun() < first + 3:
+        first, count = wal_number(path), 1
+        while wal_number(path) < first + 3:
             assert count < 40_000, "the WAL only grows"
             for number in range(count, count + 100):
                 journal.append(inputs(1, start=number))
             count += 100
+    assert numbers(reopened(path)) == list(range(count))
+
+
+def test_a_checkpoint_that_leaves_a_long_wal_is_done_again_while_no_writer_goes_on(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Somebody reads an old state during the first attempt, and has gone when the writers are held up."""
+    monkeypatch.setattr(sqlite_store, "_CHECKPOINT_BYTES", 1 << 19)
+    monkeypatch.setattr(sqlite_store, "_WAL_FRAMES", 64)
+    with (
+        closing(SqliteJournal(path)) as journal,
+        closing(sqlite3.connect(path, isolation_level=None, check_same_thread=False)) as reader,
+    ):
+        lock, checkpoints = journal._store.lock, list[str]()
+
+        class Held:
+            def __enter__(self) -> None:
+                lock.acquire()
+                if threading.current_thread().name == "holdfast-store":
+                    reader.execute("ROLLBACK")
+                    checkpoints.append("again")
+
+            def __exit__(self, *_: object) -> None:
+                lock.release()
+
+        journal.append(inputs(1))
+        reader.execute("BEGIN")
+        reader.execute("SELECT count(*) FROM sqlite_master").fetchall()
+        monkeypatch.setattr(journal._store, "lock", Held())
+        count = 1
+        while journal._store._checkpointer is None:
+            journal.append(inputs(100, start=count))
+            count += 100
+        journal._store._checkpointer.join()
+        assert checkpoints == ["again"]
+        with open(f"{path}-shm", "rb") as index:
+            words = struct.unpack("=25I", index.read(100))
+        assert words[24] == words[4] > 64, "all frames are in the database: the WAL begins anew with the next one"
     assert numbers(reopened(path)) == list(range(count))
 
 
