@@ -7,6 +7,7 @@ import random
 import uuid
 from collections import deque
 from collections.abc import Awaitable, Callable, Coroutine
+from contextvars import ContextVar, copy_context
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 from . import links, mailbox
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
 A = TypeVar("A", bound="Actor")
 T = TypeVar("T")
 R = TypeVar("R")
+
+begun_in: ContextVar[Any] = ContextVar("begun_in", default=None)
+"""In a background task: what was being handled when it was created. That turn may wait for it, a later one does not."""
 
 
 class StashError(HoldfastError, text="{why}"):
@@ -135,7 +139,9 @@ class ActorContext:
         return future
 
     def chain(self) -> Chain:
-        """This turn, and those that wait for it."""
+        """This turn, and those that wait for it; nothing in a background task whose turn is over."""
+        if self.is_left_behind():
+            return ()
         if self._asking is not self.item:
             self._asking = self.item
             self._turn = self.cell.node.next_turn()
@@ -147,6 +153,11 @@ class ActorContext:
         if more is None or more.turn is None:  # Its last turn has ended: nobody waits here.
             return False
         return self._asking is self.item and (self.path, self._turn) in chain
+
+    def is_left_behind(self) -> bool:
+        """Whether a background task asks, and something else than in its turn is being handled now."""
+        begun = begun_in.get()
+        return begun is not None and begun is not self.item
 
     def in_turn(self) -> bool:
         """Whether a turn of this actor runs, seen from its own code: from a background task it may be idle."""
@@ -246,10 +257,7 @@ class ActorContext:
                 crashes this actor. What `then` or `failed` raises does too, and so does what is no message of its.
         """
         self._alive()
-        tasks = self.cell.extra().tasks
-        task = self.cell.node.loop.create_task(self._pipe(work, then, failed), name=f"pipe of {self.path}")
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
+        self._beside(self._pipe(work, then, failed), "pipe")
 
     async def _pipe(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> None:
         try:
@@ -418,17 +426,23 @@ class ActorContext:
     def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
         """A background task that ends with this life; an exception in it crashes the actor."""
         self._alive()
-        task = self.cell.node.loop.create_task(contained(work), name=f"task of {self.path}")
-        self.cell.extra().tasks.add(task)
+        task = self._beside(work, "task")
         task.add_done_callback(self._task_done)
         task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
         return task
 
+    def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
+        """A task of this life, which knows in what turn it was begun."""
+        tasks, context = self.cell.extra().tasks, copy_context()
+        context.run(begun_in.set, self.item)
+        task = self.cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+        return task
+
     def _task_done(self, task: asyncio.Task[Any]) -> None:
-        self.cell.extra().tasks.discard(task)
         if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
-            cause = error.__cause__
-            self.cell.push(Piped(None, cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error))
+            self.cell.push(Piped(None, uncontained(error)))
 
 
 async def contained(work: Coroutine[Any, Any, T]) -> T:
@@ -441,6 +455,12 @@ async def contained(work: Coroutine[Any, Any, T]) -> T:
         return await work
     except (SystemExit, KeyboardInterrupt) as error:
         raise remote_crash(error) from error
+
+
+def uncontained(error: BaseException) -> BaseException:
+    """What was raised in `contained` work that has failed with `error`."""
+    cause = error.__cause__
+    return cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error
 
 
 class Stashed(Envelope, eq=False):
@@ -471,5 +491,5 @@ def waits_for(asker: ActorContext, cell: Cell, chain: Chain) -> bool:
     """Whether the turn that runs at `cell` is in the chain: an ask to it would wait for itself."""
     ctx = cell.ctx
     if ctx is asker:
-        return asker.in_turn()
+        return asker.in_turn() and not asker.is_left_behind()
     return ctx is not None and ctx.turn_in(chain)

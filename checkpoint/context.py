@@ -230,12 +230,7 @@ class RecordedContext(ActorContext):
                     work.close()
                 return
             life.pipes += 1
-        tasks = self.cell.extra().tasks
-        task = self.cell.node.loop.create_task(
-            self._piped(life.turn, k, work, then, failed), name=f"pipe of {self.path}"
-        )
-        tasks.add(task)
-        task.add_done_callback(tasks.discard)
+        task = self._beside(self._piped(life.turn, k, work, then, failed), "pipe")
         if asyncio.iscoroutine(work):  # Cancelled before its first step, the task would leave it unawaited.
             task.add_done_callback(lambda _: work.close())
 

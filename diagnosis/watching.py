@@ -84,6 +84,7 @@ async def watch(
     manner: Manner | None = None,
     seconds: float = 3.0,
     window: float = 2.0,
+    hung_after: float | None = None,
     name: str = "diagnosis",
     **options: Any,
 ) -> Watch:
@@ -105,6 +106,8 @@ async def watch(
         manner: of the observers that are made here.
         seconds: see `model`.
         window: of a generated model: seconds over which rates are counted, and five times as long learned.
+        hung_after: seconds after which an actor that is still in the same turn counts as not running, such as one that
+            others ask in vain. None: nothing takes too long.
         name: of the supervisor that is started.
         options: those of `tree`.
 
@@ -115,13 +118,13 @@ async def watch(
     watchers = [*observers]
     if generated is not None:
         declaration = generated.declaration
-        watchers += observers_for(generated, window=window, manner=manner)
+        watchers += observers_for(generated, window=window, hung_after=hung_after, manner=manner)
     else:
         assert model is not None
         declaration = model.declaration() if isinstance(model, System) else model
     where = (dict(generated.addresses) if generated is not None else {}) | dict(addresses or {})
     if generated is None and where:
-        watchers.append(observer("nodes", Start(NodeObserver, (where,), {"manner": manner})))
+        watchers.append(observer("nodes", Start(NodeObserver, (where,), {"hung_after": hung_after, "manner": manner})))
     if limits:
         declaration = expecting(declaration, limits)
         watchers += property_observers(limits, where, manner)

@@ -41,6 +41,8 @@ ABORTED_WITHIN = 5.0
 """Seconds that it may take to end them again, before it is ended."""
 SECURED_WITHIN = 15.0
 """Seconds within which the authority has to have certified everybody."""
+MOST_BROKEN_OFF = 3
+"""Replicas that end while they prepare, whoever has ended them: then it is given up."""
 WHOLE_WITHIN = 30.0
 """Seconds for which replicas are waited for that are being replaced, before the others prepare."""
 COPIED_WITHIN = 5.0
@@ -84,6 +86,7 @@ class Reconfiguration:
         self.is_back = False  # to what has worked before
         self.is_preparing = False  # replicas start its bricks
         self.is_tried = False
+        self.broken_off = 0  # how often a replica has ended, or has changed its part, while it prepared
         self.link: SecuredLink | None = None  # that of the new stack, if it is another one
         self.given_up: asyncio.Future[str] = group.node.loop.create_future()
         self.prepared: dict[str, int] = {}  # name to life, of those that have the new bricks
@@ -218,10 +221,14 @@ class AdaptationEngine(Actor):
             if errors:
                 await self._wait_for_change(LOOK_AGAIN)  # If it has died, that is known soon.
                 for name, why in errors.items():
-                    # A failover has it given up: it is prepared again.
+                    # Else a failover has broken it off: it is prepared again.
                     if group.epoch == epoch and group.members.get(name) == members[name] and group.is_well(name):
                         change.give_up(f"{name} could not prepare it: {why}")
                         self._replace_late(name, members[name], why)
+                    else:
+                        change.broken_off += 1
+                        if change.broken_off == MOST_BROKEN_OFF:
+                            change.give_up(f"{MOST_BROKEN_OFF} replicas have ended while they prepared it, {name} last")
                 change.is_preparing = False
                 return
         change.is_preparing = False
@@ -234,9 +241,11 @@ class AdaptationEngine(Actor):
         What a trial does not show may end, or block, any replica that prepares, and another may die meanwhile.
         """
         group, end = self._group, self._now() + WHOLE_WITHIN
+        if change.is_back:
+            return group.is_steady()  # Whoever is not there comes with bricks that are not wanted.
         while not group.whole_since()[0] and self._now() < end and not change.why:
             await self._wait_for_change(LOOK_AGAIN)
-        if not (change.is_back or change.why):
+        if not change.why:
             copied = group.keep_copy(change)
             await asyncio.wait((copied, change.given_up), timeout=COPIED_WITHIN, return_when=asyncio.FIRST_COMPLETED)
         return group.is_steady() and not change.why
@@ -339,7 +348,13 @@ class AdaptationEngine(Actor):
         if not await self._ends(group.quiet(), change, end, "a turn of it has not ended"):
             return False
         for name, future in asked.items():
-            if not await self._ends(future, change, end, f"{name} has not come to rest"):
+            if change.is_back and name != primary:  # What keeps it may be what is to go: it is replaced.
+                await asyncio.wait((future,), timeout=max(0.0, end - self._now()))
+                if not future.done():
+                    group.suspect(name, change.prepared[name], "it has not come to rest")
+            elif not await self._ends(future, change, end, f"{name} has not come to rest"):
+                return False
+            if not future.done():
                 return False
             if (error := future.exception()) is not None:
                 if isinstance(error, (ConfigMismatch, StaleEpoch)):

@@ -158,7 +158,7 @@ class After(Brick):
     """What is done with outcomes before they leave; without `after` they pass through."""
 
     async def after(self, done: Done) -> Done | None:
-        """Make outcomes ready to leave. None: they do not.
+        """Make outcomes ready to leave. None: they do not, and their requests have been let fall.
 
         Proceed goes on when this has returned, or has said `taken()`: the state is not looked at after that.
         """
@@ -175,6 +175,8 @@ class After(Brick):
         if not self._refuses():
             try:
                 out = await self.after(done)
+                if out is None and self._standing.leads:  # Whoever let the batch in hears that it is over.
+                    out = msgspec.structs.replace(done, ends=[], more=[])
             except StaleEpoch:
                 out = None  # Another one leads: these outcomes never were.
             if out is not None:

@@ -57,8 +57,8 @@ class Joiner(Actor):
         group = self._group
         for name in group.names:
             primary = group.primary
-            if group.is_changing or group.is_resting:
-                return  # Whoever does that wakes us.
+            if group.is_changing or group.is_resting or (group.change is not None and group.change.is_back):
+                return  # Whoever does that wakes us; until then it would come with the bricks that have failed.
             if group.is_over or not group.is_live or primary is None or name == primary or name in group.members:
                 continue
             life = group.life_of(name)

@@ -123,7 +123,13 @@ class Computes(Message[Doing]):
 
 
 class Rehearse(Message[None]):
-    """To a replica that is no part of a group yet: play each role, and let a batch without requests pass its bricks."""
+    """To a replica that is no part of a group yet: play this role, and let a batch without requests pass its bricks.
+
+    `is_new`: all of them are made anew.
+    """
+
+    leads: bool
+    is_new: bool
 
 
 class Finish(Message[None]):

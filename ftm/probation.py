@@ -25,9 +25,9 @@ if TYPE_CHECKING:
     from .mechanism import Mechanism
 
 SECONDS: Final = 5.0
-"""It lasts at least so long,"""
+"""It lasts at least so long with the same replicas: one that dies, of whatever, may hide what the bricks would do,"""
 TURNS: Final = 100
-"""and until so many turns have ended,"""
+"""and until so many turns of theirs have ended,"""
 MOST_SECONDS: Final = 60.0
 """but no longer than this, as soon as nothing is in the bricks of which that is not known."""
 STUCK_AFTER: Final = 5.0
@@ -72,11 +72,17 @@ class Probation:
         self._detaching: asyncio.Task[None] | None = None
         self._begin_going_back, self._over = begin, over
         self.moved(group)
-        self._since, self._turn = group.node.loop.time(), group.switch.turn
+        self._begun = group.node.loop.time()
+        self._begin_anew()
         self._last_turn, self._moved_at, self._looked_at = self._turn, self._since, self._since
         self._timer = group.node.loop.call_later(LOOK_EVERY, self._look)
         self._asking: asyncio.Task[None] | None = None
         self._again_at, self._pause = 0.0, LOOK_EVERY  # when going back is tried again
+
+    def _begin_anew(self) -> None:
+        """From here on it is seen whether it works."""
+        group = self._group
+        self._since, self._turn, self._members = group.node.loop.time(), group.switch.turn, dict(group.members)
 
     @property
     def is_over(self) -> bool:
@@ -123,7 +129,7 @@ class Probation:
         stacks = self.before if self.before is not NOTHING else (), self.layers
         was, now = (tuple(one.name for one in layers) for layers in stacks)
         event = MechanismSettled(
-            self._group.path, was, now, is_kept, self.why, node.loop.time() - self._since
+            self._group.path, was, now, is_kept, self.why, node.loop.time() - self._begun
         )  # fmt: skip
         self.settled.set_result(event)
         if node.watched:
@@ -173,6 +179,8 @@ class Probation:
         if group.is_over:
             return  # Its life is being begun again.
         self._looked_at = now
+        if group.members != self._members:
+            self._begin_anew()
         if group.switch.turn != self._last_turn or (group.out is None and not group.waiting):
             self._last_turn, self._moved_at = group.switch.turn, now
         if now - self._moved_at >= STUCK_AFTER:  # Whoever has led meanwhile: nothing has passed.

@@ -138,6 +138,8 @@ class RequestProtocol(Transfer):
         goes_in = bool(left) or work.go is not None
         if known or self._later or not goes_in:
             more, self._later = self._later, []
+            if work.copy and not goes_in:
+                more += self._standing.server.copied()
             self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in, None, more))
         if goes_in:
             self._standing.inside.update((one.feed.id, one) for one in left)
@@ -269,7 +271,7 @@ class RequestProtocol(Transfer):
                 raise
 
     async def _quiet(self) -> None:
-        """Wait until nothing is inside. Whoever calls has raised `_holds`."""
+        """Wait until nothing is inside, or another epoch has begun. Whoever calls has raised `_holds`."""
         while self._current is not None:
             idle: asyncio.Future[None] = self._standing.node.loop.create_future()
             self._idle.append(idle)
@@ -299,8 +301,10 @@ class RequestProtocol(Transfer):
     @on(Lead)
     def _lead(self, message: Lead) -> Any:
         self._check(message.epoch, message.config)
-        if self._standing.leads and self._standing.leading != message.epoch and self._marker is None:
-            self._current = None  # The bricks have kept what was inside, and are others now: it is asked for again.
+        if self._standing.leads and self._standing.leading != message.epoch:
+            # The bricks have kept what was inside, and are others now: it is asked for again. Whoever waits for its
+            # end was told so in another epoch.
+            self._current = self._marker = None
             self._go_on()
         return self._answer(self._begin_to_lead(message))
 
@@ -386,9 +390,11 @@ class RequestProtocol(Transfer):
         return self._answer(self._give_out())
 
     async def _give_out(self) -> Exported:
+        epoch = self._standing.epoch
         self._holds += 1
         try:
             await self._quiet()
+            self._standing.check(epoch)
             server = self._standing.server
             await server.ensure()
             await server.until_work_is_back()
@@ -454,19 +460,15 @@ class RequestProtocol(Transfer):
     def _rehearse(self, message: Rehearse) -> Any:
         if self._standing.epoch >= 0:  # It has a part: whoever says this, plain, must not take it from there.
             raise Refused(path=self._standing.path, reason="plain")
-        return self._answer(self._rehearsed())
+        return self._answer(self._rehearsed(message))
 
-    async def _rehearsed(self) -> None:
-        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody.
-
-        In each role, and both ways into it: from the other one, and made in it.
-        """
+    async def _rehearsed(self, message: Rehearse) -> None:
+        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody."""
         standing = self._standing
-        for leads, is_new in ((True, False), (True, True), (False, False), (False, True)):
-            await self._order(Play(leads, is_new))
-            self._current = self._marker = CANARY
-            self.before.tell(Work(standing.epoch, standing.config, CANARY, []))
-            await self._quiet()
+        await self._order(Play(message.leads, message.is_new))
+        self._current = self._marker = CANARY
+        self.before.tell(Work(standing.epoch, standing.config, CANARY, []))
+        await self._quiet()
 
     @on(Finish)
     def _finish(self, message: Finish) -> Any:

@@ -20,7 +20,7 @@ from ..actors.errors import HoldfastError, StartFailed, StartIgnored, remote_cra
 from ..actors.events import ActorStarted
 from ..actors.exits import SHUTDOWN, ExitReason, Shutdown
 from ..actors.mail import ReplyHandle
-from ..actors.message import Message
+from ..actors.message import Message, message_of
 from ..actors.process.recipe import unpack_recipe
 from ..checkpoint.method import Method
 from ..supervision.children import STOPPED, UP, Child, new_cell
@@ -29,6 +29,7 @@ from ..supervision.supervisor import Supervisor
 from .bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
 from .heart import Heart
 from .mechanism import Description, Mechanism, MechanismRefused, revive
+from .messages import FORWARDED, Work
 from .orders import Abort, Broken, Commit, Prepare, Setting
 from .protocol import InnerProtocol, RequestProtocol
 from .sealed import Opened, Refused
@@ -302,17 +303,20 @@ class Replica(Supervisor):
             self._give_up_address(one, SHUTDOWN)
             self._forget(one)
 
-    async def _settled(self, names: list[str]) -> None:
+    async def _settled(self, names: list[str]) -> list[Work]:
         """Wait until bricks that are to end have handled what has come so far; one that does not is killed.
 
         What it still had is not lost: home sends again what it has no outcome of.
+
+        Returns:
+            What it had from the one that has led: home may have the outcome of that, and nobody sends it again.
 
         Raises:
             HoldfastError: one has crashed, which is the end of all of us.
         """
         asked = {name: self._cell(name).ref.ask(Settle(), timeout=FOREVER) for name in names}
         ended = {name: self._cell(name).ended() for name in names}
-        end = self.ctx.cell.node.loop.time() + SETTLED_WITHIN
+        end, held = self.ctx.cell.node.loop.time() + SETTLED_WITHIN, list[Work]()
         for name in names:
             left = max(0.0, end - self.ctx.cell.node.loop.time())
             await asyncio.wait((asked[name], ended[name]), timeout=left, return_when=asyncio.FIRST_COMPLETED)
@@ -322,16 +326,25 @@ class Replica(Supervisor):
                 raise HoldfastError(f"{self._cell(name).path} has crashed")
             else:
                 asked[name].cancel()
-                one = self._children[name]
+                one, cell = self._children[name], self._cell(name)
                 one.state = STOPPED  # Its end is no failure of ours.
-                self._cell(name).kill()
+                # The bricks behind it come behind it in `names`, and what they have came before.
+                had = map(message_of, (cell.item, *(cell.queue or ())))
+                held[:0] = [one for one in had if isinstance(one, Work) and one.number <= FORWARDED]
+                cell.kill()
+        return held
+
+    def _pass_on(self, held: list[Work]) -> None:
+        """What bricks had that were killed goes past them, in the order in which it came, and is computed."""
+        for work in held:
+            self._cell(self._woven.names["proceed"]).ref.tell(work)
 
     async def _take_up(self, woven: Woven, *, leads: bool | None = None, behind: bool = False) -> None:
         """Have this stack be the one: bind everything, end what is not needed (`behind`: when we have answered)."""
         old, self._woven, standing = self._woven, woven, self._standing
         kept = set(woven.names.values())
         left = [name for name in old.names.values() if name not in kept and name in self._children]
-        await self._settled(left)  # What is in their mailboxes belongs to the time before.
+        held = await self._settled(left)  # What is in their mailboxes belongs to the time before.
         standing.config, standing.layers = woven.config, woven.layers
         if leads is not None:
             standing.leads = leads
@@ -344,6 +357,7 @@ class Replica(Supervisor):
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         standing.forget_bricks()
         self._bind_all(woven)
+        self._pass_on(held)
         if behind:
             self._obey(EndBricks(left), None)
         else:
@@ -515,10 +529,11 @@ class Replica(Supervisor):
         old = self._woven
         places = weave(old.layers, leads=message.leads)
         left = [name for slot, name in old.names.items() if places[slot][:2] != old.places[slot][:2]]
-        await self._settled(left)  # What is in their mailboxes belongs to the time before.
+        held = await self._settled(left)  # What is in their mailboxes belongs to the time before.
         await self._end_bricks(left)  # First: the new ones have their names.
         woven = await self._start_bricks(old.config, old.layers, leads=message.leads)
         await self._take_up(woven, leads=message.leads)
+        self._pass_on(held)
 
     async def _play(self, message: Play) -> None:
         """Have the bricks of this role, without the protected actor: it is only to be seen how they do."""

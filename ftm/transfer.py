@@ -80,7 +80,7 @@ class Transfer(Gate):
         raise NotImplementedError
 
     async def _quiet(self) -> None:
-        """Wait until nothing is inside."""
+        """Wait until nothing is inside, or another epoch has begun."""
         raise NotImplementedError
 
     def _go_on(self) -> None:
@@ -106,9 +106,11 @@ class Transfer(Gate):
             raise CannotJoin(path=path, why=f"{standing.path} does not lead")
         if standing.peer == path:  # It follows anew, or has lived anew: whatever it had, it does not count on that.
             standing.set_peer(path, "joining")
+        epoch = standing.epoch
         self._holds += 1
         try:
             await self._quiet()
+            standing.check(epoch)
             await server.ensure()
             state = None
             if server.has_access:

@@ -28,7 +28,9 @@ TRIAL: Final = "trial"
 STARTED_WITHIN: Final = 30.0
 """Seconds that its process and its bricks may take to come up."""
 PASSED_WITHIN: Final = 15.0
-"""Seconds that it may take to play all roles."""
+"""Seconds that it may take to play one of its parts."""
+PARTS: Final = ((True, False), (True, True), (False, False), (False, True))
+"""Each role (whether it leads), and both ways into it: from the other one, and made in it."""
 
 
 class TrialFailed(HoldfastError, text="{why}"):
@@ -65,14 +67,15 @@ async def tried(group: Group, above: Cell, spec: ChildSpec) -> None:
 
 
 async def rehearsed(group: Group, name: str) -> None:
-    """Have a replica that has no part yet play all roles, each with a batch without requests.
+    """Have a replica that has no part yet play all parts, each with a batch without requests.
 
     Raises:
         TrialFailed: a brick has not started, has ended its replica, or has kept the batch.
     """
     life = group.life_of(name)
     try:
-        await group.entry(name).ask(Rehearse(), PASSED_WITHIN)
+        for part in PARTS:
+            await group.entry(name).ask(Rehearse(*part), PASSED_WITHIN)
     except AskTimeout:
         why = f"one of its bricks did not start, or pass on an empty batch, within {PASSED_WITHIN:g} s"
         raise TrialFailed(group.path, why) from None

@@ -8,7 +8,8 @@ from collections import OrderedDict, deque
 from collections.abc import AsyncGenerator, AsyncIterable, AsyncIterator, Callable, Iterable, Iterator
 from typing import Any, Literal, cast
 
-from ..actors.errors import AskTimeout, HoldfastError
+from ..actors.context import contained, uncontained
+from ..actors.errors import AskTimeout, HoldfastError, RemoteCrash
 from .awaited import Failed, Job, Ok
 
 OnTimeout = Literal["exit", "kill_task"]
@@ -116,13 +117,16 @@ class _Source:
         except (StopIteration, StopAsyncIteration):
             self._is_over = True
             return []
+        except RemoteCrash as error:
+            raise uncontained(error) from error.__cause__
 
     def pulling(self, there: Callable[[object], None]) -> asyncio.Task[Any] | None:
         """Pull the next item, and call `there` when it is there; None if there will be none, or it is there."""
         if self._async is None or self._is_over:
             return None
         if self._pulling is None:
-            self._pulling = asyncio.get_running_loop().create_task(_next(self._async), name="pull of a stream")
+            pull = contained(_next(self._async))
+            self._pulling = asyncio.get_running_loop().create_task(pull, name="pull of a stream")
             self._pulling.add_done_callback(there)
         return self._pulling
 

@@ -1,9 +1,10 @@
 """A test that hangs says where: every thread, every task, and every turn of an actor that waits.
 
 A pytest plugin, for `pytest_plugins = ["holdfast.testing.hanging"]` in a conftest.py. It goes by pytest's own option
-`faulthandler_timeout`, and adds two things. pytest prints the stacks of threads only, which for a program of tasks
-is that of the event loop. And its limit ends with the first failure: a teardown behind a test that has failed, or that
-hangs itself, would hang for ever; here each teardown has the time anew.
+`faulthandler_timeout`, and adds three things. pytest prints the stacks of threads only, which for a program of tasks
+is that of the event loop. An async test that hangs is cancelled when that was told: it fails, and the run goes on. And
+pytest's limit ends with the first failure: a teardown behind a test that has failed, or that hangs itself, would hang
+for ever; here each teardown has the time anew.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from _pytest.faulthandler import fault_handler_stderr_fd_key
 T = TypeVar("T")
 
 SOONER = 0.9
-"""We tell at this part of the time; then pytest prints its own, and ends the run if it is to."""
+"""We tell, and cancel, at this part of the time; then pytest prints its own, and ends the run if it is to."""
 
 
 def what_waits() -> str:
@@ -42,6 +43,15 @@ def what_waits() -> str:
     return "\n".join(lines)
 
 
+def cancel(function: str) -> None:
+    """Cancel a test: the tasks of all event loops that run the coroutine of this function. Called from any thread."""
+    loops = [one for one in gc.get_objects() if isinstance(one, asyncio.AbstractEventLoop) and one.is_running()]
+    for loop in loops:
+        for task in asyncio.all_tasks(loop):
+            if getattr(task.get_coro(), "__name__", "") == function:
+                loop.call_soon_threadsafe(task.cancel, "the test hangs")
+
+
 @contextmanager
 def watched(item: pytest.Item, what: str) -> Generator[None, None, None]:
     """Tell what waits if this takes nearly as long as it may."""
@@ -55,6 +65,8 @@ def watched(item: pytest.Item, what: str) -> Generator[None, None, None]:
 
     def tell() -> None:
         os.write(target, f"\n{item.nodeid}: {what} hangs\n{what_waits()}\n".encode())
+        if what == "the test":
+            cancel(item.name.partition("[")[0])
 
     timer = Onlooker(seconds * SOONER, tell)
     timer.start()

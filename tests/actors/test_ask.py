@@ -268,6 +268,58 @@ async def test_an_actor_whose_turn_has_ended_can_be_asked_by_whom_it_asked(syste
     assert await heard == "not busy"
 
 
+@pytest.mark.parametrize("how", ["task", "pipe"])
+async def test_background_work_asks_beside_a_turn_that_does_not_wait_for_it(system: hf.ActorSystem, how: str) -> None:
+    """Whoever waits for that later turn is asked when it is done waiting; so is the actor itself."""
+
+    class Told(hf.Message):
+        answers: list[str]
+
+    class Owner(hf.Actor):
+        def __init__(self, way: list[hf.ActorRef[Any]]) -> None:
+            self._way = way
+
+        @hf.on(Work)
+        def work(self, message: Work) -> str:
+            if how == "task":
+                self.ctx.create_task(self._tell())
+            else:
+                self.ctx.pipe_to_self(self._report(), Told)
+            return "begun"
+
+        async def _tell(self) -> None:
+            heard.set_result(await self._report())
+
+        @hf.on(Told)
+        def told(self, message: Told) -> None:
+            heard.set_result(message.answers)
+
+        async def _report(self) -> list[str]:
+            await asked.wait()
+            answers = [one.ask(Quick(one.path)) for one in (*self._way, self.ctx.ref)]
+            gate.set()
+            return await asyncio.gather(*answers)
+
+        @hf.on(Ring)
+        async def ring(self, message: Ring) -> str:
+            asked.set()
+            await gate.wait()
+            return "done"
+
+        @hf.on(Quick)
+        def quick(self, message: Quick) -> str:
+            return message.name
+
+    asked, gate = asyncio.Event(), asyncio.Event()
+    heard: asyncio.Future[list[str]] = asyncio.get_running_loop().create_future()
+    asker = system.spawn(hf.start(Worker), "asker")
+    owner = system.spawn(hf.start(Owner, [asker]), "owner")
+    await owner.ask(Work())
+    assert await asker.ask(Ring([owner])) == "done"
+    async with asyncio.timeout(30):
+        assert await heard == ["/t/asker", "/t/owner"]
+
+
 async def test_a_background_task_may_ask_its_own_idle_actor(system: hf.ActorSystem) -> None:
     class Owner(hf.Actor):
         @hf.on(Work)

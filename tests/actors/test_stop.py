@@ -475,10 +475,12 @@ async def test_a_crash_stays_the_reason_when_on_stop_fails_too(system: hf.ActorS
 @pytest.mark.parametrize("isolation", ["task", "process"])
 async def test_who_stops_with_a_crash_has_crashed(system: hf.ActorSystem, isolation: Any) -> None:
     ref = await system.start(hf.child("a", hf.start(Gives), isolation=isolation, restart="temporary"))
+    ended = ref._cell.ended()
     with system.events() as events:
         ref.tell(Give())
-        while not (told := [event for event in events.take() if isinstance(event, hf.ActorCrashed)]):
-            await asyncio.sleep(0)
+        await ended
+        await system.node.settled()
+        told = [event for event in events.take() if isinstance(event, hf.ActorCrashed)]
     assert [(event.address, str(event.reason)) for event in told] == [("/t/a", "Up: it gives up")]
 
 

@@ -34,5 +34,5 @@ async def test_turns_of_a_recorded_actor_share_their_writes(tmp_path: Path) -> N
             ledger.tell(Put(number))
             if number % BURST == BURST - 1:
                 await asyncio.sleep(0)
-        assert await ledger.ask(All(), timeout=120.0) == [*range(TELLS)]
+        assert await ledger.ask(All(), timeout=60.0) == [*range(TELLS)]
         assert engine.appends - before < TELLS / 4, "each turn was written on its own"

@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
+import msgspec
 import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import RequestsDropped
-from holdfast.ftm.bricks import Before
+from holdfast.ftm.bricks import After, Before
 from holdfast.ftm.mechanism import Mechanism, Role
-from holdfast.ftm.messages import RequestDropped, Work
+from holdfast.ftm.messages import Done, RequestDropped, Work
 from tests.ftm.accounts import Add, Counter, Tags
 
 REFUSED, ANSWERED, DROPPED = -1, -2, -3
@@ -52,6 +53,30 @@ class Guarding(Mechanism):
     """Whether a brick that drops one request drops its whole batch."""
 
 
+class Loser(After):
+    """Keeps the first outcomes of a message, alone or with all of their part."""
+
+    is_over = False
+
+    async def after(self, done: Done) -> Done | None:
+        assert isinstance(self.mechanism, Losing)
+        if self.is_over or not any(end.id and end.answer.kind for end in done.ends):
+            return done
+        self.is_over = True
+        return None if self.mechanism.whole else msgspec.structs.replace(done, ends=[])
+
+
+@dataclasses.dataclass(frozen=True)
+class Losing(Mechanism):
+    """Masks nothing, needs nothing."""
+
+    name: ClassVar[str] = "losing"
+    layer: ClassVar[str] = "assertion"
+    roles: ClassVar[dict[str, Role]] = {"leader": Role(after=Loser), "other": Role()}
+
+    whole: bool = False
+
+
 @pytest.mark.parametrize("below", ["pbr", "lfr"])
 async def test_one_request_is_refused_or_answered_and_leaves_no_trace(system: hf.ActorSystem, below: str) -> None:
     stack = hf.compose(Guarding(), hf.PBR() if below == "pbr" else hf.LFR())
@@ -76,3 +101,16 @@ async def test_a_request_that_a_brick_lets_fall_fails_and_is_told(system: hf.Act
     assert (told.address, told.numbers.isdecimal()) == (ref.path, True)
     assert await ref.ask(Add(2)) == 1
     assert await ref.ask(Tags()) == [2]
+
+
+@pytest.mark.parametrize("below", [hf.PBR(), hf.LFR()], ids=["pbr", "lfr"])
+@pytest.mark.parametrize("whole", [False, True])
+async def test_an_outcome_that_a_brick_lets_fall_fails_and_may_have_been(
+    system: hf.ActorSystem, whole: bool, below: Mechanism
+) -> None:
+    stack = hf.compose(Losing(whole=whole), below)
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
+    with pytest.raises(RequestDropped) as dropped:
+        await ref.ask(Add(1), timeout=30)
+    assert dropped.value.may_have_run
+    assert await ref.ask(Tags(), timeout=30) == [1]

@@ -8,7 +8,10 @@ from typing import Any
 import holdfast as hf
 
 LEAVING = {kind.__name__: kind for kind in (KeyboardInterrupt, SystemExit, GeneratorExit, asyncio.CancelledError)}
-PHASES = ("__init__", "on_start", "on_start later", "turn", "turn later", "def turn", "on_stop", "task", "pipe")
+PHASES = (
+    *("__init__", "on_start", "on_start later", "turn", "turn later", "def turn", "on_stop"),
+    *("task", "pipe", "ended task", "ended pipe"),
+)
 
 
 class Go(hf.Message[str]):
@@ -38,6 +41,12 @@ class Leaver(hf.Actor):
             await asyncio.sleep(0.001)
             self.leave(phase)
 
+    async def leave_when_cancelled(self, phase: str) -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            self.leave(phase)
+
     async def on_start(self, restored: bool) -> None:
         self.leave("on_start")
         await self.leave_later("on_start later")
@@ -50,6 +59,10 @@ class Leaver(hf.Actor):
             self.ctx.create_task(self.leave_later("task"))
         if self.phase == "pipe":
             self.ctx.pipe_to_self(self.leave_later("pipe"), lambda _: Gone())
+        if self.phase == "ended task":
+            self.ctx.create_task(self.leave_when_cancelled("ended task"))
+        if self.phase == "ended pipe":
+            self.ctx.pipe_to_self(self.leave_when_cancelled("ended pipe"), lambda _: Gone())
         return "still here"
 
     @hf.on(GoNow)

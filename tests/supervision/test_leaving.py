@@ -43,7 +43,7 @@ async def test_what_would_end_the_program_ends_one_life(place: str, error: str) 
         with system.events() as events:
             top = await system.start(hf.supervisor("top", isolation=isolation, children=[], intensity=len(PHASES)))
             for phase in PHASES:
-                if place == "protected" and phase in ("task", "pipe"):
+                if place == "protected" and phase.endswith(("task", "pipe")):
                     continue  # Its background work is that of a replica: not tried here.
                 spec = hf.child("x", hf.start(Leaver, phase, error), **PLACES[place])
                 started = top.ask(hf.StartChild(spec, fresh=True), SECONDS)
@@ -58,6 +58,8 @@ async def test_what_would_end_the_program_ends_one_life(place: str, error: str) 
                 elif phase == "pipe" or (phase == "task" and error != "CancelledError"):  # Tasks may be cancelled.
                     assert await ref.ask(Go(), SECONDS) == "still here"
                     await crashed(events, "/app/top/x", error if error != "CancelledError" else "cancelled")
+                elif phase.startswith("ended"):  # What is raised when it is cancelled with its life.
+                    assert await ref.ask(Go(), SECONDS) == "still here"
                 assert await ref.ask(GoNow() if phase != "def turn" else Go(), SECONDS) == "still here"
                 await top.ask(hf.TerminateChild("x"), SECONDS)
                 await top.ask(hf.DeleteChild("x"), SECONDS)

@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.supervision.family import Boom, Family, Leave, Plan, kid
+from tests.supervision.family import Boom, Family, Kid, Leave, Plan, kid
 
 pytestmark = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -242,6 +242,43 @@ async def test_which_ends_are_reported(restart: Any, reason: hf.ExitReason) -> N
             await family.after("a", Leave(reason))
             told = [event.reason for event in events.take() if isinstance(event, hf.ChildTerminated)]
         assert told == ([reason] if restart == "permanent" or not reason.is_clean else [])
+
+
+@pytest.mark.parametrize("restart", ["permanent", "transient", "temporary"])
+@pytest.mark.parametrize("above", [hf.supervisor, hf.dynamic])
+async def test_an_end_is_told_that_comes_while_its_supervisor_stops(restart: Any, above: Any) -> None:
+    """It stops a sibling meanwhile, or is told to stop at the same moment."""
+    plan = Plan()
+    async with hf.ActorSystem(log=False) as system:
+        top = await system.start(above("top"))
+        for spec in (kid(plan, "a", restart=restart), naughty("n", 10.0, shutdown="infinity")):
+            await top.ask(hf.StartChild(spec))
+        with system.events() as events:
+            if above is hf.dynamic:
+                system.ref("/app/top/a", Kid).kill()
+                await system.stop(top)
+            else:
+                stopping = asyncio.ensure_future(system.stop(top))
+                await asyncio.sleep(1.0)
+                system.ref("/app/top/a", Kid).kill()
+                await stopping
+            told = [event for event in events.take() if isinstance(event, hf.ChildTerminated)]
+        assert [(event.address, event.reason) for event in told] == [("/app/top/a", hf.KILLED)]
+
+
+async def test_so_is_one_that_comes_while_its_group_is_restarted() -> None:
+    plan = Plan()
+    async with hf.ActorSystem(log=False) as system:
+        children = kid(plan, "a"), naughty("n", 10.0, shutdown="infinity"), kid(plan, "b")
+        family = await Family.start(system, plan, *children, strategy="one_for_all")
+        with system.events() as events:
+            family.ref("b").tell(Boom())
+            await asyncio.sleep(1.0)
+            family.ref("a").kill()
+            await asyncio.sleep(10.0)
+            told = [event for event in events.take() if isinstance(event, hf.ChildTerminated)]
+        assert [event.address for event in told] == ["/app/top/b", "/app/top/a"]
+        assert plan.take() == "-b +a +b"
 
 
 async def test_the_next_life_begins_when_the_last_is_over() -> None:

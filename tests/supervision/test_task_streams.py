@@ -152,10 +152,11 @@ async def test_leaving_the_stream_early_ends_its_jobs(how: str) -> None:
         assert 3000.0 not in load.begun
 
 
-async def test_an_error_of_the_source_ends_the_stream_and_its_jobs() -> None:
+@pytest.mark.parametrize("error", [LookupError, SystemExit])
+async def test_an_error_of_the_source_ends_the_stream_and_its_jobs(error: type[BaseException]) -> None:
     def broken() -> Iterator[float]:
         yield 1000.0
-        raise LookupError("no more")
+        raise error("no more")
 
     async def broken_later() -> AsyncIterator[float]:
         for item in broken():
@@ -165,7 +166,7 @@ async def test_an_error_of_the_source_ends_the_stream_and_its_jobs() -> None:
         sources: list[Callable[[], Any]] = [broken, broken_later]
         for source in sources:
             load = Load()
-            with pytest.raises(LookupError):
+            with pytest.raises(error):
                 await values(jobs.stream(load.take, source(), max_concurrency=2))
             assert (load.running, await jobs.children()) == (0, [])
 

@@ -41,12 +41,24 @@ async def test_it(system):
 """
 
 
+def ran(folder: Path, program: str, seconds: int = 2) -> subprocess.CompletedProcess[str]:
+    """A run of pytest, in which nothing may take longer."""
+    (folder / "test_hangs.py").write_text(program, "utf-8")
+    options = [
+        "-o",
+        f"faulthandler_timeout={seconds}",
+        "-o",
+        "faulthandler_exit_on_timeout=true",
+        "-o",
+        "asyncio_mode=auto",
+    ]
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "holdfast.testing.hanging", *options, "--rootdir", "."]
+    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=SECONDS, check=False)
+
+
 @pytest.mark.parametrize("how", ["the test", "the teardown", "a teardown behind a failure"])
 def test_what_hangs_is_told_and_ended(how: str, tmp_path: Path) -> None:
-    (tmp_path / "test_hangs.py").write_text(f"HOW = {how!r}\n{HANGS}", "utf-8")
-    options = ["-o", "faulthandler_timeout=2", "-o", "faulthandler_exit_on_timeout=true", "-o", "asyncio_mode=auto"]
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "holdfast.testing.hanging", *options, "--rootdir", "."]
-    run = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=SECONDS, check=False)
+    run = ran(tmp_path, f"HOW = {how!r}\n{HANGS}")
     assert run.returncode == 1
     what = "the test" if how == "the test" else "the teardown"
     assert f"test_hangs.py::test_it: {what} hangs" in run.stderr
@@ -55,3 +67,21 @@ def test_what_hangs_is_told_and_ended(how: str, tmp_path: Path) -> None:
     assert ("task forgotten:" in run.stderr) is (how == "the test")
     assert "in hang_in_task" in run.stderr or how != "the test"
     assert "Timeout (0:00:02)!" in run.stderr
+
+
+FORGETS = """
+import asyncio
+
+async def test_hangs():
+    await asyncio.Event().wait()
+
+async def test_another():
+    pass
+"""
+
+
+def test_a_test_that_hangs_fails_alone(tmp_path: Path) -> None:
+    run = ran(tmp_path, FORGETS, 30)
+    assert "test_hangs.py::test_hangs: the test hangs" in run.stderr
+    assert "1 failed, 1 passed" in run.stdout
+    assert "CancelledError" in run.stdout

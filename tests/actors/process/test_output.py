@@ -76,6 +76,21 @@ async def test_a_program_that_prints_without_end_does_not_hold_up_the_root(syste
     assert longest < 1.0
 
 
+async def test_of_a_flood_of_short_lines_others_have_their_turn_in_between(system: hf.ActorSystem) -> None:
+    """Counted in lines that come between two turns of ours: a pipe holds 32,768 of them, and one read takes all."""
+    flood = 100_000
+    worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process"))
+    with system.events() as events:
+        writing = worker.ask(Run("write", [1, b"y\n" * flood]), timeout=60)
+        came = list[int]()
+        async with asyncio.timeout(60):
+            while sum(came) + events.missed < flood:
+                await asyncio.sleep(0)
+                came.append(sum(isinstance(event, LogLine) for event in events.take()))
+        await writing
+    assert max(came) < 8_192
+
+
 async def test_the_end_of_the_pipe_is_the_end_of_the_reader() -> None:
     out, into = os.pipe2(os.O_CLOEXEC)
     os.set_blocking(out, False)

@@ -78,6 +78,35 @@ class Desk(hf.Actor):
         pass
 
 
+class Hang(hf.Message):
+    """Do not come back."""
+
+
+class Quote(hf.Message[int]):
+    """Say what is known."""
+
+
+class Cache(hf.Actor):
+    @hf.on(Hang)
+    async def _hang(self, message: Hang) -> None:
+        await asyncio.Event().wait()
+
+    @hf.on(Quote)
+    def _quote(self, message: Quote) -> int:
+        return 1
+
+
+class Asker(hf.Actor):
+    cache: hf.Binding[Cache]
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.every(0.3, Tick())
+
+    @hf.on(Tick)
+    async def _tick(self, message: Tick) -> None:
+        await self.cache.ask(Quote(), timeout=1.0)
+
+
 class Shop:
     """The system, and what repair tells."""
 
@@ -250,3 +279,16 @@ async def test_who_was_restarted_by_its_supervisor_is_not_restarted_by_repair(sh
     shop.part("feed").tell(Freeze())
     await shop.hear(Repaired)
     assert shop.done() == ["restart_child(feed)"]
+
+
+async def test_who_is_asked_in_vain_is_repaired(shop: Shop) -> None:
+    keeper = shop.system.ref("/t/shop", hf.Supervisor)
+    await keeper.ask(hf.StartChild(hf.child("cache", hf.start(Cache))))
+    asker = hf.child("asker", hf.start(Asker), bindings={"cache": "/t/shop/cache"})
+    await keeper.ask(hf.StartChild(asker))
+    await diagnosis.watch(shop.system, repair=POLICY, hung_after=2.0)
+    await asyncio.sleep(20.0)
+    shop.system.ref("/t/shop/cache", Cache).tell(Hang())
+    await shop.hear(Repaired)
+    assert "restart_child(shop/cache)" in shop.done()
+    assert await shop.system.ref("/t/shop/cache", Cache).ask(Quote()) == 1

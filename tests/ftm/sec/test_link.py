@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import datetime as dt
 from typing import Any
 
 import pytest
@@ -11,6 +12,8 @@ import holdfast as hf
 from holdfast.ftm.mechanisms.sec import SEC
 from holdfast.ftm.sealed import TELLS, Agree, Back, Call, Greet, LinkLost, Part, Refused, SecuredLink
 from holdfast.ftm.sec.authority import CertificationAuthority, GetRoot, Revoke
+from holdfast.ftm.sec.certificates import make_list
+from holdfast.ftm.sec.errors import Rejected
 
 CA = "/app/ca"
 PROXY, REPLICA = "/app/c/ftm/proxy", "/app/c/ftm/r1"
@@ -96,4 +99,22 @@ async def test_a_revocation_ends_the_sessions_there_are(whom: str) -> None:
             with pytest.raises(LinkLost):
                 await asked
         assert wire.done == [b"before"]
+        wire.close()
+
+
+class Late(CertificationAuthority):
+    """The time of its lists is over when they come."""
+
+    def _list(self) -> bytes:
+        self.list_number += 1
+        over = dt.timedelta(seconds=-1)
+        return make_list(self._key, self.root, self.revoked, self.list_number, self.ctx.now(), over)
+
+
+async def test_who_cannot_know_whether_somebody_was_revoked_believes_nobody() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("ca", hf.start(Late)))
+        wire = Wire(system)
+        with pytest.raises(Rejected, match="stale_list"):
+            await wire.outer.ready()
         wire.close()
