@@ -107,6 +107,9 @@ class FailoverManager(Actor):
         leading = group.leading
         if leading is None or not group.is_well(leading):
             if leading is not None:
+                if group.silences.get(leading) == group.suspects.get(leading) and group.is_awaited(leading):
+                    self._later()  # It may be building the actor from a large state, which nobody else has.
+                    return False
                 group.condemned[leading] = group.members.get(leading, 0)
                 group.lost(leading, group.why)
                 group.leading = None

@@ -15,6 +15,7 @@ from ..actors.errors import HoldfastError
 from ..actors.exits import Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal
 from ..actors.message import Message
 from ..actors.process.remote import ProcessHost
+from ..actors.process.watch import waited_for_processor
 from .events import ReplicaLost, WrongSuspicion
 from .securing import Securing
 
@@ -55,14 +56,6 @@ def is_blocked(pid: int) -> bool:
     except OSError:
         return False
     return state == "S" or (state == "R" and os.getloadavg()[0] <= (os.cpu_count() or 1))
-
-
-def waited_for_processor(pid: int) -> float:
-    """Seconds for which the main thread of a process was ready and got no processor, so far; 0.0 if nobody knows."""
-    try:
-        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
-    except (OSError, IndexError):  # It has ended, or the kernel does not count that.
-        return 0.0
 
 
 def is_within(place: str, sender: ActorRef[Any] | None) -> bool:

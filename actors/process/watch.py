@@ -49,17 +49,21 @@ class Watch:
         if limits.hung_after is not None:
             self._period = limits.hung_after / LOOKS
             self._clock, self._last_beat = OwnClock(now, self._period), 0.0
+            self._waited = waited_for_processor(worker.pid)  # as of the last beat
             self._timers.append(self._loop.call_later(self._period, self._listen))
 
     def beat(self) -> None:
         """The loop in the process turns."""
         if self.limits.hung_after is not None:
             self._last_beat = self._clock.at(self._loop.time())
+            self._waited = waited_for_processor(self._worker.pid)
 
     def _listen(self) -> None:
         hung_after = self.limits.hung_after
         assert hung_after is not None
         silent = self._clock.tick(self._loop.time()) - self._last_beat
+        if silent >= hung_after:  # What it waited for a processor meanwhile is no silence of its own.
+            silent -= waited_for_processor(self._worker.pid) - self._waited
         if silent >= hung_after:
             self._worker.hung(silent)
             return
@@ -92,6 +96,14 @@ class Watch:
         """Stop watching."""
         for timer in self._timers:
             timer.cancel()
+
+
+def waited_for_processor(pid: int) -> float:
+    """Seconds for which the main thread of a process was ready and got no processor, so far; 0.0 if nobody knows."""
+    try:
+        return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
+    except (OSError, IndexError):  # It has ended, or the kernel does not count that.
+        return 0.0
 
 
 def oom_kills() -> int:

@@ -311,6 +311,33 @@ async def test_a_silent_primary_that_nobody_could_replace_is_waited_for(system: 
     events.close()
 
 
+async def test_a_silent_successor_that_is_all_there_is_is_waited_for(system: hf.ActorSystem) -> None:
+    """It may be building the actor from a large state, which nobody else has any more."""
+    ref = await started(system)
+    host: Any = ref._cell.host
+    group = group_of(ref)
+    assert await ref.ask(Add(0)) == 1
+    first, heir, stopped = group.primary, other(group), list[int]()
+    assert first is not None
+
+    def stop_heir(step: str) -> None:
+        if step == "lead" and not stopped:
+            stopped.append(pid_of(system, ref, heir))
+            os.kill(stopped[0], signal.SIGSTOP)
+
+    host.on_step = stop_heir
+    os.kill(pid_of(system, ref, first), signal.SIGKILL)
+    async with asyncio.timeout(30):
+        while heir not in group.silences and not group.is_over:
+            await asyncio.sleep(0.005)
+    await asyncio.sleep(1.5)  # real time: the manager looks again, more than once
+    assert heir in group.members
+    os.kill(stopped[0], signal.SIGCONT)
+    assert await ref.ask(Add(1), timeout=30) == 2
+    await two_again(ref)
+    assert await ref.ask(Tags()) == [0, 1]
+
+
 async def test_a_stopped_backup_holds_nobody_up_for_long(system: hf.ActorSystem) -> None:
     ref = await started(system)
     load = Load(ref)

@@ -116,6 +116,12 @@ class Computed(hf.Message):
     n: int
 
 
+class Spend(hf.Message[None]):
+    """Compute, and await nothing, until the turn has had so many seconds of a processor."""
+
+    seconds: float
+
+
 class Block(hf.Message[int]):
     """Wait in the turn until the file is there (`path`), asynchronously or not."""
 
@@ -169,6 +175,12 @@ class Worker(Account):
 
     def on_stop(self, reason: hf.ExitReason) -> None:
         self._write(f"stop {reason}")
+
+    @hf.on(Spend)
+    def spend(self, message: Spend) -> None:
+        end = time.thread_time() + message.seconds
+        while time.thread_time() < end:
+            pass
 
     def _write(self, line: str) -> None:
         if self._log:

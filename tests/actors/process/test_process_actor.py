@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,7 @@ from tests.actors.process.players import (
     PutAside,
     Resume,
     Run,
+    Spend,
     Ticks,
     Total,
     Where,
@@ -290,6 +293,24 @@ async def test_a_process_is_not_hung_because_the_root_was_late(system: hf.ActorS
     faults = await asyncio.create_subprocess_exec("sh", "-c", pause, str(os.getpid()))
     assert await faults.wait() == 0
     assert await worker.ask(Add(1)) == 1
+    assert worker._cell.life == 1
+
+
+async def test_a_process_that_gets_no_processor_is_not_hung(system: hf.ActorSystem) -> None:
+    """T3: it computes for less than the limit, and shares its processor with others."""
+    worker = await start(system, hf.start(Worker), limits=hf.Limits(hung_after=1.6))
+    pid = system.pid_of(worker)
+    assert pid is not None
+    processor = min(os.sched_getaffinity(pid))
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(3)]
+    try:
+        for one in (pid, *(each.pid for each in busy)):
+            os.sched_setaffinity(one, {processor})
+        await worker.ask(Spend(1.1), timeout=60)
+    finally:
+        for each in busy:
+            each.kill()
+            each.wait()
     assert worker._cell.life == 1
 
 
