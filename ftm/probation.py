@@ -109,16 +109,24 @@ class Probation:
         return True
 
     def drops(self, end: TurnEnd) -> bool:
-        """A brick has ended a request itself: whether that is asked of the stack before, since it was let fall."""
+        """A brick has ended a request itself: whether that is asked of the stack before, since it was let fall.
+
+        One that may have run is asked of another replica alone: what came of it is known there, or was never.
+        """
         group, name = self._group, self._group.primary
         if self.is_over or end.answer.name != DROPPED:
             return False
         error = group.node.codec.decode_error(end.answer.kind, end.answer.name, end.answer.body)
         why = "its bricks have let a request fall"
-        if not self.why and name is not None:
+        life = 0 if name is None else group.members.get(name, 0)
+        if name is not None and not self.why:
             group.at_fault(name, why)
-            self._take_from(name, group.members.get(name, 0), why)
-        return isinstance(error, RequestDropped) and not error.may_have_run
+            self._take_from(name, life, why)
+        if not isinstance(error, RequestDropped):
+            return False
+        if error.may_have_run and name is not None and group.is_well(name) and group.backups():
+            group.suspect(name, life, why)
+        return not error.may_have_run or (bool(group.backups()) and (name is None or not group.is_well(name)))
 
     def end(self, *, is_kept: bool) -> None:
         """It is known what comes of it."""
