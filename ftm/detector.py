@@ -1,7 +1,7 @@
 """The failure detector: heartbeats judged by phi accrual, on a clock that stands still while the observer does.
 
 A late observer sees all heartbeats late. What it was late itself is no silence of theirs, so its lag is taken out. So
-is the time for which a replica had no processor to beat with.
+is the time for which a replica had no processor to beat with, and what going through its state may take it.
 
 Source:
     Hayashibara, Defago, Yared and Katayama, "The phi accrual failure detector" (2004).
@@ -162,6 +162,11 @@ class Detector(Actor):
             accrual = self._known.get((name, life))
             if accrual is None:  # Not heard yet by this life of ours.
                 self._known[name, life] = Accrual(self._group.detection, now, self._group.starved(name))
-            elif accrual.is_suspect(now) and accrual.is_suspect(now - self._group.starved(name) + accrual.starved):
+            elif accrual.is_suspect(now) and self._is_silent(name, accrual, now):
                 self._group.silent(name, life, f"no heartbeat for {now - accrual.last:.3f} s")
         self._timer = loop.call_later(self._period, self._look)
+
+    def _is_silent(self, name: str, accrual: Accrual, now: float) -> bool:
+        """Whether it would also be suspected if it had had a processor, and no large state to go through."""
+        heard = now - self._group.starved(name) + accrual.starved
+        return accrual.is_suspect(heard) and accrual.is_suspect(heard - self._group.at_work(name))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import math
 import os
 import time
 from collections.abc import Callable, Iterator
@@ -26,6 +27,10 @@ if TYPE_CHECKING:
 
 FROM_OUTSIDE: Final = frozenset({1, 2, 3, 9, 15, 19, 20})
 """Signals (HUP, INT, QUIT, KILL, TERM, STOP, TSTP) by which others end a process, or stop it."""
+BARE: Final = 50_000_000
+"""Bytes that a replica has in memory without a state."""
+SLOWEST: Final = 20_000_000
+"""Bytes of what else it has in memory that it goes through in a second, on a busy machine."""
 OUTVOTED: Final = "OutvotedHere"
 """The error of a replica that was outvoted, which is no fault of its bricks."""
 
@@ -56,6 +61,19 @@ def is_blocked(pid: int) -> bool:
     except OSError:
         return False
     return state == "S" or (state == "R" and os.getloadavg()[0] <= (os.cpu_count() or 1))
+
+
+def work_on_state(pid: int) -> float:
+    """Seconds for which a process may hold its event loop to go through all that it has, if it computes; else 0.0.
+
+    Encoding, comparing and restoring a state do that. What it is at nobody can tell from here, only how much there is.
+    """
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+        resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    except (OSError, IndexError):
+        return 0.0
+    return max(0, resident - BARE) / SLOWEST if state in "RD" else 0.0
 
 
 def is_within(place: str, sender: ActorRef[Any] | None) -> bool:
@@ -89,7 +107,7 @@ class Members(Securing):
         self.suspects: dict[str, int] = {}  # name to life
         self.silences: dict[str, int] = {}  # name to life, of those suspected for their silence alone
         self.renewing: str | None = None  # the primary, if it is to lead anew, with other bricks
-        self.suspected_at = 0.0  # when the primary was, on the loop's clock
+        self.suspected_at: dict[str, float] = {}  # on the loop's clock
         self.wrong = 0  # suspicions
         self.is_over = False
         self._stirred: list[asyncio.Future[None]] = []
@@ -125,7 +143,7 @@ class Members(Securing):
         """Whether a member that is suspected, and may yet be heard of again, is all there is."""
         life = self.members.get(name, 0)
         is_alive = life > 0 and self.life_of(name) == life
-        waited = self.node.loop.time() - self.suspected_at
+        waited = self.node.loop.time() - self.suspected_at.get(name, -math.inf)
         return is_alive and not self.backups() and waited < self.detection.hopeless
 
     def backups(self) -> list[str]:
@@ -184,7 +202,7 @@ class Members(Securing):
 
     def _suspect(self, name: str, life: int, why: str) -> None:
         self.suspects[name] = life
-        self.suspected_at = self.node.loop.time()
+        self.suspected_at[name] = self.node.loop.time()
         if name in (self.primary, self.leading):
             self.why, self.noticed = why, time.monotonic()
         self.wake()
@@ -206,6 +224,11 @@ class Members(Securing):
         """Seconds for which a replica was ready to go on and got no processor, so far."""
         pid = self._pid_of(name)
         return 0.0 if pid is None else waited_for_processor(pid)
+
+    def at_work(self, name: str) -> float:
+        """Seconds of silence for which its state may be the reason; never more than until it is hopeless."""
+        pid = self._pid_of(name)
+        return 0.0 if pid is None else min(work_on_state(pid), self.detection.hopeless)
 
     def _pid_of(self, name: str) -> int | None:
         cell = self.cell_of(name)

@@ -118,7 +118,7 @@ class Sign:
 
     def line(self, text: str) -> None:
         """A line of output, or the beginning of one: a prompt has no end."""
-        if self._pattern is not None and self._pattern.search(text):
+        if self._pattern is not None and self._pattern.search(text.rstrip("\r\n")):
             self.seen.set()
 
     def close(self) -> None:

@@ -8,6 +8,8 @@ import sys
 from collections.abc import Coroutine
 from typing import Any, TypeVar
 
+from ..actors.errors import SpecError
+
 T = TypeVar("T")
 
 
@@ -18,9 +20,14 @@ def run(main: Coroutine[Any, Any, T], *, debug: bool | None = None) -> T:
     cancels it, too, and SIGTERM ends the process at once.
 
     Raises:
+        SpecError: an event loop runs in this thread already, as in a notebook.
         KeyboardInterrupt: it was ended by SIGINT.
         SystemExit: it was ended by SIGTERM (with code 143, as a shell reports it).
     """
+    if asyncio._get_running_loop() is not None:
+        main.close()
+        problem = "an event loop runs here already (a notebook, or another framework's): await the coroutine there"
+        raise SpecError("hf.run", problem)
     stopped_by: list[int] = []
 
     async def guarded() -> T:

@@ -7,6 +7,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from typing import Any
 
 import pytest
@@ -21,7 +22,7 @@ from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.mechanisms.tr import TR
 from holdfast.ftm.orders import Beat
-from tests.ftm.accounts import Counter
+from tests.ftm.accounts import Add, Counter
 from tests.ftm.test_failover import group_of, pid_of, two_again
 
 DETECTION = Detection(interval=0.05, threshold=8.0, pause=0.2, spread=0.01)
@@ -100,6 +101,7 @@ class Watched:
         self.up: dict[str, int] = {}
         self.lives = {"r1": 1, "r2": 1}
         self.starving = {"r1": 0.0, "r2": 0.0}
+        self.working = {"r1": 0.0, "r2": 0.0}
         self.suspects: list[tuple[str, int, float]] = []
         self.loop = asyncio.get_running_loop()
 
@@ -118,6 +120,9 @@ class Watched:
 
     def starved(self, name: str) -> float:
         return self.starving[name]
+
+    def at_work(self, name: str) -> float:
+        return self.working[name]
 
     def silent(self, name: str, life: int, why: str) -> None:
         self.suspects.append((name, life, self.loop.time()))
@@ -250,6 +255,47 @@ async def test_what_a_replica_waits_for_a_processor_is_read_of_its_process(syste
     finally:
         busy.kill()
         busy.wait()
+
+
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_replica_at_work_on_its_state_is_suspected_when_that_should_be_over() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        watched = Watched()
+        watched.working["r1"] = 2.0
+        detector = system.spawn(Start(Detector, (watched,)))
+        for voice, name in zip(await voices(system, detector), ("r1", "r2"), strict=True):
+            voice.tell(Speak(name))
+        await asyncio.sleep(2.0)
+        assert [name for name, _, _ in watched.suspects] == ["r2"]
+        await asyncio.sleep(2.0)
+        assert [name for name, _, _ in watched.suspects] == ["r2", "r1"]
+        await system.stop(detector)
+
+
+class Bulky(Counter):
+    """Takes long to say what it has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bulk = b"x" * 60_000_000
+
+    def get_state(self) -> Any:
+        end = time.process_time() + 1.2
+        while time.process_time() < end:
+            pass
+        return self.total, self.tags, self.bulk
+
+    def set_state(self, state: Any) -> None:
+        self.total, self.tags, self.bulk = state
+
+
+async def test_a_replica_that_goes_through_a_large_state_is_not_suspected(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("one", hf.start(Bulky), mechanism=PBR()))
+    await two_again(ref)
+    group = group_of(ref)
+    assert [await ref.ask(Add(tag), timeout=60) for tag in range(3)] == [1, 2, 3]
+    await two_again(ref)
+    assert (group.wrong, group.failovers, group.members) == (0, 0, {"r1": 1, "r2": 1})
 
 
 class QuickTR(TR):

@@ -62,6 +62,11 @@ def test_it_returns_what_the_program_returns() -> None:
     assert hf.run(value()) == 42
 
 
+async def test_where_an_event_loop_runs_already_it_says_what_to_do() -> None:
+    with pytest.raises(hf.SpecError, match="await the coroutine there"):
+        hf.run(value())
+
+
 def test_it_runs_on_uvloop() -> None:
     assert issubclass(hf.run(loop_kind()), uvloop.Loop)
 
