@@ -138,7 +138,7 @@ async def test_a_function_that_is_cancelled_is_a_failed_start(system: hf.ActorSy
 
 
 async def test_the_end_of_a_line_in_whatever_form(system: hf.ActorSystem) -> None:
-    await system.start(sh(r"printf 'up\r\n'; exec sleep 99", ready="up$", start_timeout=30))
+    await system.start(sh(r"printf 'up\r\n'; exec sleep 99", ready="up$"))
 
 
 async def test_a_file_that_appears_or_changes(system: hf.ActorSystem, tmp_path: Path) -> None:
