@@ -428,7 +428,6 @@ class ActorContext:
         self._alive()
         task = self._beside(work, "task")
         task.add_done_callback(self._task_done)
-        task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
         return task
 
     def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
@@ -438,6 +437,7 @@ class ActorContext:
         task = self.cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
         tasks.add(task)
         task.add_done_callback(tasks.discard)
+        task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
         return task
 
     def _task_done(self, task: asyncio.Task[Any]) -> None:

@@ -15,6 +15,9 @@ FUTEX = {"x86_64": 202, "aarch64": 98}.get(platform.machine(), -1)
 """The number of the system call that waits for a lock."""
 WAITS = (0, 9)
 """Its operations FUTEX_WAIT and FUTEX_WAIT_BITSET."""
+MUTEX = (0, 2)
+"""The operation, and the expected value, by which the C library waits for a mutex, such as that of the interpreter's
+lock: it is held for an instant, and who waits for it is at work."""
 
 
 class Onlooker(threading.Timer):
@@ -49,5 +52,5 @@ def _is_at_work(thread: threading.Thread) -> bool:
         return False  # It has ended meanwhile, or this system has no such file.
     if words[0] != str(FUTEX):
         return FUTEX >= 0
-    operation, timeout = int(words[2], 16) & 0x7F, int(words[4], 16)
-    return operation not in WAITS or timeout != 0
+    operation, value, timeout = int(words[2], 16) & 0x7F, int(words[3], 16), int(words[4], 16)
+    return operation not in WAITS or timeout != 0 or (operation, value) == MUTEX

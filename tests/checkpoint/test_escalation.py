@@ -160,7 +160,7 @@ async def test_who_waits_for_a_later_reply_from_an_undone_turn_is_told(isolation
         waiting = at(system).ask(Do(["later"]), timeout=20.0)
         await add(system, "a")
         await rolled_back(system, isolation)
-        with pytest.raises(hf.ActorStopped):
+        with pytest.raises(hf.AskFailed, match="RuntimeError: it"):
             await waiting
 
 
