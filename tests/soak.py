@@ -245,7 +245,10 @@ class Soak:
         ]  # fmt: skip
         if not pids:
             return "nobody"
-        os.kill(self._rng.choice(pids), signal.SIGKILL)
+        try:
+            os.kill(self._rng.choice(pids), signal.SIGKILL)
+        except ProcessLookupError:  # It has just ended by itself, as one that has been moved to a task does.
+            return "nobody"
         return "a replica" if kind == "protected" else "a process"
 
     async def well(self) -> None:
