@@ -8,12 +8,10 @@ from importlib import import_module as _import_module
 from typing import TYPE_CHECKING
 from typing import Any as _Any
 
-from holdfast.actors.actor import Actor, Start, on, start, subscribe
-from holdfast.actors.bindings import Binding, Unbound
-from holdfast.actors.context import ActorContext
+from holdfast.actors.adapters import Bus, Calls, Wrapped, calls, wrap
+from holdfast.actors.control.live_state import Opaque
 from holdfast.actors.control.orders import Status
-from holdfast.actors.control.state import Opaque
-from holdfast.actors.control.tap import Statistics
+from holdfast.actors.control.tracing import Statistics
 from holdfast.actors.errors import (
     ActorRestarting,
     ActorStopped,
@@ -93,7 +91,7 @@ from holdfast.actors.events import (
     TurnSlow,
     TurnsSkipped,
 )
-from holdfast.actors.exits import (
+from holdfast.actors.exit_reasons import (
     KILLED,
     NOPROC,
     NORMAL,
@@ -109,23 +107,23 @@ from holdfast.actors.exits import (
     Shutdown,
     Signal,
 )
-from holdfast.actors.links import Monitor
-from holdfast.actors.mail import ReplyHandle
-from holdfast.actors.mailbox import bounded
-from holdfast.actors.message import Message, Refusal
-from holdfast.actors.plain import Bus, Calls, Wrapped, calls, wrap
-from holdfast.actors.process.kept import ProgramFailed
-from holdfast.actors.process.limits import Limits
-from holdfast.actors.ref import ActorRef
-from holdfast.actors.timers import Timer
-from holdfast.checkpoint.compared import StateDiverged
-from holdfast.checkpoint.due import CheckpointFailed
-from holdfast.checkpoint.file import RecoveryFile, load_recovery
-from holdfast.checkpoint.groups import NoSuchGroup
+from holdfast.actors.kernel.actor import Actor, Start, on, start, subscribe
+from holdfast.actors.kernel.bindings import Binding, Unbound
+from holdfast.actors.kernel.context import ActorContext
+from holdfast.actors.kernel.envelope import ReplyHandle
+from holdfast.actors.kernel.links import Monitor
+from holdfast.actors.kernel.mailbox import bounded
+from holdfast.actors.kernel.message import Message, Refusal
+from holdfast.actors.kernel.ref import ActorRef
+from holdfast.actors.kernel.timers import Timer
+from holdfast.actors.process.program.external_program import ProgramFailed
+from holdfast.actors.process.resource_limits import Limits
+from holdfast.checkpoint.home.quarantine import NotQuarantined, QuarantinedMessage
 from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StaleEpoch, StoreFailed, StoreInUse
+from holdfast.checkpoint.life.determinism_guard import NotDeterministic
+from holdfast.checkpoint.life.readonly_guard import NotReadonly
+from holdfast.checkpoint.life.replay_guard import StateDiverged
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
-from holdfast.checkpoint.quarantine import NotQuarantined, QuarantinedMessage
-from holdfast.checkpoint.readonly import NotReadonly
 from holdfast.checkpoint.recovery.settings import (
     Held,
     RecoveryHooks,
@@ -135,7 +133,9 @@ from holdfast.checkpoint.recovery.settings import (
     recovery_hooks,
     safe_state,
 )
-from holdfast.checkpoint.strict import NotDeterministic
+from holdfast.checkpoint.recovery_file import RecoveryFile, load_recovery
+from holdfast.checkpoint.snapshot.snapshot_groups import NoSuchGroup
+from holdfast.checkpoint.snapshot.snapshot_schedule import CheckpointFailed
 from holdfast.supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -156,12 +156,13 @@ from holdfast.supervision.admin import (
     TerminateChild,
     WhichChildren,
 )
-from holdfast.supervision.awaited import Failed, Job, Ok
 from holdfast.supervision.backoff import Backoff
 from holdfast.supervision.config import load_tree, tree_from
 from holdfast.supervision.dynamic import DynamicSupervisor, dynamic
-from holdfast.supervision.jobs import TaskSupervisor
-from holdfast.supervision.partition import (
+from holdfast.supervision.rules import Rule, rule
+from holdfast.supervision.services.awaited_jobs import Failed, Job, Ok
+from holdfast.supervision.services.jobs import TaskSupervisor
+from holdfast.supervision.services.partition import (
     CountPartitions,
     PartitionSupervisor,
     ResizePartitions,
@@ -169,15 +170,21 @@ from holdfast.supervision.partition import (
     partition_of,
     partitions,
 )
-from holdfast.supervision.pool import PoolInfo, PoolStatus, PoolSupervisor, ResizePool, pool, pool_of
-from holdfast.supervision.program import InputRefused, Program, ProgramInfo, ProgramInput, ProgramStatus, program
-from holdfast.supervision.registrar import KeyFreed, KeyRegistered, NotAnActor, NotUnique, RegistryActor
-from holdfast.supervision.registry import AlreadyRegistered, Registry, RegistryEntry, registry
-from holdfast.supervision.routing import NoRoute
-from holdfast.supervision.rules import Rule, rule
+from holdfast.supervision.services.pool import PoolInfo, PoolStatus, PoolSupervisor, ResizePool, pool, pool_of
+from holdfast.supervision.services.program import (
+    InputRefused,
+    Program,
+    ProgramInfo,
+    ProgramInput,
+    ProgramStatus,
+    program,
+)
+from holdfast.supervision.services.registrar import KeyFreed, KeyRegistered, NotAnActor, NotUnique, RegistryActor
+from holdfast.supervision.services.registry import AlreadyRegistered, Registry, RegistryEntry, registry
+from holdfast.supervision.services.router import NoRoute
+from holdfast.supervision.services.tasks import Tasks, tasks
 from holdfast.supervision.spec import ChildSpec, Flags, Plan, check_children, child
 from holdfast.supervision.supervisor import Supervisor
-from holdfast.supervision.tasks import Tasks, tasks
 from holdfast.supervision.tree import supervisor
 from holdfast.system.portal import ThreadPortal
 from holdfast.system.run import run
@@ -194,9 +201,9 @@ from holdfast.system.transaction.events import (
 from holdfast.system.transaction.operation import Operation, Step
 
 if TYPE_CHECKING:
-    from holdfast.ftm.adaptation import CannotAdapt
     from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
-    from holdfast.ftm.detector import Detection
+    from holdfast.ftm.bricks.sealed_frames import FrameRefused
+    from holdfast.ftm.bricks.voters import NoMajority
     from holdfast.ftm.events import (
         BackgroundWorkLost,
         FailedOver,
@@ -210,19 +217,19 @@ if TYPE_CHECKING:
         TurnHung,
         WrongSuspicion,
     )
-    from holdfast.ftm.mechanism import Mechanism, MechanismRefused, compose
+    from holdfast.ftm.group.detector import Detection
+    from holdfast.ftm.group.protected import ProtectionStatus
+    from holdfast.ftm.group.reconfiguration import CannotAdapt
     from holdfast.ftm.mechanisms.ad import AD
     from holdfast.ftm.mechanisms.lfr import LFR
+    from holdfast.ftm.mechanisms.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.mechanisms.nvp import NVP
     from holdfast.ftm.mechanisms.pbr import PBR
     from holdfast.ftm.mechanisms.rb import RB
     from holdfast.ftm.mechanisms.sec import SEC
     from holdfast.ftm.mechanisms.tmr import TMR
     from holdfast.ftm.mechanisms.tr import TR
-    from holdfast.ftm.protected import ProtectionStatus
-    from holdfast.ftm.sealed import FrameRefused
     from holdfast.ftm.sec.authority import CertificationAuthority as CertificationAuthority  # not in `__all__`
-    from holdfast.ftm.voters import NoMajority
     from holdfast.system.protection import AdaptationUndone
 
 __version__ = "0.1.0"
@@ -487,25 +494,25 @@ _LAZY = {
     "AD": "holdfast.ftm.mechanisms.ad",
     "CertificationAuthority": "holdfast.ftm.sec.authority",
     "BackgroundWorkLost": "holdfast.ftm.events",
-    "Detection": "holdfast.ftm.detector",
+    "Detection": "holdfast.ftm.group.detector",
     "Diverged": "holdfast.ftm.alarms",
     "FailedOver": "holdfast.ftm.events",
-    "FrameRefused": "holdfast.ftm.sealed",
+    "FrameRefused": "holdfast.ftm.bricks.sealed_frames",
     "LFR": "holdfast.ftm.mechanisms.lfr",
     "Masked": "holdfast.ftm.alarms",
-    "Mechanism": "holdfast.ftm.mechanism",
+    "Mechanism": "holdfast.ftm.mechanisms.mechanism",
     "MechanismAttached": "holdfast.ftm.events",
     "MechanismDetached": "holdfast.ftm.events",
-    "CannotAdapt": "holdfast.ftm.adaptation",
+    "CannotAdapt": "holdfast.ftm.group.reconfiguration",
     "MechanismChanged": "holdfast.ftm.events",
     "AdaptationUndone": "holdfast.system.protection",
-    "MechanismRefused": "holdfast.ftm.mechanism",
+    "MechanismRefused": "holdfast.ftm.mechanisms.mechanism",
     "MechanismSettled": "holdfast.ftm.events",
     "NVP": "holdfast.ftm.mechanisms.nvp",
-    "NoMajority": "holdfast.ftm.voters",
+    "NoMajority": "holdfast.ftm.bricks.voters",
     "PBR": "holdfast.ftm.mechanisms.pbr",
     "ProtectionLost": "holdfast.ftm.alarms",
-    "ProtectionStatus": "holdfast.ftm.protected",
+    "ProtectionStatus": "holdfast.ftm.group.protected",
     "RB": "holdfast.ftm.mechanisms.rb",
     "ReplicaFaulty": "holdfast.ftm.events",
     "ReplicaJoined": "holdfast.ftm.events",
@@ -515,7 +522,7 @@ _LAZY = {
     "TR": "holdfast.ftm.mechanisms.tr",
     "TurnHung": "holdfast.ftm.events",
     "WrongSuspicion": "holdfast.ftm.events",
-    "compose": "holdfast.ftm.mechanism",
+    "compose": "holdfast.ftm.mechanisms.mechanism",
 }
 
 

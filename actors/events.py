@@ -12,9 +12,9 @@ from typing import Any
 import msgspec
 
 from .errors import portable
-from .exits import ExitReason, pack_exit, unpack_exit
-from .mail import Item, item_name
-from .message import Message, MessageText, message_of
+from .exit_reasons import ExitReason, pack_exit, unpack_exit
+from .kernel.envelope import Item, item_name
+from .kernel.message import Message, MessageText, message_of
 
 
 class Event(msgspec.Struct, frozen=True, eq=False):

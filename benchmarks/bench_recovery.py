@@ -30,8 +30,8 @@ from harness import Run, main
 
 import holdfast as hf
 from holdfast.actors.values import decode_value, encode_value
+from holdfast.checkpoint.home.outputs import switch_of
 from holdfast.checkpoint.method import Method
-from holdfast.checkpoint.outputs import switch_of
 
 PROGRAMS_FOLDER = Path(__file__).resolve().parents[1] / "examples/programs"
 sys.path.append(str(PROGRAMS_FOLDER))

@@ -10,12 +10,12 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-from holdfast.actors.actor import Actor, Start
-from holdfast.ftm.bricks import Brick
-from holdfast.ftm.mechanism import BUILT_IN, find
-from holdfast.ftm.proxy import Proxy
-from holdfast.ftm.replica import Replica
-from holdfast.ftm.state import StateManager
+from holdfast.actors.kernel.actor import Actor, Start
+from holdfast.ftm.bricks.bricks import Brick
+from holdfast.ftm.group.proxy import Proxy
+from holdfast.ftm.mechanisms.mechanism import BUILT_IN, find
+from holdfast.ftm.replica.replica import Replica
+from holdfast.ftm.replica.state_manager import StateManager
 
 KEPT = 400  # marks between two writes
 
@@ -74,7 +74,7 @@ def _derived(kind: type[Any]) -> list[type[Any]]:
 
 
 def recipe(folder: Path) -> Any:
-    """What stands in for `holdfast.ftm.host.replica`."""
+    """What stands in for `holdfast.ftm.group.group_host.replica`."""
 
     def replica(setting: Any, start: Start[Any], layers: tuple[Any, ...]) -> Start[Any]:
         return Start(TimedReplica, (setting, start, layers, str(folder)))

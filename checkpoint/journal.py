@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol, TypeAlias
 from ..actors.errors import StoreError
 
 if TYPE_CHECKING:
-    from .segments import Segment
+    from .snapshot.shared_blocks import Segment
 
 __all__ = [
     "DamagedStore",

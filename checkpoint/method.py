@@ -8,9 +8,8 @@ from typing import Any, Literal, get_args
 
 import msgspec
 
-from ..actors.actor import Actor
 from ..actors.errors import SpecError, type_name
-from .compression import check_compress
+from ..actors.kernel.actor import Actor
 from .recovery.settings import (
     SAFE_STATE_TIMEOUT,
     Held,
@@ -20,6 +19,7 @@ from .recovery.settings import (
     as_safe_state,
     check_seconds,
 )
+from .snapshot.compression import check_compress
 
 Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import get_args
 
 from ..actors.errors import SpecError
-from .called import Called
+from .engine_calls import Called
 from .journal import Journal, MemoryJournal
 from .method import Durability
 

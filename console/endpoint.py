@@ -15,9 +15,9 @@ from typing import Any
 
 import msgspec
 
-from ..actors.actor import Actor
 from ..actors.errors import HoldfastError
-from ..actors.process.forked import check_can_watch
+from ..actors.kernel.actor import Actor
+from ..actors.process.fork.forked_process import check_can_watch
 from ..actors.values import encode_value
 from ..system.script import check_folders
 from ..system.system import ActorSystem

@@ -12,7 +12,7 @@ from typing import Annotated
 import typer
 
 from ..actors.errors import HoldfastError, SpecError
-from ..ftm.protected import ProtectionStatus
+from ..ftm.group.protected import ProtectionStatus
 from ..system.script import UntrustedFile, load_script
 from .remote import NotReached, RemoteChange, RemoteSystem
 from .wire import WrongUser

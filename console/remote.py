@@ -14,12 +14,12 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from ..actors.actor import Actor, Start
 from ..actors.control.orders import Change as StateChange
 from ..actors.control.orders import Migrate, Status
-from ..actors.control.tap import Statistics
+from ..actors.control.tracing import Statistics
 from ..actors.errors import HoldfastError, SpecError
-from ..ftm.protected import ProtectionStatus
+from ..actors.kernel.actor import Actor, Start
+from ..ftm.group.protected import ProtectionStatus
 from ..supervision.spec import NAMELESS, ChildSpec, Isolation, Strategy, child
 from ..system.transaction.operation import Step
 from .wire import (

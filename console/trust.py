@@ -8,7 +8,7 @@ import sys
 from collections.abc import Generator
 
 from ..actors.errors import SpecError
-from ..actors.node import Node
+from ..actors.kernel.node import Node
 from ..system.script import find_beside, guarded_imports, load_source, read_source, tell_loaded
 from .wire import AnyArg, Packed
 

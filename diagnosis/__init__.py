@@ -29,7 +29,7 @@ from .messages import (
     RosDiagnostics,
     Touched,
 )
-from .server import (
+from .model_server import (
     ChangeModel,
     GetModel,
     GetVersions,

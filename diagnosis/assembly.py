@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from ..actors.actor import Start
-from ..actors.mailbox import bounded
+from ..actors.kernel.actor import Start
+from ..actors.kernel.mailbox import bounded
 from ..supervision.backoff import Backoff
 from ..supervision.spec import ChildSpec, child
 from ..supervision.tree import supervisor
 from .diagnoser import SERVER, DiagnoserActor
 from .messages import DIAGNOSER
 from .model import Declaration, History, System
+from .model_server import ModelServer
 from .observers import Observer
-from .server import ModelServer
 
 WAITING: Final = 10_000
 """Messages that may wait at an observer; of more, the oldest are not seen."""

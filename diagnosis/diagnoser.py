@@ -6,9 +6,9 @@ import asyncio
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
-from ..actors.actor import Actor, on, subscribe
-from ..actors.mail import ReplyHandle
-from ..actors.message import Message
+from ..actors.kernel.actor import Actor, on, subscribe
+from ..actors.kernel.envelope import ReplyHandle
+from ..actors.kernel.message import Message
 from .engine import Diagnoser, Diagnosis, State
 from .literals import BadLiteral, Literal
 from .messages import (
@@ -32,8 +32,8 @@ from .messages import (
     Touched,
 )
 from .model import Declaration, Model
+from .model_server import GetModel, ModelServer
 from .observations import Observation, ObservationSet, Observed
-from .server import GetModel, ModelServer
 
 SERVER: Final = "model"
 """The last part of the model server's address; the rest is that of the diagnoser's supervisor."""

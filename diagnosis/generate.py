@@ -12,9 +12,9 @@ from collections.abc import Collection, Iterable, Iterator
 
 import msgspec
 
-from ..actors.actor import Actor, Start, on
-from ..actors.cell import Cell
-from ..actors.node import Node, cell_kind
+from ..actors.kernel.actor import Actor, Start, on
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.node import Node, cell_kind
 from ..supervision.spec import ChildSpec
 from .assembly import observer
 from .literals import ok

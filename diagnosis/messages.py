@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from ..actors.message import Message
+from ..actors.kernel.message import Message
 from .engine import Diagnosis
 from .literals import Literal
 from .model import Declaration

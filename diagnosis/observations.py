@@ -12,7 +12,7 @@ from collections.abc import Iterable, Mapping
 
 import msgspec
 
-from ..actors.message import Message
+from ..actors.kernel.message import Message
 from .literals import TRENDS, Literal, Vocabulary
 
 

@@ -7,9 +7,9 @@ from typing import Any, Protocol
 
 import msgspec
 
-from ..actors.actor import Start
-from ..actors.node import Node
-from ..actors.ref import ActorRef
+from ..actors.kernel.actor import Start
+from ..actors.kernel.node import Node
+from ..actors.kernel.ref import ActorRef
 from ..supervision.spec import ChildSpec
 from .assembly import observer, tree
 from .diagnoser import DiagnoserActor

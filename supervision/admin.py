@@ -6,12 +6,12 @@ from typing import Any
 
 import msgspec
 
-from ..actors.codec import Packed
 from ..actors.errors import HoldfastError, SpecError
-from ..actors.message import Message, Order, Refusal
-from ..actors.node import Node
-from ..actors.process.recipe import pack_data, unpack_data
-from ..actors.ref import ActorRef
+from ..actors.kernel.codec import Packed
+from ..actors.kernel.message import Message, Order, Refusal
+from ..actors.kernel.node import Node
+from ..actors.kernel.ref import ActorRef
+from ..actors.process.wire.start_codec import pack_data, unpack_data
 
 # -- refusals -------------------------------------------------------------------------------------------------------
 

@@ -19,10 +19,10 @@ import math
 from collections.abc import Callable, Generator, Iterable, Iterator
 from typing import Final
 
-from ..actors.cell import DOWN, ENDING, Cell
 from ..actors.errors import HoldfastError
 from ..actors.events import ChildRestarted, Event, SupervisorGaveUp
-from ..actors.node import Node
+from ..actors.kernel.cell import DOWN, ENDING, Cell
+from ..actors.kernel.node import Node
 from .children import RECOVERING, RESTARTING, STOPPED, UP
 from .supervisor import Supervisor
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
-from ..actors.cell import GONE
 from ..actors.errors import HoldfastError, Ignore, SpecError, StartIgnored, remote_crash, type_name
-from ..actors.node import Node
+from ..actors.kernel.cell import GONE
+from ..actors.kernel.node import Node
 from .admin import ChangeSupervisor, opened
 from .children import Child, complete
 from .spec import ChildSpec, Flags, Plan, check_spec

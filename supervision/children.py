@@ -8,10 +8,10 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from ..actors.cell import Cell
 from ..actors.errors import NoSuchActor, StartFailed
-from ..actors.exits import ExitReason
-from ..actors.mail import Item
+from ..actors.exit_reasons import ExitReason
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.envelope import Item
 from .admin import ChildInfo
 from .spec import ChildSpec
 

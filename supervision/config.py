@@ -7,14 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
-from ..actors.actor import Actor, Start
 from ..actors.errors import HoldfastError, SpecError
-from ..actors.mailbox import bounded
-from ..actors.process.limits import Limits
+from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.mailbox import bounded
+from ..actors.process.resource_limits import Limits
 from .backoff import Backoff
 from .dynamic import dynamic
-from .partition import partitions
 from .rules import rule
+from .services.partition import partitions
 from .spec import ChildSpec, child
 from .tree import supervisor
 

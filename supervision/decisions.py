@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, TypeVar
 
-from ..actors.exits import ExitReason
+from ..actors.exit_reasons import ExitReason
 from .rules import Action, Rule
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ def is_restarted(restart: Restart, reason: ExitReason) -> bool:
     Source:
         Erlang/OTP `supervisor`: permanent always, transient after an abnormal end, temporary never.
 
-    >>> from holdfast.actors.exits import NORMAL, KILLED
+    >>> from holdfast.actors.exit_reasons import NORMAL, KILLED
     >>> is_restarted("transient", NORMAL), is_restarted("transient", KILLED), is_restarted("temporary", KILLED)
     (False, True, False)
     """
@@ -30,7 +30,7 @@ def is_restarted(restart: Restart, reason: ExitReason) -> bool:
 def decide(restart: Restart, rules: Sequence[Rule], reason: ExitReason) -> Action:
     """What follows from an end: the first rule that fits says it, else the restart type.
 
-    >>> from holdfast.actors.exits import KILLED
+    >>> from holdfast.actors.exit_reasons import KILLED
     >>> decide("permanent", (), KILLED), decide("permanent", (Rule("Killed", "stop"),), KILLED)
     ('restart', 'stop')
     """

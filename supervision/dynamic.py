@@ -11,15 +11,16 @@ import asyncio
 import dataclasses
 from typing import Any, ClassVar
 
-from ..actors import exits, lives, stopping
-from ..actors.actor import Start, on
-from ..actors.cell import DOWN, GONE, Cell
+from ..actors import exit_reasons
 from ..actors.errors import HoldfastError, SpecError, type_name
 from ..actors.events import ChildStartFailed, StoreRefused
-from ..actors.exits import SHUTDOWN, ExitReason
-from ..actors.keeper import child_key
-from ..actors.process.limits import Limits
-from ..actors.process.recipe import pack_data, unpack_data
+from ..actors.exit_reasons import SHUTDOWN, ExitReason
+from ..actors.kernel import lifecycle, stopping
+from ..actors.kernel.actor import Start, on
+from ..actors.kernel.cell import DOWN, GONE, Cell
+from ..actors.persistence import child_key
+from ..actors.process.resource_limits import Limits
+from ..actors.process.wire.start_codec import pack_data, unpack_data
 from .admin import AlreadyStarted, DeleteChild, MaxChildren, NotSupported, RestartChild, StartChild, opened
 from .change import check_place, check_subtree
 from .children import STARTING, Child, Row, complete
@@ -74,7 +75,7 @@ class DynamicSupervisor(Supervisor):
             try:
                 await self._come_up_in(row, one)
             except HoldfastError as error:  # One that fails must not keep the others from coming back.
-                self._again(one, exits.crash(error))
+                self._again(one, exit_reasons.crash(error))
 
     def _lose(self, name: str) -> None:
         """A child is over whose id nobody will use again: whoever waits for it is told, what was recorded is erased."""
@@ -220,7 +221,7 @@ async def stop_together(cells: list[Cell]) -> None:
     for cell in cells:
         spec: ChildSpec | None = cell.spec
         if cell.state in (DOWN, GONE):
-            lives.retire(cell, "its parent has stopped")
+            lifecycle.retire(cell, "its parent has stopped")
             continue
         waiting.append((cell, stopping.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
         patience = stopping.PATIENCE if spec is None else spec.shutdown
@@ -232,7 +233,7 @@ async def stop_together(cells: list[Cell]) -> None:
             ended = await gone
             if cell.spec is not None:
                 cell.spec.judge(cell, SHUTDOWN, ended)
-            lives.retire(cell, "its parent has stopped")
+            lifecycle.retire(cell, "its parent has stopped")
     finally:
         for timer in timers:
             timer.cancel()

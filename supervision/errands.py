@@ -11,11 +11,11 @@ import asyncio
 from collections.abc import Coroutine
 from typing import Any
 
-from ..actors import lives
-from ..actors.context import ActorContext
 from ..actors.errors import HoldfastError
-from ..actors.mail import LEAVE, Item, ReplyHandle
-from ..actors.message import Refusal
+from ..actors.kernel import lifecycle
+from ..actors.kernel.context import ActorContext
+from ..actors.kernel.envelope import LEAVE, Item, ReplyHandle
+from ..actors.kernel.message import Refusal
 
 
 class Errand(Item):
@@ -24,7 +24,7 @@ class Errand(Item):
     __slots__ = ("_ctx", "_first", "is_over", "work")
 
     def __init__(
-        self, ctx: ActorContext, work: Coroutine[Any, Any, None], first: lives.FirstTurn | None = None
+        self, ctx: ActorContext, work: Coroutine[Any, Any, None], first: lifecycle.FirstTurn | None = None
     ) -> None:
         self._ctx, self.work, self._first = ctx, work, first
         self.is_over = False
@@ -56,10 +56,10 @@ class Errand(Item):
         except BaseException as error:
             if item._first is None:
                 raise
-            lives.crash(item._ctx.cell, item._first, error)  # It is the start of this life that has failed.
+            lifecycle.crash(item._ctx.cell, item._first, error)  # It is the start of this life that has failed.
             return LEAVE
         if item.is_over and item._first is not None:
-            lives.came_up(item._ctx.cell)
+            lifecycle.came_up(item._ctx.cell)
         return None
 
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..actors.actor import Actor, on
 from ..actors.errors import HoldfastError
-from ..actors.mail import ReplyHandle
+from ..actors.kernel.actor import Actor, on
+from ..actors.kernel.envelope import ReplyHandle
 from .admin import Boxed, ChildCounts, ChildInfo, CountChildren, GetChildSpec, NoSuchChild, WhichChildren
 from .children import Child
 

@@ -6,10 +6,11 @@ import asyncio
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from ..actors import stacks, stopping
-from ..actors.cell import DOWN, GONE, Cell
+from ..actors import turn_stacks
 from ..actors.events import StopOverdue
-from ..actors.lives import GRACE
+from ..actors.kernel import stopping
+from ..actors.kernel.cell import DOWN, GONE, Cell
+from ..actors.kernel.lifecycle import GRACE
 
 if TYPE_CHECKING:
     from .spec import ChildSpec
@@ -33,7 +34,7 @@ def end_within(cell: Cell, gone: asyncio.Future[Any]) -> None:
 
 def _overdue(cell: Cell, seconds: float) -> None:
     if cell.state not in (DOWN, GONE):
-        cell.node.emit(StopOverdue(cell.path, seconds, stacks.blocked_below(cell)))
+        cell.node.emit(StopOverdue(cell.path, seconds, turn_stacks.blocked_below(cell)))
         cell.kill()
 
 

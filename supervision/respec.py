@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-from ..actors.actor import Start
-from ..actors.cell import Cell
+from ..actors.kernel.actor import Start
+from ..actors.kernel.cell import Cell
 from .spec import ChildSpec
 from .supervisor import Supervisor
 

@@ -8,7 +8,7 @@ import sys
 from typing import Literal, get_args
 
 from ..actors.errors import SpecError, type_name
-from ..actors.exits import Crash, ExitReason, OutOfMemory
+from ..actors.exit_reasons import Crash, ExitReason, OutOfMemory
 
 Action = Literal["restart", "stop", "escalate"]
 """What a rule may say: start the child again, leave it stopped, or end the supervisor with the child's own reason."""
@@ -46,7 +46,7 @@ def rule(reason: ExitReason | type[ExitReason] | type[BaseException] | str, acti
 
     >>> rule(ValueError, "stop").fits(Crash("ValueError", "boom"))
     True
-    >>> from holdfast.actors.exits import KILLED, Signal
+    >>> from holdfast.actors.exit_reasons import KILLED, Signal
     >>> rule(Signal, "escalate").fits(KILLED), rule(Signal, "escalate").fits(Signal(9))
     (False, True)
     """

@@ -10,15 +10,15 @@ from typing import Any, Generic, Literal, TypeGuard, get_args
 
 from typing_extensions import TypeVar
 
-from ..actors.actor import Actor, Start
-from ..actors.cell import Cell
 from ..actors.errors import SpecError, type_name
 from ..actors.events import ShutdownError
-from ..actors.exits import KILLED, SHUTDOWN, ExitReason
-from ..actors.lives import GRACE
-from ..actors.mailbox import Bounded
-from ..actors.process.limits import Limits
-from ..actors.process.recipe import pack_recipe
+from ..actors.exit_reasons import KILLED, SHUTDOWN, ExitReason
+from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.lifecycle import GRACE
+from ..actors.kernel.mailbox import Bounded
+from ..actors.process.resource_limits import Limits
+from ..actors.process.wire.start_codec import pack_recipe
 from ..actors.values import UnsavableValue
 from .backoff import Backoff
 from .decisions import decide, is_as_told
@@ -363,7 +363,11 @@ def check_mechanism(where: str, mechanism: Any, kind: type[Actor], *, is_supervi
     layers = mechanism if isinstance(mechanism, tuple) else (mechanism,)
     for layer in layers:
         if isinstance(layer, type) or not hasattr(layer, "check") or not hasattr(layer, "replicas"):
-            hint = "; a class by its name is `find(name)` of `holdfast.ftm.mechanism`" if isinstance(layer, str) else ""
+            hint = (
+                "; a class by its name is `find(name)` of `holdfast.ftm.mechanisms.mechanism`"
+                if isinstance(layer, str)
+                else ""
+            )
             problem = f"mechanism must be one such as PBR(), a tuple of them or left out, not {layer!r}{hint}"
             raise SpecError(where, problem)
         layer.check(kind, where)

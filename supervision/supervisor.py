@@ -10,13 +10,13 @@ import asyncio
 from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, ClassVar
 
-from ..actors import lives
-from ..actors.actor import Start, on
-from ..actors.cell import DOWN, GONE, Cell
 from ..actors.errors import HoldfastError, SpecError, StartFailed, StartIgnored
 from ..actors.events import AutoShutdown, ChildRestarted, ChildStartFailed, ChildTerminated, SupervisorGaveUp
-from ..actors.exits import SHUTDOWN, ExitReason, crash, unpack_exit
-from ..actors.mail import Item, ReplyHandle
+from ..actors.exit_reasons import SHUTDOWN, ExitReason, crash, unpack_exit
+from ..actors.kernel import lifecycle
+from ..actors.kernel.actor import Start, on
+from ..actors.kernel.cell import DOWN, GONE, Cell
+from ..actors.kernel.envelope import Item, ReplyHandle
 from .admin import (
     AlreadyPresent,
     AlreadyStarted,
@@ -88,7 +88,7 @@ class Supervisor(Inquiries):
 
     # -- errands ----------------------------------------------------------------------------------------------------
 
-    def _errand(self, work: Coroutine[Any, Any, None], first: lives.FirstTurn | None = None) -> Errand:
+    def _errand(self, work: Coroutine[Any, Any, None], first: lifecycle.FirstTurn | None = None) -> Errand:
         """Begin what has to wait for others; what comes behind its first wait is done in turns of its own."""
         errand = Errand(self.ctx, work, first)
         errand.step()
@@ -124,7 +124,7 @@ class Supervisor(Inquiries):
         self._planned, self._parked = frozenset(self._children), set[str]()
         self._dismissed = {}
         self._restarts = ()
-        self._early: list[lives.ChildExit] = []
+        self._early: list[lifecycle.ChildExit] = []
 
     def _is_starting(self) -> bool:
         return self._first is not None and not self._first.is_over
@@ -181,7 +181,7 @@ class Supervisor(Inquiries):
         self._is_up(one)
         cell = one.cell
         if cell is not None and cell.state is DOWN:  # It ended before we heard that it was up: its end in our queue
-            self.ctx.cell.push(lives.ChildExit(cell, cell.life, cell.extra().reason))  # may be passed over already.
+            self.ctx.cell.push(lifecycle.ChildExit(cell, cell.life, cell.extra().reason))  # may be passed over already.
         return True
 
     async def _come_up(self, one: Child) -> None:
@@ -262,10 +262,10 @@ class Supervisor(Inquiries):
         """Decide what follows from the end of a child's life (called by the loop, in a turn of ours)."""
         one = self._children.get(cell.name)
         if cell.parent is not self.ctx.cell and cell.parent is not None:
-            cell.parent.push(lives.ChildExit(cell, life, reason))  # It was moved since: another one decides.
+            cell.parent.push(lifecycle.ChildExit(cell, life, reason))  # It was moved since: another one decides.
             return
         if one is None or one.cell is not cell:
-            lives.retire(cell, reason)
+            lifecycle.retire(cell, reason)
             return
         if life <= one.ignored_life:
             return  # We stopped it, or its start has failed.
@@ -275,7 +275,7 @@ class Supervisor(Inquiries):
             return  # Or it ended while it started: that is told by who waits for the start.
         spec = one.spec
         if self._is_starting() and self._flags.strategy != "one_for_one":
-            self._early.append(lives.ChildExit(cell, life, reason))  # First the others come up: they may go down again.
+            self._early.append(lifecycle.ChildExit(cell, life, reason))  # First the others come up.
             return
         self._report_end(one, life, reason)
         action = decide(spec.restart, spec.rules, reason)
@@ -302,7 +302,7 @@ class Supervisor(Inquiries):
         """The child is not restarted: its address goes, its spec too if it is temporary."""
         one.state = STOPPED
         if one.cell is not None:
-            lives.retire(one.cell, reason)
+            lifecycle.retire(one.cell, reason)
         if one.spec.restart == "temporary":
             self._forget(one)
 
@@ -384,7 +384,7 @@ class Supervisor(Inquiries):
     def _erase(self, one: Child) -> None:
         """Forget what was recorded of a child that does not run. Raises HoldfastError if the store refuses."""
         if one.cell is not None:
-            lives.retire(one.cell, "it begins afresh")
+            lifecycle.retire(one.cell, "it begins afresh")
         one.spec = complete(self.ctx.cell, one.spec)
         if one.spec.is_supervisor or one.spec.has_home:
             self.ctx.cell.node.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
@@ -510,7 +510,7 @@ class Supervisor(Inquiries):
     def _unlist(self, one: Child) -> None:
         """A child could not be started for the first time."""
         if one.cell is not None:
-            lives.retire(one.cell, "it could not be started")
+            lifecycle.retire(one.cell, "it could not be started")
         self._forget(one)
 
     def _enlist(self, one: Child) -> None:
@@ -591,7 +591,7 @@ class Supervisor(Inquiries):
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
         if one.cell is not None:
-            lives.retire(one.cell, "it was deleted")
+            lifecycle.retire(one.cell, "it was deleted")
         if message.erase:
             try:
                 self._erase(one)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from ..actors.actor import Start
 from ..actors.errors import SpecError
-from ..actors.process.limits import Limits
+from ..actors.kernel.actor import Start
+from ..actors.process.resource_limits import Limits
 from .change import check_subtree
 from .rules import Rule
 from .spec import AutoShutdown, ChildSpec, Flags, Isolation, Restart, Shutdown, Strategy, checked

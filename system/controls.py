@@ -6,9 +6,6 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-from ..actors.actor import Actor, Start
-from ..actors.cell import GONE, Cell
-from ..actors.control.calls import ask_status, order
 from ..actors.control.orders import (
     Change,
     GetState,
@@ -23,24 +20,27 @@ from ..actors.control.orders import (
     next_start,
     status_of,
 )
-from ..actors.control.tap import Statistics, tap_of
+from ..actors.control.orders_lane import ask_status, order
+from ..actors.control.tracing import Statistics, tap_of
 from ..actors.errors import ActorStopped, AskTimeout, ControlFailed, HoldfastError, SpecError
 from ..actors.events import EventStream
-from ..actors.exits import SHUTDOWN, ExitReason
-from ..actors.process.limits import Limits
-from ..actors.process.recipe import unpack_recipe
-from ..actors.process.relay import OutsideHost
-from ..actors.process.remote import Elsewhere
-from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
-from ..checkpoint.outputs import switch_of
-from ..checkpoint.switch import Switch
+from ..actors.exit_reasons import SHUTDOWN, ExitReason
+from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.cell import GONE, Cell
+from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
+from ..actors.process.process_host import Elsewhere
+from ..actors.process.resource_limits import Limits
+from ..actors.process.wire.peer import OutsideHost
+from ..actors.process.wire.start_codec import unpack_recipe
+from ..checkpoint.home.outputs import switch_of
+from ..checkpoint.home.switch import Switch
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Isolation
-from .moving import Moves, check_isolation
+from .live_moves import Moves, check_isolation
 
 if TYPE_CHECKING:
-    from ..actors.node import Node
-    from ..ftm.protected import ProtectionStatus
+    from ..actors.kernel.node import Node
+    from ..ftm.group.protected import ProtectionStatus
 
 A = TypeVar("A", bound=Actor)
 
@@ -161,7 +161,7 @@ class Controls:
 
         It is what the root knows at this moment. (`timeout` is as for the other questions; nobody is asked.)
         """
-        from ..ftm.protected import protection_of
+        from ..ftm.group.protected import protection_of
 
         return protection_of(self._living(ref))
 

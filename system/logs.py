@@ -43,9 +43,9 @@ from ..actors.events import (
     SupervisorGaveUp,
     TrustBreached,
 )
-from ..actors.exits import Crash
-from ..actors.mail import Item, item_name
-from ..actors.message import Message, MessageText, message_of
+from ..actors.exit_reasons import Crash
+from ..actors.kernel.envelope import Item, item_name
+from ..actors.kernel.message import Message, MessageText, message_of
 from .transaction.events import ScriptLoaded, TransactionCommitted, TransactionRolledBack
 
 BURST = 10

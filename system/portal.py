@@ -9,12 +9,12 @@ from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..actors.errors import ActorStopped, AskTimeout, HoldfastError
-from ..actors.message import Message
-from ..actors.ref import DEFAULT_TIMEOUT, ActorRef
-from ..actors.threads import LOOK_AGAIN, wait_on_loop
+from ..actors.kernel.message import Message
+from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
+from ..actors.kernel.threads import LOOK_AGAIN, wait_on_loop
 
 if TYPE_CHECKING:
-    from ..actors.node import Node
+    from ..actors.kernel.node import Node
 
 R = TypeVar("R")
 

@@ -18,8 +18,8 @@ from ..actors.events import Event
 from ..supervision.respec import rebuilt, spec_below
 
 if TYPE_CHECKING:
-    from ..actors.cell import Cell
-    from ..checkpoint.homes import Homes
+    from ..actors.kernel.cell import Cell
+    from ..checkpoint.home.homes import Homes
     from ..supervision.spec import ChildSpec
 
 KEPT = "mechanisms"
@@ -81,7 +81,7 @@ class Protection:
             spec = self._completed_below(spec, address)
         if address not in self._loaded:
             return spec
-        from ..ftm.mechanism import Description, MechanismRefused, revive
+        from ..ftm.mechanisms.mechanism import Description, MechanismRefused, revive
 
         self._loaded.discard(address)
         declared, current, *before = self._kept[address]

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..actors.errors import HoldfastError, SpecError
-from ..actors.ref import ActorRef
-from ..checkpoint.homes import Homes
-from ..checkpoint.quarantine import QuarantinedMessage
+from ..actors.kernel.ref import ActorRef
+from ..checkpoint.home.homes import Homes
+from ..checkpoint.home.quarantine import QuarantinedMessage
 from ..supervision.admin import RestartChild, TerminateChild, WhichChildren
 from ..supervision.supervisor import Supervisor
 

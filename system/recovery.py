@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..actors.actor import Start, start
-from ..actors.cell import RUNNING, Cell
 from ..actors.errors import NameTaken
-from ..checkpoint.recovery.parts import PARTS
+from ..actors.kernel.actor import Start, start
+from ..actors.kernel.cell import RUNNING, Cell
+from ..checkpoint.recovery.part_list import PARTS
 from ..supervision.spec import Flags, child
 from ..supervision.supervisor import Supervisor
 
 if TYPE_CHECKING:
-    from ..actors.node import Node
-    from ..checkpoint.homes import Homes
+    from ..actors.kernel.node import Node
+    from ..checkpoint.home.homes import Homes
 
 NAMES = ("recovery", "$recovery")
 """What the supervisor is called; the second, if the program has a child of the first name."""

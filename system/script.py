@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ..actors.errors import HoldfastError, SpecError, error_text, type_name
-from ..actors.node import Node
+from ..actors.kernel.node import Node
 from .transaction.events import ScriptLoaded
 
 PREFIX = "holdfast_script_"

@@ -9,39 +9,39 @@ from collections.abc import Sequence
 from types import TracebackType
 from typing import Any, TypeVar, cast
 
-from ..actors import lives, stopping
-from ..actors.actor import Actor, Start
-from ..actors.cell import Cell, Host
 from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
 from ..actors.events import EventStream, RecoveryTableUnused
-from ..actors.exits import SHUTDOWN, ExitReason, pack_exit
-from ..actors.lives import LOCAL
-from ..actors.mailbox import Bounded
-from ..actors.message import Message
-from ..actors.node import Node, cell_kind
-from ..actors.process.remote import ProcessHost, on_frame
-from ..actors.process.workers import Workers
-from ..actors.ref import ActorRef, current
-from ..actors.topics import publish
-from ..actors.watch import LoopWatch, check_limits
-from ..checkpoint.controller import RecordedProcessHost, TaskHost
-from ..checkpoint.file import RecoveryFile, load_recovery
-from ..checkpoint.homes import Homes
+from ..actors.exit_reasons import SHUTDOWN, ExitReason, pack_exit
+from ..actors.kernel import lifecycle, stopping
+from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.cell import Cell, Host
+from ..actors.kernel.lifecycle import LOCAL
+from ..actors.kernel.mailbox import Bounded
+from ..actors.kernel.message import Message
+from ..actors.kernel.node import Node, cell_kind
+from ..actors.kernel.ref import ActorRef, current
+from ..actors.kernel.topics import publish
+from ..actors.loop_watchdog import LoopWatch, check_limits
+from ..actors.process.process_host import ProcessHost, on_frame
+from ..actors.process.worker_pool import Workers
+from ..checkpoint.home.homes import Homes
+from ..checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
+from ..checkpoint.home.subtree_homes import Lived, SubtreeHome, SubtreeHost
 from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
-from ..checkpoint.records import Wanted
+from ..checkpoint.protocol import Wanted
 from ..checkpoint.recovery.settings import RecoveryHooks
+from ..checkpoint.recovery_file import RecoveryFile, load_recovery
 from ..checkpoint.stores import check_durability, check_system, open_journal
-from ..checkpoint.subtree import Lived, SubtreeHome, SubtreeHost
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.patience import end_within
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
 from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
+from .live_moves import Moves
 from .logs import LogSink
-from .moving import Moves
 from .portal import ThreadPortal
 from .protection import Protection, check_no_part
 from .recorded import Recorded
@@ -52,8 +52,8 @@ from .transaction.transaction import Transaction, Transactions
 
 A = TypeVar("A", bound=Actor)
 
-ENTRY = f"{__package__}.guest_main:main"
-BASE = (f"{__package__}.guest_main",)
+ENTRY = f"{__package__}.worker_main:main"
+BASE = (f"{__package__}.worker_main",)
 
 REPLICA = f"{__name__.rpartition('.')[0].rpartition('.')[0]}.ftm.replica"
 """What the processes of replicas import beforehand."""
@@ -178,7 +178,7 @@ class ActorSystem(Recorded, Controls):
             node.complete = self.mechanism_notes.completing(node.complete)
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
-        up = lives.begin(root, Start(Supervisor, (self._flags, ())))
+        up = lifecycle.begin(root, Start(Supervisor, (self._flags, ())))
         if up is not None:
             await up
         root.ended().add_done_callback(self._root_ended)
@@ -262,9 +262,9 @@ class ActorSystem(Recorded, Controls):
         Raises:
             MechanismRefused: its mechanisms do not go together, or not in this order.
         """
-        from ..ftm.adaptation_rules import check_stack  # Most systems protect nobody.
-        from ..ftm.host import GroupHost
-        from ..ftm.mechanism import COMMON, compose
+        from ..ftm.group.group_host import GroupHost
+        from ..ftm.mechanisms.mechanism import COMMON, compose
+        from ..ftm.model.composition import check_stack  # Most systems protect nobody.
 
         check_stack(compose(spec.mechanism), spec.start.kind, spec.id)
         self._workers.want(spec.start.kind.__module__)
@@ -280,8 +280,8 @@ class ActorSystem(Recorded, Controls):
         Raises:
             MechanismRefused: its mechanisms cannot be had here, or do not go together.
         """
-        from ..ftm.mechanism import COMMON
-        from ..ftm.subtree import subtree_group
+        from ..ftm.mechanisms.mechanism import COMMON
+        from ..ftm.migration.subtree_groups import subtree_group
 
         group = subtree_group(place, cell, wanted, before)
         for name in (REPLICA, *COMMON):

@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ..actors.errors import HoldfastError
-from ..actors.loop import RunLoop
-from ..actors.message import message_of
-from ..actors.process import frames
-from ..actors.process.remote import Outlet
-from ..actors.process.workers import Worker
-from ..actors.timers import Timer
-from ..checkpoint.outputs import switch_of
-from ..checkpoint.records import STASHED
-from ..checkpoint.switch import Switch
+from ..actors.kernel.loop import RunLoop
+from ..actors.kernel.message import message_of
+from ..actors.kernel.timers import Timer
+from ..actors.process.process_host import Outlet
+from ..actors.process.wire import frames
+from ..actors.process.worker_pool import Worker
+from ..checkpoint.home.outputs import switch_of
+from ..checkpoint.home.switch import Switch
+from ..checkpoint.protocol import STASHED
 from .clock import VirtualClockLoop
 
 if TYPE_CHECKING:
-    from ..actors.cell import Cell
-    from ..actors.node import Node
+    from ..actors.kernel.cell import Cell
+    from ..actors.kernel.node import Node
     from ..system.system import ActorSystem
 
 TIMEOUT = 10.0

@@ -7,7 +7,7 @@ from typing import Any
 
 import msgspec
 
-from ..actors.message import Message
+from ..actors.kernel.message import Message
 
 
 def damaged(value: Any, draw: random.Random) -> Any:

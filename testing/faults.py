@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any, Literal, NamedTuple, get_args
 
 from ..actors.errors import HoldfastError, SpecError
-from ..actors.ref import ActorRef
+from ..actors.kernel.ref import ActorRef
 from ..system.system import ActorSystem
 
 Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail"]

@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from typing import Any
 
-from ..actors.cell import Host
 from ..actors.errors import HoldfastError
 from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
-from ..actors.exits import Exited, Hung, OutOfMemory, Signal
+from ..actors.exit_reasons import Exited, Hung, OutOfMemory, Signal
+from ..actors.kernel.cell import Host
 from ..supervision.spec import ChildSpec
 from ..system.system import ActorSystem
 from .clock import RealTimeNeeded, VirtualClockLoop

@@ -28,8 +28,8 @@ SOONER = 0.9
 
 def what_waits() -> str:
     """The tasks of every event loop, and the turns of every node, with their stacks. Called from any thread."""
-    from ..actors.node import Node  # pytest loads plugins before coverage begins to measure.
-    from ..actors.stacks import blocked_below, stack_of
+    from ..actors.kernel.node import Node  # pytest loads plugins before coverage begins to measure.
+    from ..actors.turn_stacks import blocked_below, stack_of
 
     found = gc.get_objects()
     lines: list[str] = []

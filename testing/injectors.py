@@ -10,18 +10,18 @@ from typing import Any
 
 import msgspec
 
-from ..actors import mailbox
-from ..actors.cell import GONE, Cell
 from ..actors.errors import HoldfastError, ProcessUnavailable, SpecError
-from ..actors.mail import Ask, Envelope, Handler
-from ..actors.message import message_of
-from ..actors.process import frames
-from ..actors.process.workers import Worker
-from ..actors.ref import ActorRef
-from ..checkpoint.commits import Submission
-from ..checkpoint.inputs import HomeJournal
+from ..actors.kernel import mailbox
+from ..actors.kernel.cell import GONE, Cell
+from ..actors.kernel.envelope import Ask, Envelope, Handler
+from ..actors.kernel.message import message_of
+from ..actors.kernel.ref import ActorRef
+from ..actors.process.wire import frames
+from ..actors.process.worker_pool import Worker
+from ..checkpoint.group_commit import Submission
+from ..checkpoint.home.inputs import HomeJournal
+from ..checkpoint.home.outputs import switch_of
 from ..checkpoint.journal import Saved, StoreFailed
-from ..checkpoint.outputs import switch_of
 from ..system.system import ActorSystem
 from .damage import damaged
 from .faults import Strikes

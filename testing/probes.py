@@ -8,14 +8,14 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeVar, cast, overload
 
-from ..actors import links
-from ..actors.actor import Actor, Start
 from ..actors.errors import HoldfastError, type_name
-from ..actors.exits import ExitReason
-from ..actors.links import Monitor
-from ..actors.mail import Ask, Handler, Item, ReplyHandle, Table
-from ..actors.message import Message, Refusal
-from ..actors.ref import DEFAULT_TIMEOUT, ActorRef, current
+from ..actors.exit_reasons import ExitReason
+from ..actors.kernel import links
+from ..actors.kernel.actor import Actor, Start
+from ..actors.kernel.envelope import Ask, Handler, Item, ReplyHandle, Table
+from ..actors.kernel.links import Monitor
+from ..actors.kernel.message import Message, Refusal
+from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef, current
 from ..system.system import ActorSystem
 from .barrier import NotIdle, idle, patience
 

@@ -11,12 +11,12 @@ from typing import Any
 
 import msgspec
 
-from ..actors.cell import Cell
-from ..actors.context import ActorContext
 from ..actors.errors import BadMessage, type_name
-from ..actors.message import Message, message_of
-from ..actors.node import Node
-from ..actors.ref import ActorRef, current
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.context import ActorContext
+from ..actors.kernel.message import Message, message_of
+from ..actors.kernel.node import Node
+from ..actors.kernel.ref import ActorRef, current
 from .swaps import Swaps
 from .turns import TurnWatcher, watch_turns
 

@@ -17,10 +17,10 @@ from collections import deque
 from collections.abc import Callable, Coroutine, Iterable
 from typing import Any
 
-from ..actors import loop as run_loop
-from ..actors.cell import NEXT_URGENT, Cell
-from ..actors.message import message_of
-from ..checkpoint.turns import Fed
+from ..actors.kernel import loop as run_loop
+from ..actors.kernel.cell import NEXT_URGENT, Cell
+from ..actors.kernel.message import message_of
+from ..checkpoint.life.recorded_inbox import Fed
 from .clock import virtual
 from .faults import Faults
 from .guarded import GuardedSystem, UnexpectedEnd

@@ -21,7 +21,7 @@ import pytest
 
 from ..actors.errors import HoldfastError
 from ..checkpoint.journal import DamagedStore, Entry, Journal, Saved
-from ..checkpoint.segments import BLOCK, PAGE
+from ..checkpoint.snapshot.shared_blocks import BLOCK, PAGE
 
 Factory = Callable[[Path], Journal]
 Crash = Callable[[Journal, Path], Path]

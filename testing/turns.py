@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ..actors import loop as run_loop
-from ..actors.cell import Cell
-from ..actors.loop import RunLoop, Suspended
-from ..actors.mail import Handler, Table
-from ..actors.message import Message
+from ..actors.kernel import loop as run_loop
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.envelope import Handler, Table
+from ..actors.kernel.loop import RunLoop, Suspended
+from ..actors.kernel.message import Message
 from .swaps import Swaps
 
 Substitute = Callable[[Handler], Handler]

@@ -27,7 +27,7 @@ import psutil
 import pytest
 import pytest_asyncio
 
-from holdfast.actors.loop import RunLoop
+from holdfast.actors.kernel.loop import RunLoop
 from holdfast.testing.leaks import Leaks, end_processes, is_of_test
 from tests.waits import Waits
 

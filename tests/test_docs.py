@@ -131,10 +131,14 @@ def test_blocks_run(document: Path, tmp_path: Path) -> None:
 
 
 def test_blocks_keep_their_lines() -> None:
-    quotation = "- b\n\n  ```python\n  # actors/ref.py\n  y = x\n  ```\n"
+    quotation = "- b\n\n  ```python\n  # actors/kernel/ref.py\n  y = x\n  ```\n"
     text = f"# A\n\n```python\nx = 1\n```\n\n{quotation}\n```python\nprint(x)\n```\n"
     blocks = list(python_blocks(text))
-    assert [(block.line, quoted_path(block)) for block in blocks] == [(4, None), (10, "actors/ref.py"), (15, None)]
+    assert [(block.line, quoted_path(block)) for block in blocks] == [
+        (4, None),
+        (10, "actors/kernel/ref.py"),
+        (15, None),
+    ]
     assert program(blocks).splitlines() == ["", "", "", "x = 1", *[""] * 10, "print(x)"]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.codec import Packed
+from holdfast.actors.kernel.codec import Packed
 from holdfast.ftm.mechanisms.pbr import PBR
 
 # These actors are imported by other processes: by name, so the root has to be on the path.

@@ -5,6 +5,7 @@ import json
 import subprocess
 import sys
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +13,7 @@ from types import ModuleType
 import pytest
 
 import holdfast
+from tests import house_map
 
 ROOT = Path(__file__).resolve().parents[1]
 IN_EXTRAS = {"CertificationAuthority"}  # public, and not what a star imports
@@ -43,11 +45,11 @@ def imports(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def test_a_fresh_process_holds_one_copy_of_the_package() -> None:
-    assert [name for name in modules_after_import() if name.endswith("actors.ref")] == ["holdfast.actors.ref"]
+    assert [name for name in modules_after_import() if name.endswith("kernel.ref")] == ["holdfast.actors.kernel.ref"]
 
 
 def test_pytest_holds_one_copy_of_the_package() -> None:
-    assert [name for name in sys.modules if name.endswith("actors.ref")] == ["holdfast.actors.ref"]
+    assert [name for name in sys.modules if name.endswith("kernel.ref")] == ["holdfast.actors.kernel.ref"]
 
 
 @pytest.mark.parametrize("name", ["numpy", "holdfast.console", "holdfast.diagnosis", "holdfast.testing"])
@@ -106,6 +108,18 @@ def test_every_folder_of_the_package_is_shipped() -> None:
     listed = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["setuptools"]["packages"]
     assert sorted(listed) == sorted({".".join(("holdfast", *path.parts[:-1])) for path in SOURCES})
     assert all((ROOT / path.parent / "__init__.py").exists() for path in SOURCES)
+
+
+def test_the_map_is_up_to_date() -> None:
+    """If not: `python -m tests.house_map`."""
+    assert (ROOT / "docs" / "map.md").read_text("utf-8") == house_map.text()
+
+
+def test_no_folder_is_crowded_and_no_room_has_a_name_twice() -> None:
+    names = Counter((path.parts[0], path.name) for path in SOURCES if path.name != "__init__.py")
+    assert [name for name, count in names.items() if count > 1] == []
+    files = Counter(path.parent for path in SOURCES if path.name != "__init__.py")
+    assert {folder: count for folder, count in files.items() if count > 18} == {}
 
 
 def test_types_are_announced() -> None:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from holdfast.actors.cell import Cell
-from holdfast.actors.loop import RunLoop
-from holdfast.actors.stacks import stack_of
+from holdfast.actors.kernel.cell import Cell
+from holdfast.actors.kernel.loop import RunLoop
+from holdfast.actors.turn_stacks import stack_of
 from holdfast.supervision.supervisor import Supervisor
 
 

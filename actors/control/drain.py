@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from .. import mailbox
-from ..cell import GONE, Cell
 from ..errors import ActorStopped, AskFailed, AskTimeout
-from .calls import order
+from ..kernel import mailbox
+from ..kernel.cell import GONE, Cell
 from .orders import Mark
+from .orders_lane import order
 
 
 async def drain(cell: Cell, seconds: float) -> bool:

@@ -13,17 +13,17 @@ import sys
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
-from .. import mailbox
-from ..actor import Actor, Start
 from ..errors import ControlFailed, NotSuspended, SpecError, error_text, type_name
-from ..message import message_name
-from ..process.recipe import pack_recipe, unpack_recipe
+from ..kernel import mailbox
+from ..kernel.actor import Actor, Start
+from ..kernel.message import message_name
+from ..process.wire.start_codec import pack_recipe, unpack_recipe
 from ..values import UnsavableValue
-from .state import change_state, state_to_show
-from .tap import Statistics, tap_of
+from .live_state import change_state, state_to_show
+from .tracing import Statistics, tap_of
 
 if TYPE_CHECKING:
-    from ..cell import Cell
+    from ..kernel.cell import Cell
 
 Change = Callable[[Any], Any]
 """Takes a state and returns the one that shall be in its place."""

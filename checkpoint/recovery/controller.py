@@ -6,15 +6,15 @@ import asyncio
 import inspect
 from typing import Any
 
-from ...actors.actor import on
-from ...actors.cell import Cell
 from ...actors.errors import error_text, type_name
-from ...actors.exits import ExitReason
-from ...actors.message import Message
-from ...actors.ref import ActorRef
+from ...actors.exit_reasons import ExitReason
+from ...actors.kernel.actor import on
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.message import Message
+from ...actors.kernel.ref import ActorRef
 from .part import Part
-from .register import ENTER, LEAVE, STAGES, Point, Recovery
-from .safety import Receiver
+from .recoveries import ENTER, LEAVE, STAGES, Point, Recovery
+from .safe_states import Receiver
 from .settings import Hook
 
 

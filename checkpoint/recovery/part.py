@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.actor import Actor
+from ...actors.kernel.actor import Actor
 
 if TYPE_CHECKING:
-    from ..homes import Homes
+    from ..home.homes import Homes
 
 
 class Part(Actor):

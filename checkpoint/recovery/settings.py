@@ -8,9 +8,9 @@ from typing import Any, Literal, get_args
 
 import msgspec
 
-from ...actors.codec import encode_special, unencodable
 from ...actors.errors import SpecError, type_name
-from ...actors.message import Message, message_name
+from ...actors.kernel.codec import encode_special, unencodable
+from ...actors.kernel.message import Message, message_name
 
 HeldOverflow = Literal["block", "latest", "drop_oldest", "reject"]
 Phase = Literal["safe_state", "isolate", "restart", "restore", "replay", "release"]

@@ -5,7 +5,7 @@ a crash, `app.db-mark`: the last acknowledged position; and what lies in `app.db
 
 Log        A few entries are one write to a log, and go to the database with whatever is written there next, at the
            latest when they are 512. A new owner seals the log, so that nobody else writes to it unnoticed, and brings
-           it into the database before anything else. `log.py` says how a power loss is survived.
+           it into the database before anything else. `append_log.py` says how a power loss is survived.
 
 Exclusion  The `store` row names the owning process (pid and start time) and an epoch that rises at each opening; every
            write checks the epoch inside its transaction. SQLite's locks are held for one short transaction only, so
@@ -18,9 +18,10 @@ Layout     Entries are clustered by position and have no index by address: it wo
            when a batch spans many addresses. The positions of each address are held in memory (8 bytes each) instead
            and found again by one scan at the opening.
 
-Read `engine.py` first: it has the journal, as far as it is not about the file. `store.py` opens, writes and closes the
-file, `log.py` is in front of it, `claim.py` decides who owns it, `chains.py` finds what is in it, `reading.py` reads an
-address back, `mark.py` and `files.py` keep what is beside it, and `rows.py` has the bytes.
+Read `engine.py` first: it has the journal, as far as it is not about the file. `open_store.py` opens, writes and closes
+the file, `append_log.py` is in front of it, `ownership.py` decides who owns it, `entry_chains.py` finds what is in it,
+`read_back.py` reads an address back, `position_mark.py` and `snapshot_files.py` keep what is beside it, `row_codec.py`
+has the bytes.
 """
 
 from __future__ import annotations

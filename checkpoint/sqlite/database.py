@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from ..journal import DamagedStore
-from .files import sync
-from .parts import new_note
-from .rows import crc_of
+from .row_codec import crc_of
+from .snapshot_files import sync
+from .store_parts import new_note
 
 _APPLICATION: Final = 0x486F6C64  # "Hold", in the file header
 VERSION: Final = 1

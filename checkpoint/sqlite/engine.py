@@ -11,12 +11,13 @@ from collections.abc import Collection, Sequence
 from typing import Final, Literal
 
 from ..journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
-from ..segments import Segment
-from .chains import MODULUS, Chain
-from .log import Row
-from .packs import Packs
-from .reading import ChainReader
-from .rows import (
+from ..snapshot.shared_blocks import Segment
+from .append_log import Row
+from .block_packs import Packs
+from .entry_chains import MODULUS, Chain
+from .open_store import INSERT, Store
+from .read_back import ChainReader
+from .row_codec import (
     CHUNK,
     PLACE,
     check_entry,
@@ -27,7 +28,6 @@ from .rows import (
     snapshot_digest,
     unpack_positions,
 )
-from .store import INSERT, Store
 
 _FEW: Final = 128  # More entries at a time, or more bytes, are worth a transaction of their own.
 _SMALL: Final = 64 << 10

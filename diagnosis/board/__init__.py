@@ -7,12 +7,11 @@ with faults to order; `BoardActor` publishes what a board measures as `/board_me
 Source: Zaman et al. 2013, section IV-A (figure 4).
 """
 
-from .actor import TOPIC, BoardActor, BoardFailed, BoardMeasured, GetSpecification, SwitchChannel
+from .board_actor import TOPIC, BoardActor, BoardFailed, BoardMeasured, GetSpecification, SwitchChannel
 from .client import Board, BoardError, BoardLost, BoardRefused, BoardSilent, BoardUnreachable
 from .frames import CHANNELS, BadFrame, ChannelSpecification, Measurements, Reading, Specification
-from .server import BoardServer, Device
-from .simulated import Load, SimulatedBoard
-from .simulator import (
+from .simulated_board import Load, SimulatedBoard
+from .simulator_actor import (
     POWER_TOPIC,
     BoardSimulator,
     BoardState,
@@ -28,6 +27,7 @@ from .simulator import (
     StuckChannel,
     WrongCurrent,
 )
+from .tcp_server import BoardServer, Device
 
 __all__ = [
     "BadFrame",

@@ -1,7 +1,7 @@
 """The engine: all minimal diagnoses, ranked, explained, and what to look at next."""
 
-from .diagnoser import Diagnoser
 from .explain import Conflict, Consequence, Explanation
+from .minimal_diagnoses import Diagnoser
 from .probe import Probe
 from .result import Candidate, Diagnosis, State
 

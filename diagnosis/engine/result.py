@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 from typing import Any, TypeAlias
 
-from ...actors.message import Message
+from ...actors.kernel.message import Message
 from ..literals import Literal
 from ..observations import Contradiction
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import msgspec
 
-from ..board.actor import TOPIC, BoardMeasured
+from ..board.board_actor import TOPIC, BoardMeasured
 from ..literals import Literal, on
 from .observer import Manner, Observer, atom_of
 from .verdicts import Limits

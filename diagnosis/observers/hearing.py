@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from ...actors.actor import Actor, Start, on
 from ...actors.errors import UnknownMessage
-from ...actors.mail import Table
-from ...actors.mailbox import bounded
-from ...actors.message import Message, message_name
-from ...actors.ref import ActorRef
+from ...actors.kernel.actor import Actor, Start, on
+from ...actors.kernel.envelope import Table
+from ...actors.kernel.mailbox import bounded
+from ...actors.kernel.message import Message, message_name
+from ...actors.kernel.ref import ActorRef
 
 HEARD: int = 1000
 """Messages that may wait at an ear; of more, the oldest are not heard."""

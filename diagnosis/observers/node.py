@@ -6,12 +6,12 @@ import asyncio
 from collections.abc import Awaitable, Mapping
 from typing import Final
 
-from ...actors.cell import RUNNING, Cell
-from ...actors.control.calls import ask_status
 from ...actors.control.orders import Status, status_of
+from ...actors.control.orders_lane import ask_status
 from ...actors.errors import HoldfastError, SpecError
-from ...actors.process.relay import OutsideHost, Peer
-from ...actors.process.remote import ProcessHost
+from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.process.process_host import ProcessHost
+from ...actors.process.wire.peer import OutsideHost, Peer
 from ...supervision.intensity import admit_restart
 from ..literals import Literal, running
 from ..messages import STARTS, Started

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 import msgspec
 
-from ...actors.actor import Actor, on, subscribe
-from ...actors.message import Message
+from ...actors.kernel.actor import Actor, on, subscribe
+from ...actors.kernel.message import Message
 from ..literals import BadLiteral, Literal, parse
 from ..messages import GRACE, OBSERVATIONS, Grace
 from ..observations import Observation

@@ -13,14 +13,14 @@ from typing import Final
 import msgspec
 import psutil
 
-from ...actors.cell import Cell
-from ...actors.control.calls import ask_status, order
 from ...actors.control.orders import Look as LookAt
 from ...actors.control.orders import Status, status_of
-from ...actors.control.tap import Statistics
+from ...actors.control.orders_lane import ask_status, order
+from ...actors.control.tracing import Statistics
 from ...actors.errors import HoldfastError
-from ...actors.process.relay import OutsideHost
-from ...actors.process.remote import ProcessHost
+from ...actors.kernel.cell import Cell
+from ...actors.process.process_host import ProcessHost
+from ...actors.process.wire.peer import OutsideHost
 from ..literals import Literal
 from ..messages import Grace
 from .node import at_root

@@ -10,7 +10,7 @@ import msgspec
 from ..engine.breath import beside_a_loop
 from .answers import Budget, Outcome, OutOfTime, Plan, Planner, TimedOut, Unsolvable
 from .language import Literal, Problem
-from .simulator import check_plan
+from .plan_check import check_plan
 
 GRACE = 1.0
 """Seconds a planner may take beyond its budget before it is left alone."""

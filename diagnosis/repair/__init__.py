@@ -4,11 +4,9 @@
 """
 
 from .actions import Act, ActionFailed, RepairAction, Repertoire, action
-from .actor import Repairer
-from .assembly import repairer
 from .executor import DENIED, DONE, FAILED, LOST, SKIPPED, UNVERIFIED
 from .ledger import Memory
-from .messages import (
+from .notices import (
     TOPIC,
     ActionBegan,
     ActionEnded,
@@ -29,6 +27,8 @@ from .messages import (
     Touched,
 )
 from .policy import NORMAL, SAFE, Policy
+from .repairer import Repairer
+from .setup import repairer
 from .stock import (
     attach_mechanism,
     bind_port,

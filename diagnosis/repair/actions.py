@@ -18,8 +18,8 @@ import dataclasses
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import Any, Final
 
-from ...actors.context import ActorContext
 from ...actors.errors import HoldfastError
+from ...actors.kernel.context import ActorContext
 from ..planning import Domain, PlanningError, Step, read_domain, repair_domain, with_actions
 from ..planning.language import Action, And, Atom, Fact
 from ..planning.repair import repair_text

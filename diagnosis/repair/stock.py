@@ -14,9 +14,9 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Final, Protocol
 
-from ...actors.actor import Actor
 from ...actors.errors import HoldfastError
-from ...actors.ref import ActorRef
+from ...actors.kernel.actor import Actor
+from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import ChildBusy, ChildParked, RestartChild, TerminateChild
 from ...supervision.arbiter import OPERATOR, InOtherHands
 from ..board import SwitchChannel

@@ -9,9 +9,9 @@ import dataclasses
 import os
 from typing import ClassVar
 
-from holdfast.ftm.bricks import After, Before, Brick
-from holdfast.ftm.mechanism import Mechanism, Role
-from holdfast.ftm.messages import Done, Work
+from holdfast.ftm.bricks.brick_messages import Done, Work
+from holdfast.ftm.bricks.bricks import After, Before, Brick
+from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
 
 
 def write(brick: Brick, lines: list[str]) -> None:

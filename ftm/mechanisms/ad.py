@@ -18,14 +18,14 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from ...actors.actor import Actor
 from ...actors.errors import HoldfastError, type_name
+from ...actors.kernel.actor import Actor
 from ..alarms import Objected
-from ..assertions import Assertion, AssertionFailed, Inspector, names_of
-from ..helping import Compute, Helping
-from ..mechanism import Mechanism, MechanismRefused, Role
-from ..messages import Request, State
-from ..runs import Deciding, Run, plain
+from ..bricks.assertions import Assertion, AssertionFailed, Inspector, names_of
+from ..bricks.brick_messages import Request, State
+from ..bricks.runs import Deciding, Run, plain
+from ..bricks.shadow_runs import Compute, Helping
+from .mechanism import Mechanism, MechanismRefused, Role
 
 
 class Assisting(Helping):

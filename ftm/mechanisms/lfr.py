@@ -22,15 +22,15 @@ from collections import deque
 from typing import Any, ClassVar
 
 from ...actors.errors import HoldfastError
-from ...actors.message import Message
-from ...checkpoint.records import Outcome, TurnEnd
+from ...actors.kernel.message import Message
+from ...checkpoint.protocol import Outcome, TurnEnd
 from ..alarms import Diverged, NondeterminismFound, ProtectionLost, StatesDiffer
-from ..bricks import After, Before, Brick, Proceed
-from ..mechanism import Mechanism, Role
-from ..messages import FORWARDED, Done, Request, State, Work
-from ..runs import Missing, Shadow, digest_of_state
-from ..standing import PeerLost
-from ..transfer import GoneAstray
+from ..bricks.brick_messages import FORWARDED, Done, Request, State, Work
+from ..bricks.bricks import After, Before, Brick, Proceed
+from ..bricks.runs import Missing, Shadow, digest_of_state
+from ..bricks.state_transfer import GoneAstray
+from ..replica.standing import PeerLost
+from .mechanism import Mechanism, Role
 
 RUNS_AGAIN = 3
 """How often what has differed is computed again."""

@@ -18,16 +18,16 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from ...actors.actor import Actor
 from ...actors.errors import HoldfastError
+from ...actors.kernel.actor import Actor
 from ..alarms import Masked
-from ..assertions import names_of
-from ..declaration import Cost
-from ..mechanism import Mechanism, Role
-from ..messages import Request, State
-from ..runs import Deciding, Remembering, Run, Shadow, turns_of, vote
-from ..versions import version
-from ..voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided
+from ..bricks.assertions import names_of
+from ..bricks.brick_messages import Request, State
+from ..bricks.runs import Deciding, Remembering, Run, Shadow, turns_of, vote
+from ..bricks.versions import version
+from ..bricks.voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided
+from ..model.declaration import Cost
+from .mechanism import Mechanism, Role
 from .rb import protected_class
 
 MAJORITY = Majority()
@@ -122,6 +122,6 @@ def voter_of(value: Any) -> Any:
     except msgspec.ValidationError as error:
         raise ValueError(f"{value!r} is no voter: {error}") from error
     if isinstance(made, type) or not hasattr(made, "vote"):
-        known = "Exact(), Majority(), Tolerance(...), Median() or custom(function) of holdfast.ftm.voters"
+        known = "Exact(), Majority(), Tolerance(...), Median() or custom(function) of holdfast.ftm.bricks.voters"
         raise ValueError(f"a voter is one such as {known}, not {made!r}")
     return made

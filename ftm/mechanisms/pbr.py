@@ -15,13 +15,13 @@ import asyncio
 import dataclasses
 from typing import Any, ClassVar
 
-from ...actors.message import Message
+from ...actors.kernel.message import Message
 from ..alarms import ProtectionLost
-from ..bricks import FOREVER, After
-from ..mechanism import Mechanism, Role
-from ..messages import Change, Done, Logged, State
-from ..standing import PeerLost
-from ..state import MISFIT, Apply, Capture
+from ..bricks.brick_messages import Change, Done, Logged, State
+from ..bricks.bricks import FOREVER, After
+from ..replica.standing import PeerLost
+from ..replica.state_manager import MISFIT, Apply, Capture
+from .mechanism import Mechanism, Role
 
 
 class Checkpoint(Message[int]):

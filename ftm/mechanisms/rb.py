@@ -15,14 +15,14 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from ...actors.actor import Actor
 from ...actors.errors import HoldfastError, type_name
+from ...actors.kernel.actor import Actor
 from ..alarms import Objected
-from ..assertions import Assertion, Inspector, names_of
-from ..mechanism import Mechanism, MechanismRefused, Role
-from ..messages import Request, State
-from ..runs import Deciding, Missing, Remembering, Run, Shadow
-from ..versions import version
+from ..bricks.assertions import Assertion, Inspector, names_of
+from ..bricks.brick_messages import Request, State
+from ..bricks.runs import Deciding, Missing, Remembering, Run, Shadow
+from ..bricks.versions import version
+from .mechanism import Mechanism, MechanismRefused, Role
 
 
 class NotAccepted(HoldfastError, text="{actor}: {why}"):

@@ -28,18 +28,30 @@ import tempfile
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.actor import Actor, on
 from ...actors.errors import HoldfastError
-from ...actors.mail import ReplyHandle
-from ..bricks import FOREVER, After, Before
-from ..mechanism import Mechanism, MechanismRefused, Role
-from ..messages import Done, Outward, Taken
-from ..sealed import ORDERS, Agree, Back, Call, Greet, LinkLost, Opened, Refused, Sealed, encode_reply, tell_over
+from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.envelope import ReplyHandle
+from ..bricks.brick_messages import Done, Outward, Taken
+from ..bricks.bricks import FOREVER, After, Before
+from ..bricks.sealed_frames import (
+    ORDERS,
+    Agree,
+    Back,
+    Call,
+    Greet,
+    LinkLost,
+    Opened,
+    Refused,
+    Sealed,
+    encode_reply,
+    tell_over,
+)
+from .mechanism import Mechanism, MechanismRefused, Role
 
 if TYPE_CHECKING:
-    from ...actors.message import Message
-    from ...actors.node import Node
-    from ..sealed import SecuredLink
+    from ...actors.kernel.message import Message
+    from ...actors.kernel.node import Node
+    from ..bricks.sealed_frames import SecuredLink
 
 
 ANSWERED_WITHIN = 1.0
@@ -96,7 +108,7 @@ class Opening(Before):
     async def _do(self, call: Call) -> Back:
         standing = self._standing
         codec = standing.node.codec
-        from ..protocol import OPENED
+        from ..bricks.request_protocol import OPENED
 
         for part in call.parts:
             message = codec.decode(OPENED[part.name], part.body)

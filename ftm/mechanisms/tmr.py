@@ -24,13 +24,13 @@ import msgspec
 
 from ...actors.errors import ActorStopped, HoldfastError
 from ..alarms import Masked, Outvoted, ProtectionLost
-from ..declaration import Cost
-from ..helping import NEEDS_STATE, Compute, Computed, Helping, Settled
-from ..mechanism import Mechanism, Role
-from ..messages import Done, NotFollowing, Request, StaleEpoch, State, Strayed, is_marker
-from ..runs import Deciding, Digests, Run, turns_of, vote
-from ..standing import PeerLost
-from ..voters import Majority, Median, NoMajority, Undecided
+from ..bricks.brick_messages import Done, NotFollowing, Request, StaleEpoch, State, Strayed, is_marker
+from ..bricks.runs import Deciding, Digests, Run, turns_of, vote
+from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settled
+from ..bricks.voters import Majority, Median, NoMajority, Undecided
+from ..model.declaration import Cost
+from ..replica.standing import PeerLost
+from .mechanism import Mechanism, Role
 from .nvp import voter_of
 
 MAJORITY = Majority()

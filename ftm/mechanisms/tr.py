@@ -15,13 +15,13 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
-from ...checkpoint.records import FAILED, Answer, TurnEnd
+from ...checkpoint.protocol import FAILED, Answer, TurnEnd
 from ..alarms import Masked
-from ..bricks import FOREVER, After
-from ..mechanism import Mechanism, Role
-from ..messages import Done
-from ..state import LastRun, Ran, RunAgain, Undo
-from ..voters import NoMajority
+from ..bricks.brick_messages import Done
+from ..bricks.bricks import FOREVER, After
+from ..bricks.voters import NoMajority
+from ..replica.state_manager import LastRun, Ran, RunAgain, Undo
+from .mechanism import Mechanism, Role
 
 
 def outcome(ran: Ran) -> tuple[Any, ...]:

@@ -6,9 +6,9 @@ import datetime as dt
 import os
 from typing import Any
 
-from ...actors.actor import Actor, on
-from ...actors.mail import ReplyHandle
-from ...actors.message import Message, Order
+from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.envelope import ReplyHandle
+from ...actors.kernel.message import Message, Order
 from .certificates import (
     HEARTBEAT,
     LIFETIME,
@@ -21,8 +21,8 @@ from .certificates import (
     public_of,
     read_request,
 )
-from .errors import EnrolmentRefused, NoCertificate, Rejected
 from .keys import SigningKey, raw_public
+from .sec_errors import EnrolmentRefused, NoCertificate, Rejected
 
 
 class GetRoot(Message[bytes]):

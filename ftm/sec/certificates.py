@@ -17,8 +17,8 @@ from cryptography.hazmat.primitives import serialization
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 from cryptography.x509.oid import NameOID
 
-from .errors import EXPIRED, MALFORMED, NOT_YET, REVOKED, STALE_LIST, UNTRUSTED, WRONG_PEER, Rejected
 from .keys import SigningKey, is_signed
+from .sec_errors import EXPIRED, MALFORMED, NOT_YET, REVOKED, STALE_LIST, UNTRUSTED, WRONG_PEER, Rejected
 
 DER: Final = serialization.Encoding.DER
 LIFETIME: Final = dt.timedelta(days=30)

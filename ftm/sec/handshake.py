@@ -24,8 +24,8 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDF
 
 from .certificates import Peer, Trust
-from .errors import CLOSED, FORGED, MALFORMED, REVOKED, STALE_EPOCH, STALE_LIFE, VERSION, WRONG_PEER, Rejected
 from .keys import Secret, SigningKey, is_signed
+from .sec_errors import CLOSED, FORGED, MALFORMED, REVOKED, STALE_EPOCH, STALE_LIFE, VERSION, WRONG_PEER, Rejected
 from .session import SUITES, Limits, Session, expand
 
 T = TypeVar("T")

@@ -12,18 +12,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ...actors.errors import ActorStopped, HoldfastError
-from ...actors.message import Message
-from ..mechanism import MechanismRefused
-from ..sealed import FrameRefused
+from ...actors.kernel.message import Message
+from ..bricks.sealed_frames import FrameRefused
+from ..mechanisms.mechanism import MechanismRefused
 from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
 from .certificates import MOST_NAME, Trust, about, make_request, public_of
-from .errors import UNTRUSTED, EnrolmentRefused, NoCertificate, Rejected, UnsafeKeyFile
 from .handshake import Participant
 from .keys import Secret, SigningKey, raw_public, read_own, write_own
+from .sec_errors import UNTRUSTED, EnrolmentRefused, NoCertificate, Rejected, UnsafeKeyFile
 from .session import Limits
 
 if TYPE_CHECKING:
-    from ...actors.node import Node
+    from ...actors.kernel.node import Node
     from ..mechanisms.sec import SEC
 
 AUTHORITY_WITHIN = 5.0

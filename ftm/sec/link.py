@@ -16,8 +16,8 @@ from typing import Any
 import msgspec
 
 from ...actors.errors import AskTimeout, HoldfastError
-from ...actors.message import Message, message_name
-from ..sealed import (
+from ...actors.kernel.message import Message, message_name
+from ..bricks.sealed_frames import (
     ORDERS,
     TELLS,
     Agree,
@@ -34,7 +34,10 @@ from ..sealed import (
 )
 from .authority import AwaitRevocations
 from .certificates import HEARTBEAT
-from .errors import (
+from .handshake import Participant, Response
+from .identity import End, Identity, certified, root_file
+from .keys import Secret
+from .sec_errors import (
     CLOSED,
     MALFORMED,
     REPLAYED,
@@ -45,9 +48,6 @@ from .errors import (
     WRONG_SESSION,
     Rejected,
 )
-from .handshake import Participant, Response
-from .identity import End, Identity, certified, root_file
-from .keys import Secret
 from .session import HEAD, Session
 
 CALL, BACK = b"call", b"back"

@@ -23,7 +23,8 @@ from cryptography.hazmat.primitives.hashes import SHA256
 from cryptography.hazmat.primitives.kdf.hkdf import HKDFExpand
 
 from .certificates import Peer
-from .errors import (
+from .keys import Secret
+from .sec_errors import (
     EXHAUSTED,
     EXPIRED,
     FORGED,
@@ -36,7 +37,6 @@ from .errors import (
     WRONG_SESSION,
     Rejected,
 )
-from .keys import Secret
 
 FORMAT: Final = 1
 HEAD: Final = struct.Struct(">B8sIQ")

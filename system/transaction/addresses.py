@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from ...actors.cell import GONE, Cell
-from ...actors.node import Node
+from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.node import Node
 
 
 class Moved:

@@ -6,15 +6,15 @@ import asyncio
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from ...actors.actor import Actor, Start
 from ...actors.control.orders import Change as StateChange
 from ...actors.control.orders import Migrate
+from ...actors.kernel.actor import Actor, Start
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
 from .mechanisms import Attach, Compose, Detach, DetachLayer, OnProtection, Transition, Update
-from .moving import Move
 from .operation import Operation, Step
+from .reparenting import Move
 from .running import StartAgain, StopChild
 from .structure import Add, Remove, Reorder, SetFlags, named_spec, text_of
 from .wiring import Bind, Register, Unbind, Unregister

@@ -6,16 +6,16 @@ import difflib
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from ...actors.cell import GONE, Cell
 from ...actors.errors import ActorRestarting, NoSuchActor
-from ...actors.node import Node, cell_kind
-from ...actors.process.relay import OutsideHost
-from ...actors.process.remote import ProcessHost
-from ...actors.ref import ActorRef
+from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.node import Node, cell_kind
+from ...actors.kernel.ref import ActorRef
+from ...actors.process.process_host import ProcessHost
+from ...actors.process.wire.peer import OutsideHost
 from ...supervision.admin import WhichChildren
 from ...supervision.children import Child
 from ...supervision.dynamic import DynamicSupervisor
-from ...supervision.partition import PartitionSupervisor
+from ...supervision.services.partition import PartitionSupervisor
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
 from ..protection import part_of
@@ -23,7 +23,7 @@ from .lasting import recipe_flags
 from .operation import wrong
 
 if TYPE_CHECKING:
-    from ...actors.actor import Actor
+    from ...actors.kernel.actor import Actor
 
 Target = ActorRef[Any] | str
 """What an operation is about: a ref, or the address at that point of the transaction."""
@@ -128,9 +128,9 @@ class Place:
 
 def rules() -> Any:
     """`ftm.adaptation_rules`, which most transactions do not need."""
-    from ...ftm import adaptation_rules
+    from ...ftm.model import composition
 
-    return adaptation_rules
+    return composition
 
 
 class Draft:

@@ -9,8 +9,8 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from ...actors.actor import Start
-from ...actors.cell import Cell
+from ...actors.kernel.actor import Start
+from ...actors.kernel.cell import Cell
 from ...supervision.dynamic import DynamicSupervisor
 from ...supervision.respec import rebuilt, respec
 from ...supervision.spec import ChildSpec, Flags

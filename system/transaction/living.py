@@ -7,11 +7,11 @@ import dataclasses
 import functools
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.actor import Actor, Start
-from ...actors.cell import Cell
+from ...actors.control.live_state import Opaque
 from ...actors.control.orders import Change, Migrate, next_start
-from ...actors.control.state import Opaque
 from ...actors.errors import ControlFailed, SpecError, type_name
+from ...actors.kernel.actor import Actor, Start
+from ...actors.kernel.cell import Cell
 from ...supervision.spec import Isolation
 from .draft import Draft, Place, Target, is_elsewhere
 from .operation import Operation, wrong

@@ -6,16 +6,16 @@ import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.cell import Cell
+from ...actors.kernel.cell import Cell
 from ...supervision.arbiter import Grant, Hand, arbiter_of
 from ...supervision.respec import recipe_spec
-from ..moving import to_its_end
+from ..live_moves import to_its_end
 from .draft import Draft, Place, Target, is_elsewhere, rules
 from .living import OnLiving
 from .operation import wrong
 
 if TYPE_CHECKING:
-    from ...ftm.probation import Probation
+    from ...ftm.group.probation import Probation
     from ..system import ActorSystem
 
 PROTECT_TIMEOUT = 60.0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.cell import Cell
 from ...actors.errors import NoSuchActor
-from ...actors.ref import ActorRef
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import NotSupported, RestartChild, TerminateChild
 from ...supervision.supervisor import Supervisor
 from .draft import Draft, Place, Target, check_awake, is_elsewhere

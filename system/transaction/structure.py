@@ -6,10 +6,10 @@ import dataclasses
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.actor import Start
-from ...actors.cell import Cell
 from ...actors.errors import ActorStopped, AskTimeout, HoldfastError
-from ...actors.ref import ActorRef
+from ...actors.kernel.actor import Start
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import (
     AlreadyPresent,
     Boxed,

@@ -8,7 +8,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError, SpecError, error_text, type_name
-from ...actors.ref import current
+from ...actors.kernel.ref import current
 from ...supervision.arbiter import on_errand
 from .change import Change
 from .draft import Draft, difference

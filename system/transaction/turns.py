@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar, TypeVar
 
-from ...actors.cell import Cell
-from ...actors.control.calls import order
 from ...actors.control.orders import Order
+from ...actors.control.orders_lane import order
+from ...actors.kernel.cell import Cell
 from ...supervision.supervisor import Supervisor
 
 T = TypeVar("T")

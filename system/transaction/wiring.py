@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.cell import RUNNING, Cell
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
+from ...actors.kernel.cell import RUNNING, Cell
 from .draft import Draft, Place, Target, is_elsewhere
 from .operation import Operation, wrong
 from .structure import text_of

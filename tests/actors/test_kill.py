@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors import lives
 from holdfast.actors.events import LifeAbandoned
+from holdfast.actors.kernel import lifecycle
 from tests.actors.doers import Do, Doer, Doers, DoNow, pause
 
 
@@ -63,7 +63,7 @@ async def test_killing_a_turn_cancels_what_it_waits_for(doer: Doers) -> None:
 async def test_a_turn_that_swallows_its_kill_is_abandoned_and_may_not_send(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lives, "GRACE", 0.01)
+    monkeypatch.setattr(lifecycle, "GRACE", 0.01)
     attempts: list[str] = []
     gate, over = asyncio.Event(), asyncio.Event()
     other = system.spawn(hf.start(Doer))
@@ -117,7 +117,7 @@ async def test_a_turn_that_swallows_its_kill_is_abandoned_and_may_not_send(
 async def test_a_killed_parent_waits_for_a_stubborn_child_and_ends(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lives, "GRACE", 0.02)
+    monkeypatch.setattr(lifecycle, "GRACE", 0.02)
     gate = asyncio.Event()
 
     async def stubborn(_: Any) -> None:

@@ -11,7 +11,7 @@ import anyio
 import pytest
 
 import holdfast as hf
-from holdfast.actors.loop import MOST, RUNNERS
+from holdfast.actors.kernel.loop import MOST, RUNNERS
 from tests.actors.doers import Do, Doer, Doers, DoNow, pause
 
 

@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.actors.cell import Cell
-from holdfast.actors.codec import MAX_BYTES, Codec
-from holdfast.actors.message import UnknownRefusal, message_name, reply_type
+from holdfast.actors.kernel.cell import Cell
+from holdfast.actors.kernel.codec import MAX_BYTES, Codec
+from holdfast.actors.kernel.message import UnknownRefusal, message_name, reply_type
 
 T = TypeVar("T")
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from holdfast.checkpoint.journal import DamagedStore, Entry, Saved, StoreFailed
-from holdfast.checkpoint.segments import Segment
+from holdfast.checkpoint.snapshot.shared_blocks import Segment
 
 
 def check(part: Any) -> None:

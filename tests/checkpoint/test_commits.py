@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.commits import Commits
+from holdfast.checkpoint.group_commit import Commits
 from holdfast.checkpoint.journal import Entry, StoreFailed
-from holdfast.checkpoint.records import SnapshotNow
+from holdfast.checkpoint.protocol import SnapshotNow
 from holdfast.checkpoint.sqlite import SqliteJournal
 from tests.checkpoint.players import Do, Doer, Note, Seen, Sink, start, until
 

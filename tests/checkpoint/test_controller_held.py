@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.switch import Switch
+from holdfast.checkpoint.home.switch import Switch
 from tests.checkpoint.guards import over, running
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Tick, start, until
 from tests.checkpoint.strikes import doer, event, let_through, sink, strike, struck

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.shapes import difference, shape_of
+from holdfast.checkpoint.schema import difference, shape_of
 from tests.checkpoint.test_restart_root import PATHS
 
 PLAYER = Path(__file__).with_name("evolving_player.py")

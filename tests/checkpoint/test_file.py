@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.file import RecoveryFile
+from holdfast.checkpoint.recovery_file import RecoveryFile
 from tests.checkpoint.players import Doer, Note, Seen, start
 from tests.checkpoint.strikes import strike
 

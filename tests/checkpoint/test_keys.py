@@ -14,7 +14,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.values import DamagedValue, UnsavableValue
-from holdfast.checkpoint.keys import StateMismatch, restore_state, save_state
+from holdfast.checkpoint.snapshot.key_variables import StateMismatch, restore_state, save_state
 
 
 class Place:

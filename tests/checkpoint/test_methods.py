@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.checkpoint.file import RecoveryFile
+from holdfast.checkpoint.recovery_file import RecoveryFile
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, start, until
 from tests.checkpoint.strikes import NEVER, event, home, host_of, let_through, strike
 
@@ -50,7 +50,7 @@ def method(name: str, **options: Any) -> hf.Method:
 
 async def snapshot(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     """Have one taken after the last turn, by whatever would take one."""
-    from holdfast.checkpoint.records import SnapshotNow
+    from holdfast.checkpoint.protocol import SnapshotNow
 
     switch = home(ref)
     turn = switch.turn
@@ -447,7 +447,7 @@ async def test_a_move_whose_snapshot_cannot_be_kept_is_given_up(
     system: hf.ActorSystem, there: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The store refuses it: the old life goes on, with all it has."""
-    import holdfast.checkpoint.arrival as of_arrivals
+    import holdfast.checkpoint.snapshot.snapshot_receiver as of_arrivals
 
     def full(*_: Any) -> None:
         raise hf.HoldfastError("the disk is full")

@@ -159,7 +159,7 @@ async def test_digests_quarantine_and_group_of_an_earlier_holdfast_are_read(tmp_
 async def test_a_snapshot_of_a_later_holdfast_is_refused(tmp_path: Path) -> None:
     import msgspec
 
-    from holdfast.checkpoint.saved import decode_meta, encode_meta
+    from holdfast.checkpoint.snapshot.snapshot_record import decode_meta, encode_meta
 
     store = f"sqlite:{tmp_path / 'app.db'}"
     await recorded(store, Stubborn)

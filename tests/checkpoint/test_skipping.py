@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.checkpoint.keys import state_of
+from holdfast.checkpoint.snapshot.key_variables import state_of
 from tests.checkpoint.players import Note, Notes, Sink, gate, start, until
 from tests.checkpoint.strikes import NEVER, actor_of, event, home, let_through, strike, struck
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.image import LARGE, Imager, read_image
+from holdfast.checkpoint.snapshot.state_image import LARGE, Imager, read_image
 from tests.checkpoint.image_player import MANY, Canvas, Digest, Paint, Spoil, Write
 from tests.checkpoint.players import start, until
 from tests.checkpoint.strikes import NEVER, event, strike

@@ -150,7 +150,7 @@ async def test_what_comes_from_the_context_and_what_is_not_the_turns_own_is_let_
 
 LAZY = """
 import sys, holdfast as hf, numpy
-from holdfast.checkpoint.strict import Guard, NotDeterministic
+from holdfast.checkpoint.life.determinism_guard import Guard, NotDeterministic
 assert "numpy.random" not in sys.modules
 try:
     Guard().call(lambda: numpy.random.rand())

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process import frames
+from holdfast.actors.process.wire import frames
 from tests.control.conftest import Starter
 from tests.control.players import (
     Account,

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process.mover import Move
-from holdfast.actors.process.to_process import ToProcess
-from holdfast.actors.process.to_task import FromProcess, ToTask
-from holdfast.actors.process.workers import Worker
-from holdfast.checkpoint.moving import RecordedToProcess, RecordedToTask
+from holdfast.actors.migration.process_move import Move
+from holdfast.actors.migration.to_process import ToProcess
+from holdfast.actors.migration.to_task import FromProcess, ToTask
+from holdfast.actors.process.worker_pool import Worker
+from holdfast.checkpoint.home.recorded_moves import RecordedToProcess, RecordedToTask
 from tests.control.movers import Count, Ledger, Note, Seen, Slow
 
 OTHER: dict[str, Any] = {"task": "process", "process": "task"}

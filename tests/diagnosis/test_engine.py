@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from holdfast.diagnosis.engine import Diagnoser, State, diagnoser
+from holdfast.diagnosis.engine import Diagnoser, State, minimal_diagnoses
 from holdfast.diagnosis.engine.cone import Index, Part, cone_of
 from holdfast.diagnosis.engine.solve import Budget, Solved, solve
 from holdfast.diagnosis.literals import BadLiteral, Vocabulary, ok, parse, running
@@ -152,7 +152,7 @@ def test_only_parts_that_changed_are_solved_again(monkeypatch: pytest.MonkeyPatc
         solved.append(part)
         return solve(part, limit, budget)
 
-    monkeypatch.setattr(diagnoser, "solve", spy)
+    monkeypatch.setattr(minimal_diagnoses, "solve", spy)
     engine = Diagnoser(paper_robot())
     engine.diagnose_now(["not ok(/odom)"])
     engine.diagnose_now(["not ok(/odom)", "running(rviz)"])

@@ -19,13 +19,13 @@ from pathlib import Path
 from typing import Any
 
 import holdfast as hf
-from holdfast.ftm import host
 from holdfast.ftm.alarms import Diverged, Masked, Objected, Outvoted, ProtectionLost
-from holdfast.ftm.detector import Detection
+from holdfast.ftm.bricks.sealed_frames import FrameRefused
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
-from holdfast.ftm.group import Group, Look
-from holdfast.ftm.mechanism import Mechanism
-from holdfast.ftm.sealed import FrameRefused
+from holdfast.ftm.group import group_host
+from holdfast.ftm.group.detector import Detection
+from holdfast.ftm.group.group import Group, Look
+from holdfast.ftm.mechanisms.mechanism import Mechanism
 from tests.ftm.faults import FRAMES, KINDS, LATE, VALUES, claims
 from tests.ftm.injection import READ, REQUEST, Fault, Page, recipe, unwrap, wrap_root
 from tests.ftm.stacks import enrolling
@@ -130,20 +130,20 @@ def injecting(detection: Detection = QUICK) -> Generator[Page, None, None]:
     """Replicas that start in this block are struck by what is armed in the page."""
     with tempfile.TemporaryDirectory() as folder:
         page = Page.new(Path(folder) / "page")
-        saved, before = wrap_root(page), host.replica
-        host.replica = recipe(page)
+        saved, before = wrap_root(page), group_host.replica
+        group_host.replica = recipe(page)
         try:
             with detecting(detection):
                 yield page
         finally:
-            host.replica = before
+            group_host.replica = before
             unwrap(saved)
 
 
 @contextlib.contextmanager
 def detecting(detection: Detection) -> Generator[None, None, None]:
     """Groups that start in this block watch their replicas so."""
-    known: Any = host
+    known: Any = group_host
     before, known.Detection = known.Detection, lambda: detection
     try:
         yield
@@ -159,7 +159,7 @@ async def running() -> AsyncGenerator[hf.ActorSystem, None]:
 
 def group_of(ref: hf.ActorRef[Any]) -> Group | None:
     found = ref._cell.host
-    return found.group if isinstance(found, host.GroupHost) else None
+    return found.group if isinstance(found, group_host.GroupHost) else None
 
 
 async def whole(ref: hf.ActorRef[Any]) -> None:

@@ -2,7 +2,7 @@
 
 from typing import ClassVar
 
-from holdfast.ftm.declaration import Cost
+from holdfast.ftm.model.declaration import Cost
 
 
 class Declared:

@@ -10,8 +10,8 @@ from typing import Any
 import msgspec
 
 import holdfast as hf
-from holdfast.actors.message import message_name
-from holdfast.checkpoint.records import (
+from holdfast.actors.kernel.message import message_name
+from holdfast.checkpoint.protocol import (
     MESSAGE,
     OK,
     START,
@@ -24,10 +24,10 @@ from holdfast.checkpoint.records import (
     SnapshotNow,
     TurnEnd,
 )
-from holdfast.ftm.mechanism import Mechanism
-from holdfast.ftm.messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Strayed, Work
-from holdfast.ftm.orders import Beat, Install, Join, Peer, Setting
-from holdfast.ftm.replica import Replica
+from holdfast.ftm.bricks.brick_messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Strayed, Work
+from holdfast.ftm.mechanisms.mechanism import Mechanism
+from holdfast.ftm.replica.replica import Replica
+from holdfast.ftm.replica.replica_orders import Beat, Install, Join, Peer, Setting
 
 ADDRESS = "/app/x"
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from holdfast.ftm.mechanism import Mechanism
-from holdfast.ftm.replica import nested
+from holdfast.ftm.mechanisms.mechanism import Mechanism
+from holdfast.ftm.replica.replica import nested
 from tests.ftm.injection import READ, REQUEST, Fault
 
 Layers = Sequence[Mechanism]

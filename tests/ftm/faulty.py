@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 import msgspec
 
-from holdfast.checkpoint.records import MESSAGE, OK, REPLY, Answer, TurnEnd
-from holdfast.ftm.bricks import Before
-from holdfast.ftm.mechanism import Mechanism, Role
-from holdfast.ftm.messages import Request, Work
+from holdfast.checkpoint.protocol import MESSAGE, OK, REPLY, Answer, TurnEnd
+from holdfast.ftm.bricks.brick_messages import Request, Work
+from holdfast.ftm.bricks.bricks import Before
+from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
 
 
 class Striking(Before):

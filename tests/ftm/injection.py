@@ -21,22 +21,22 @@ from typing import Any
 import msgspec
 
 import holdfast as hf
-from holdfast.actors.actor import Start
-from holdfast.actors.mail import Envelope
-from holdfast.checkpoint.records import OK, REPLY, Answer, TurnEnd
-from holdfast.ftm.bricks import Brick
-from holdfast.ftm.detector import Detector
-from holdfast.ftm.failover import FailoverManager
-from holdfast.ftm.heart import Heart
-from holdfast.ftm.join import Joiner
-from holdfast.ftm.letters import Letter
-from holdfast.ftm.mechanism import BUILT_IN, find
-from holdfast.ftm.messages import Done, Follow, Lead, Work
-from holdfast.ftm.orders import Peer
-from holdfast.ftm.proxy import Proxy
-from holdfast.ftm.replica import Replica
-from holdfast.ftm.sealed import Sealed
-from holdfast.ftm.state import StateManager
+from holdfast.actors.kernel.actor import Start
+from holdfast.actors.kernel.envelope import Envelope
+from holdfast.checkpoint.protocol import OK, REPLY, Answer, TurnEnd
+from holdfast.ftm.bricks.brick_messages import Done, Follow, Lead, Work
+from holdfast.ftm.bricks.bricks import Brick
+from holdfast.ftm.bricks.letters import Letter
+from holdfast.ftm.bricks.sealed_frames import Sealed
+from holdfast.ftm.group.detector import Detector
+from holdfast.ftm.group.failover import FailoverManager
+from holdfast.ftm.group.join import Joiner
+from holdfast.ftm.group.proxy import Proxy
+from holdfast.ftm.mechanisms.mechanism import BUILT_IN, find
+from holdfast.ftm.replica.heartbeat import Heart
+from holdfast.ftm.replica.replica import Replica
+from holdfast.ftm.replica.replica_orders import Peer
+from holdfast.ftm.replica.state_manager import StateManager
 from tests.ftm.accounts import Bank, Counter
 from tests.ftm.stacks import HUGE
 from tests.ftm.store import Store
@@ -155,7 +155,7 @@ class StruckReplica(Replica):
 
 
 def recipe(page: Page) -> Any:
-    """What stands in for `holdfast.ftm.host.replica`."""
+    """What stands in for `holdfast.ftm.group.group_host.replica`."""
 
     def replica(setting: Any, start: Start[Any], layers: tuple[Any, ...]) -> Start[Any]:
         return Start(StruckReplica, (setting, start, layers, page.path))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import dataclasses
 from typing import ClassVar
 
-from holdfast.ftm.bricks import After, Before
-from holdfast.ftm.mechanism import Mechanism, Role
-from holdfast.ftm.messages import Done, Work
+from holdfast.ftm.bricks.brick_messages import Done, Work
+from holdfast.ftm.bricks.bricks import After, Before
+from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
 
 SEEN: list[str] = []
 

@@ -6,7 +6,9 @@ from typing import Any
 
 import holdfast as hf
 from holdfast.actors.events import Event
-from holdfast.ftm.adaptations import (
+from holdfast.ftm.model.application import Application
+from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.monitoring.adaptations import (
     AdaptationDecided,
     AdaptationDone,
     AdaptationFailed,
@@ -15,16 +17,8 @@ from holdfast.ftm.adaptations import (
     MonitoringBlind,
     NothingValid,
 )
-from holdfast.ftm.application import Application
-from holdfast.ftm.judge import Judge, Readings, Settings
-from holdfast.ftm.model import Faults, Resources
-from holdfast.ftm.monitoring import (
-    Adapt,
-    Monitored,
-    MonitoringEngine,
-    Report,
-    Watch,
-)
+from holdfast.ftm.monitoring.judge import Judge, Readings, Settings
+from holdfast.ftm.monitoring.monitor import Adapt, Monitored, MonitoringEngine, Report, Watch
 from tests.ftm.declarations import EIGHT
 
 APP = Application("Account", state_bytes=10_000, request_bytes=100, rate=100)

@@ -8,9 +8,9 @@ import random
 from typing import Any
 
 import holdfast as hf
-from holdfast.checkpoint.records import OK, REPLY, Answer
+from holdfast.checkpoint.protocol import OK, REPLY, Answer
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.orders import Peer
+from holdfast.ftm.replica.replica_orders import Peer
 from tests.ftm.driver import Driver
 
 

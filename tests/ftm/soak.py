@@ -11,8 +11,8 @@ from collections import Counter as Tally
 from typing import Any
 
 import holdfast as hf
+from holdfast.ftm.bricks.brick_messages import Done
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
-from holdfast.ftm.messages import Done
 from tests.ftm.accounts import Counter
 from tests.ftm.campaign import Stuck, described, group_of, running, whole
 from tests.ftm.stacks import CA, STACKS

@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.adaptation import CannotAdapt
-from holdfast.ftm.bricks import After
+from holdfast.ftm.bricks.brick_messages import Done
+from holdfast.ftm.bricks.bricks import After
 from holdfast.ftm.events import MechanismChanged
-from holdfast.ftm.mechanism import MechanismRefused
+from holdfast.ftm.group.reconfiguration import CannotAdapt
 from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.messages import Done
 from tests.ftm.accounts import Account, Add, Bank, Closed, Counter, Load, Put, Tags, Total, Transfer
 from tests.ftm.test_failover import METHODS, group_of, other, pid_of, two_again
 
@@ -331,6 +331,6 @@ async def test_with_a_store_the_stack_is_there_again(tmp_path: Path) -> None:
 
 async def test_a_class_that_cannot_be_made_without_settings_is_refused(system: hf.ActorSystem) -> None:
     with pytest.raises(MechanismRefused, match="must be one such as"):
-        from holdfast.ftm.adaptation_rules import layers_of
+        from holdfast.ftm.model.composition import layers_of
 
         layers_of(3)

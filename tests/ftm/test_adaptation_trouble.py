@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.adaptation import STEPS, CannotAdapt
+from holdfast.ftm.group.reconfiguration import STEPS, CannotAdapt
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR

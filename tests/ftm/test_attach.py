@@ -12,16 +12,16 @@ from typing import Any, ClassVar
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process.remote import ProcessHost
-from holdfast.checkpoint.records import Snapshot
-from holdfast.ftm.bricks import After, Before
+from holdfast.actors.process.process_host import ProcessHost
+from holdfast.checkpoint.protocol import Snapshot
+from holdfast.ftm.bricks.brick_messages import Done, Work
+from holdfast.ftm.bricks.bricks import After, Before
 from holdfast.ftm.events import MechanismAttached, MechanismDetached
-from holdfast.ftm.failover import FailoverManager
-from holdfast.ftm.host import GroupHost
-from holdfast.ftm.mechanism import Mechanism, MechanismRefused, Role
+from holdfast.ftm.group.failover import FailoverManager
+from holdfast.ftm.group.group_host import GroupHost
 from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.mechanism import Mechanism, MechanismRefused, Role
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.messages import Done, Work
 from tests.ftm.accounts import Account, Add, Closed, Counter, Fussy, Later, Load, Pay, Purse, Tags, Total
 from tests.ftm.test_failover import METHODS, group_of, pid_of, two_again
 

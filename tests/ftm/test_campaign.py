@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.host import GroupHost
+from holdfast.ftm.group.group_host import GroupHost
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import Account, Add, Bank, Counter, Load, Put, Tags, Transfer
 from tests.ftm.test_attach import attach, detach

@@ -15,13 +15,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.actors.actor import Start
-from holdfast.actors.own_clock import OwnClock
-from holdfast.ftm.detector import HIGHEST, Accrual, Detection, Detector
+from holdfast.actors.kernel.actor import Start
+from holdfast.actors.observer_clock import OwnClock
+from holdfast.ftm.group.detector import HIGHEST, Accrual, Detection, Detector
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.orders import Beat
+from holdfast.ftm.replica.replica_orders import Beat
 from tests.ftm.accounts import Add, Counter
 from tests.ftm.test_failover import group_of, pid_of, two_again
 

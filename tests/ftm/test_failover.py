@@ -13,8 +13,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.events import FailedOver, ReplicaJoined, WrongSuspicion
-from holdfast.ftm.group import Group
-from holdfast.ftm.host import GroupHost
+from holdfast.ftm.group.group import Group
+from holdfast.ftm.group.group_host import GroupHost
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import (
     Account,

@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.bricks import Before
+from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import FailedOver
-from holdfast.ftm.mechanism import Role
+from holdfast.ftm.mechanisms.mechanism import Role
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import Add, Boom, Counter, Tags, Total
 from tests.ftm.test_failover import group_of, pid_of, started

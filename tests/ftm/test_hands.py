@@ -26,14 +26,14 @@ from holdfast.diagnosis.repair import (
     restart_child,
 )
 from holdfast.diagnosis.repair.executor import Executor, Result
-from holdfast.ftm.adaptations import AdaptationDecided, AdaptationHeld
-from holdfast.ftm.application import Application
-from holdfast.ftm.judge import Judge, Settings
-from holdfast.ftm.mechanism import find
 from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.mechanism import find
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.model import Faults, Resources
-from holdfast.ftm.monitoring import MonitoringEngine, Observe, Watch
+from holdfast.ftm.model.application import Application
+from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.monitoring.adaptations import AdaptationDecided, AdaptationHeld
+from holdfast.ftm.monitoring.judge import Judge, Settings
+from holdfast.ftm.monitoring.monitor import MonitoringEngine, Observe, Watch
 from holdfast.supervision.arbiter import Hand, InOtherHands, arbiter_of
 from tests.ftm.accounts import Add, Boom, Counter, Load, Tags
 from tests.ftm.test_adaptation import protected, stack, transition

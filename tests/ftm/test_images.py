@@ -13,13 +13,13 @@ import pytest
 import holdfast as hf
 from holdfast.actors.errors import DamagedValue
 from holdfast.actors.values import encode_value
-from holdfast.ftm import points
 from holdfast.ftm.alarms import Masked
-from holdfast.ftm.images import BLOCK, Image, Misfit, Patch, cut, image_from, patch
+from holdfast.ftm.bricks.brick_messages import Change, State
 from holdfast.ftm.mechanisms.pbr import Checkpoint
 from holdfast.ftm.mechanisms.tmr import TMR
-from holdfast.ftm.messages import Change, State
-from holdfast.ftm.rows import Rows
+from holdfast.ftm.replica import rewind_points
+from holdfast.ftm.replica.entry_rows import Rows
+from holdfast.ftm.replica.state_images import BLOCK, Image, Misfit, Patch, cut, image_from, patch
 from tests.ftm.replicated import pair
 from tests.ftm.test_failover import group_of, pid_of, two_again
 from tests.ftm.warehouse import KINDS, Break, Ledger, Resize, Sum, Touch, Warehouse
@@ -197,7 +197,7 @@ async def test_damaged_deltas_are_not_applied(system: hf.ActorSystem) -> None:
 async def test_many_deltas_become_a_state_of_which_only_what_differs_is_sent(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(points, "MOST_DELTAS", 4)
+    monkeypatch.setattr(rewind_points, "MOST_DELTAS", 4)
     driver = await pair(system, Ledger)
     heard = Heard(driver)
     for at in range(16):

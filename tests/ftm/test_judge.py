@@ -10,9 +10,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from holdfast.ftm.application import Application
-from holdfast.ftm.judge import ADAPT, HOLD, NONE, STAY, Judge, Readings, Settings, Signals, Threshold, Verdict
-from holdfast.ftm.model import Faults, Resources, response_price
+from holdfast.ftm.model.application import Application
+from holdfast.ftm.model.change_model import Faults, Resources, response_price
+from holdfast.ftm.monitoring.judge import (
+    ADAPT,
+    HOLD,
+    NONE,
+    STAY,
+    Judge,
+    Readings,
+    Settings,
+    Signals,
+    Threshold,
+    Verdict,
+)
 from tests.ftm.declarations import EIGHT
 
 APP = Application("Account", state_bytes=10_000, request_bytes=100, rate=100)

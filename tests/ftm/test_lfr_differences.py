@@ -11,8 +11,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import Diverged, NondeterminismFound, StatesDiffer
+from holdfast.ftm.bricks.brick_messages import Strayed
 from holdfast.ftm.mechanisms.lfr import LFR, RUNS_AGAIN
-from holdfast.ftm.messages import Strayed
 from tests.ftm.replicated import Add, Guess, Read, Total, pair
 
 

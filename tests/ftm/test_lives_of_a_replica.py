@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.message import message_name
-from holdfast.checkpoint.records import MESSAGE, Feed, TurnEnd
+from holdfast.actors.kernel.message import message_name
+from holdfast.checkpoint.protocol import MESSAGE, Feed, TurnEnd
+from holdfast.ftm.bricks.brick_messages import Request
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.messages import Request
-from holdfast.ftm.server import Server
-from holdfast.ftm.standing import Standing
+from holdfast.ftm.replica.protected_actor import Server
+from holdfast.ftm.replica.standing import Standing
 from tests.ftm.accounts import Add, Counter
 
 

@@ -9,14 +9,23 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.adaptation_rules import check_stack
-from holdfast.ftm.bricks import After
-from holdfast.ftm.mechanism import BUILT_IN, Description, Mechanism, MechanismRefused, compose, find, load, revive
+from holdfast.ftm.bricks.bricks import After
 from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.mechanism import (
+    BUILT_IN,
+    Description,
+    Mechanism,
+    MechanismRefused,
+    compose,
+    find,
+    load,
+    revive,
+)
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.orders import Abort, Commit, Prepare
-from holdfast.ftm.replica import weave
+from holdfast.ftm.model.composition import check_stack
+from holdfast.ftm.replica.replica import weave
+from holdfast.ftm.replica.replica_orders import Abort, Commit, Prepare
 from tests.ftm import versions
 from tests.ftm.driver import Driver
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Total, pair

@@ -10,10 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.ftm.application import Application
-from holdfast.ftm.coverage import coverage, selection_table, selection_text
-from holdfast.ftm.declaration import FAULTS, LAYERS, BadDeclaration, Cost, Entry
-from holdfast.ftm.model import (
+from holdfast.ftm.model.application import Application
+from holdfast.ftm.model.change_model import (
     Choice,
     Faults,
     Resources,
@@ -25,6 +23,8 @@ from holdfast.ftm.model import (
     response_price,
     select,
 )
+from holdfast.ftm.model.coverage import coverage, selection_table, selection_text
+from holdfast.ftm.model.declaration import FAULTS, LAYERS, BadDeclaration, Cost, Entry
 from tests.ftm.declarations import AD, EIGHT, LFR, NVP, PBR, RB, SEC, TMR, TR, Declared
 
 GOOD = Application("Account")
@@ -460,7 +460,7 @@ def test_the_selection_table_says_none_where_nothing_is_valid() -> None:
 
 
 def test_the_built_in_mechanisms_are_the_default() -> None:
-    pytest.importorskip("holdfast.ftm.mechanism")
+    pytest.importorskip("holdfast.ftm.mechanisms.mechanism")
     names = [entry.name for entry in coverage().entries]
     assert {"pbr", "lfr", "tr"} <= set(names)
     assert select(Faults.of("crash"), GOOD, Resources(units=2)).best is not None

@@ -6,7 +6,12 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.adaptations import (
+from holdfast.ftm.alarms import Diverged, NondeterminismFound
+from holdfast.ftm.bricks.sealed_frames import FrameRefused
+from holdfast.ftm.events import MechanismAttached, MechanismChanged, MechanismDetached, ReplicaFaulty
+from holdfast.ftm.model.application import Application
+from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.monitoring.adaptations import (
     AdaptationDecided,
     AdaptationDone,
     AdaptationFailed,
@@ -15,12 +20,8 @@ from holdfast.ftm.adaptations import (
     MonitoringBlind,
     NothingValid,
 )
-from holdfast.ftm.alarms import Diverged, NondeterminismFound
-from holdfast.ftm.application import Application
-from holdfast.ftm.events import MechanismAttached, MechanismChanged, MechanismDetached, ReplicaFaulty
-from holdfast.ftm.judge import Readings
-from holdfast.ftm.model import Faults, Resources
-from holdfast.ftm.monitoring import (
+from holdfast.ftm.monitoring.judge import Readings
+from holdfast.ftm.monitoring.monitor import (
     Adapt,
     Allow,
     ApplicationIs,
@@ -30,7 +31,6 @@ from holdfast.ftm.monitoring import (
     Object,
     Observe,
 )
-from holdfast.ftm.sealed import FrameRefused
 from holdfast.testing import advance
 from tests.ftm.monitored import APP, NARROW, SETTINGS, WIDE, World, in_world
 

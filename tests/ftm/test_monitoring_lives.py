@@ -5,18 +5,11 @@ import asyncio
 import msgspec
 import pytest
 
-from holdfast.ftm.adaptations import (
-    AdaptationWithdrawn,
-)
-from holdfast.ftm.application import Application
-from holdfast.ftm.judge import Readings
-from holdfast.ftm.model import Faults
-from holdfast.ftm.monitoring import (
-    Adapt,
-    Measured,
-    Observe,
-    read_machine,
-)
+from holdfast.ftm.model.application import Application
+from holdfast.ftm.model.change_model import Faults
+from holdfast.ftm.monitoring.adaptations import AdaptationWithdrawn
+from holdfast.ftm.monitoring.judge import Readings
+from holdfast.ftm.monitoring.monitor import Adapt, Measured, Observe, read_machine
 from holdfast.testing import advance
 from tests.ftm.monitored import NARROW, SETTINGS, World, in_world
 

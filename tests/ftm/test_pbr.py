@@ -9,16 +9,16 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.exits import SHUTDOWN, pack_exit
-from holdfast.checkpoint.records import OK, STASHED, TurnEnd
-from holdfast.checkpoint.records import Closed as LifeClosed
+from holdfast.actors.exit_reasons import SHUTDOWN, pack_exit
+from holdfast.checkpoint.protocol import OK, STASHED, TurnEnd
+from holdfast.checkpoint.protocol import Closed as LifeClosed
 from holdfast.ftm.alarms import ProtectionLost
-from holdfast.ftm.images import image_from
-from holdfast.ftm.letters import Letter
+from holdfast.ftm.bricks.brick_messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
+from holdfast.ftm.bricks.letters import Letter
+from holdfast.ftm.bricks.reply_log import ReplyLog
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
-from holdfast.ftm.messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
-from holdfast.ftm.orders import Export, Finish, Install, Join, Peer
-from holdfast.ftm.replylog import ReplyLog
+from holdfast.ftm.replica.replica_orders import Export, Finish, Install, Join, Peer
+from holdfast.ftm.replica.state_images import image_from
 from tests.ftm.replicated import (
     Add,
     Back,
@@ -171,7 +171,7 @@ async def test_a_part_may_be_over_before_any_turn_that_is_run_again(
     """What a slow machine has left for the next part is not run with the one that is run again."""
     driver = await pair(system)
     driver.standing("r1").server._chunk = 1
-    monkeypatch.setattr("holdfast.ftm.server.time", _Slow(every))
+    monkeypatch.setattr("holdfast.ftm.replica.protected_actor.time", _Slow(every))
     keys = driver.send(Add(1), Spoil(2), Add(3), Fail(4), Spoil(5), Add(6), Add(7))
     assert await driver.reply(keys[6]) == 17
     assert [driver.ends[key].turn for key in keys] == [1, 2, 3, 4, 5, 6, 7]

@@ -8,14 +8,14 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.mail import ReplyHandle
+from holdfast.actors.kernel.envelope import ReplyHandle
 from holdfast.ftm.alarms import Diverged
-from holdfast.ftm.letters import Letter, Sheet
+from holdfast.ftm.bricks.letters import Letter, Sheet
+from holdfast.ftm.bricks.peer_channel import Inbox, Where
+from holdfast.ftm.bricks.request_protocol import RequestProtocol
 from holdfast.ftm.mechanisms.lfr import LFR, Comparing, Handling
 from holdfast.ftm.mechanisms.pbr import PBR, StateUpdate
 from holdfast.ftm.mechanisms.tmr import TMR, Computing
-from holdfast.ftm.post import Inbox, Where
-from holdfast.ftm.protocol import RequestProtocol
 from tests.ftm.replicated import Add, Fetch, Read, Total, pair
 
 Handler = Callable[[Any, Any], Any]
@@ -24,7 +24,7 @@ Fault = Callable[[Handler, Any, Any], Any]
 
 @pytest.fixture(autouse=True)
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.ftm.post.PATIENCE", 0.05)
+    monkeypatch.setattr("holdfast.ftm.bricks.peer_channel.PATIENCE", 0.05)
 
 
 def lose(handler: Handler, actor: Any, item: Any) -> Any:
@@ -112,7 +112,7 @@ async def test_a_vote_goes_on_when_an_order_to_compute_is_lost(
 async def test_a_large_letter_of_which_a_sheet_is_lost_is_sent_again(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("holdfast.ftm.post.LETTER_BYTES", 10)
+    monkeypatch.setattr("holdfast.ftm.bricks.peer_channel.LETTER_BYTES", 10)
     driver = await pair(system)
     struck = strike(monkeypatch, StateUpdate, Sheet, lambda handler, actor, item: None, each=3, most=3)
     for n in range(9):

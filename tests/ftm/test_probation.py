@@ -13,15 +13,15 @@ from typing import Any, ClassVar
 import pytest
 
 import holdfast as hf
-from holdfast.ftm import probation
-from holdfast.ftm.bricks import Before
+from holdfast.ftm.bricks.brick_messages import Done, Work
+from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import MechanismSettled
-from holdfast.ftm.mechanism import Mechanism, Role
+from holdfast.ftm.group import probation
 from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR, Computing, Voting
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.messages import Done, Work
 from holdfast.system.protection import AdaptationUndone
 from tests.ftm import probation_root
 from tests.ftm.accounts import Add, Counter, Load, Tags

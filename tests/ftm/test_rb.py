@@ -8,7 +8,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import Objected
-from holdfast.ftm.mechanism import MechanismRefused, find, revive
+from holdfast.ftm.mechanisms.mechanism import MechanismRefused, find, revive
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.rb import RB, NotAccepted
 from tests.ftm import versions

@@ -16,23 +16,23 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.codec import Parcel
-from holdfast.actors.exits import SHUTDOWN, pack_exit
-from holdfast.actors.process.inner import Inner
-from holdfast.checkpoint.records import Closed
-from holdfast.ftm.mechanism import MechanismRefused
+from holdfast.actors.exit_reasons import SHUTDOWN, pack_exit
+from holdfast.actors.kernel.codec import Parcel
+from holdfast.actors.process.stand_ins import Inner
+from holdfast.checkpoint.protocol import Closed
+from holdfast.ftm.bricks.brick_messages import Done, Follow, Lead, Work
+from holdfast.ftm.bricks.sealed_frames import TELLS, Agree, Back, Call, Greet, LinkLost, Opened, Part, Refused, Sealed
+from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.sec import SEC
 from holdfast.ftm.mechanisms.tmr import TMR
-from holdfast.ftm.messages import Done, Follow, Lead, Work
-from holdfast.ftm.orders import Export, Join, Peer
-from holdfast.ftm.replica import weave
-from holdfast.ftm.sealed import TELLS, Agree, Back, Call, Greet, LinkLost, Opened, Part, Refused, Sealed
+from holdfast.ftm.replica.replica import weave
+from holdfast.ftm.replica.replica_orders import Export, Join, Peer
 from holdfast.ftm.sec.authority import CertificationAuthority, Enrol, GetRoot
 from holdfast.ftm.sec.certificates import Trust, make_request
-from holdfast.ftm.sec.errors import EnrolmentRefused
 from holdfast.ftm.sec.handshake import Participant
 from holdfast.ftm.sec.identity import root_file
 from holdfast.ftm.sec.keys import SigningKey
+from holdfast.ftm.sec.sec_errors import EnrolmentRefused
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.sec.parties import Office
 

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.detector import Detection
 from holdfast.ftm.events import FailedOver, TurnHung
+from holdfast.ftm.group.detector import Detection
 from tests.ftm.accounts import Account, Add, Counter, Put, Tags
 
 

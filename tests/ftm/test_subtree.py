@@ -15,11 +15,11 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.actors.exits import KILLED, pack_exit
-from holdfast.checkpoint.records import Closed
-from holdfast.ftm.mechanism import Code, Description, MechanismRefused
+from holdfast.actors.exit_reasons import KILLED, pack_exit
+from holdfast.checkpoint.protocol import Closed
+from holdfast.ftm.mechanisms.mechanism import Code, Description, MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.subtree import SubtreeGroup, known
+from holdfast.ftm.migration.subtree_groups import SubtreeGroup, known
 from tests.ftm.accounts import Account, Add, Counter, Load, Pay, Purse, Tags
 from tests.ftm.test_failover import METHODS, SEED, group_of, pid_of, two_again
 

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.subtree import SubtreeHome
-from holdfast.ftm.host import GroupHost
+from holdfast.checkpoint.home.subtree_homes import SubtreeHome
+from holdfast.ftm.group.group_host import GroupHost
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.subtree import SubtreeGroup
+from holdfast.ftm.migration.subtree_groups import SubtreeGroup
 from tests.ftm.accounts import Add, Boom, Counter, Load, Tags
 from tests.ftm.test_adaptation_trouble import fails, struck
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again

@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process.relay import OutsideHost
-from holdfast.checkpoint.subtree import SubtreeHost
-from holdfast.ftm.carrying import IntoProcess, OutOfProcess
+from holdfast.actors.process.wire.peer import OutsideHost
+from holdfast.checkpoint.home.subtree_homes import SubtreeHost
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.subtree import SubtreeGroup
+from holdfast.ftm.migration.subtree_groups import SubtreeGroup
+from holdfast.ftm.migration.unrecorded_handover import IntoProcess, OutOfProcess
 from tests.ftm.accounts import Add, Boom, Counter, Later, Load, Tags
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
 from tests.ftm.test_subtree import Heard, Watch, Watcher, at, bank, bank_pid

@@ -13,9 +13,9 @@ import pytest
 import holdfast as hf
 from holdfast.actors.events import TurnsLost
 from holdfast.ftm.alarms import Outvoted
+from holdfast.ftm.bricks.brick_messages import Strayed
 from holdfast.ftm.events import FailedOver, ReplicaJoined
 from holdfast.ftm.mechanisms.tmr import TMR
-from holdfast.ftm.messages import Strayed
 from tests.ftm.accounts import Counter, Load, Tags
 from tests.ftm.replicated import Add, Fetch, Read, Total, pair
 from tests.ftm.versions import FAULTY

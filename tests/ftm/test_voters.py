@@ -15,10 +15,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.actors.codec import encode_special
-from holdfast.checkpoint.records import CRASH, OK, REFUSAL, REPLY, Answer, Out, TurnEnd
-from holdfast.ftm.canonical import ABSENT, canonical
-from holdfast.ftm.voters import (
+from holdfast.actors.kernel.codec import encode_special
+from holdfast.checkpoint.protocol import CRASH, OK, REFUSAL, REPLY, Answer, Out, TurnEnd
+from holdfast.ftm.bricks.canonical import ABSENT, canonical
+from holdfast.ftm.bricks.voters import (
     Agreed,
     AnyVoter,
     Custom,

@@ -8,15 +8,15 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.adaptations import AdaptationDone, AdaptationFailed
-from holdfast.ftm.application import Application
-from holdfast.ftm.judge import Settings
-from holdfast.ftm.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.model import Faults, Resources
-from holdfast.ftm.monitoring import MonitoringEngine, Observe, Report
-from holdfast.ftm.watched import watch_of
+from holdfast.ftm.model.application import Application
+from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.monitoring.adaptations import AdaptationDone, AdaptationFailed
+from holdfast.ftm.monitoring.judge import Settings
+from holdfast.ftm.monitoring.monitor import MonitoringEngine, Observe, Report
+from holdfast.ftm.monitoring.watched import watch_of
 from tests.ftm.accounts import Add, Counter
 from tests.ftm.versions import is_positive
 

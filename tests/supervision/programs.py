@@ -52,7 +52,7 @@ async def refused(system: hf.ActorSystem, spec: hf.ChildSpec) -> str:
 def keeper_of(pid: int) -> psutil.Process:
     found = psutil.Process(pid).parent()
     assert found is not None
-    assert "keeper.py" in " ".join(found.cmdline())
+    assert "reaper.py" in " ".join(found.cmdline())
     return found
 
 

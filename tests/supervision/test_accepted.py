@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process import forked
+from holdfast.actors.process.fork import forked_process
 
 
 class Item(hf.Message[None]):
@@ -155,7 +155,7 @@ async def test_nothing_stays_of_a_made_up_child_that_has_ended_but_what_it_said(
 
 
 async def test_a_process_takes_more_recorded_children_in_its_life_than_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(forked, "PAGE_BYTES", 8 * 8)  # six places
+    monkeypatch.setattr(forked_process, "PAGE_BYTES", 8 * 8)  # six places
     template = hf.child(None, hf.start(Leaver), recovery=hf.hybrid(), restart="temporary")
     async with hf.ActorSystem("app", log=False) as system:
         supervisor = await system.start(hf.dynamic("d", template=template, isolation="process"))

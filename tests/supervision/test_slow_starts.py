@@ -10,8 +10,8 @@ from typing import Any, Literal
 import pytest
 
 import holdfast as hf
+from holdfast.actors.deadline_thread import BLOCKED
 from holdfast.actors.events import LogLine
-from holdfast.actors.overdue import BLOCKED
 from holdfast.testing import idle
 from tests.supervision.blockers import Blocker
 from tests.supervision.family import Boom, refused

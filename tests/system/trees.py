@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import holdfast as hf
-from holdfast.actors.cell import Cell
+from holdfast.actors.kernel.cell import Cell
 from holdfast.supervision.supervisor import Supervisor
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors import loop
+from holdfast.actors.kernel import loop
 from holdfast.testing import POINTS, Faults, GuardedSystem, Probe, UnexpectedEnd, idle
 from holdfast.testing.damage import damaged
 from holdfast.testing.faults import InjectedCrash

@@ -296,7 +296,7 @@ def test_what_cannot_be_simulated_is_refused(wrong) -> None:
 
 
 def test_the_loop_has_its_own_functions_back() -> None:
-    from holdfast.actors import loop
+    from holdfast.actors.kernel import loop
 
     before = loop.run_turns, loop.clock, loop.MOST
     trace_of(0)

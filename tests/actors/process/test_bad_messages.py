@@ -9,8 +9,8 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.actors.codec import MAX_BYTES
 from holdfast.actors.events import DeadLetter
+from holdfast.actors.kernel.codec import MAX_BYTES
 from tests.actors.process.players import Account, Add, Fail, Note, Notebook, Notes, Run, Total, Worker
 from tests.actors.process.waiting import next_event
 

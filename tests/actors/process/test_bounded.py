@@ -16,8 +16,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import DeadLetter
-from holdfast.actors.mailbox import Bound
-from holdfast.checkpoint.bound import HomeBound
+from holdfast.actors.kernel.mailbox import Bound
+from holdfast.checkpoint.home.capacity import HomeBound
 from tests.actors.process.observers import Observer, Publish, Send
 from tests.actors.process.players import Add, Block, Note, Notes, Slow, Total, Worker
 from tests.actors.process.waiting import until

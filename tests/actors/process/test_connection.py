@@ -16,9 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import holdfast as hf
-from holdfast.actors.codec import MAX_BYTES
-from holdfast.actors.process import frames
-from holdfast.actors.process.connection import HIGH_BYTES, MAX_FRAME, READ_BYTES, BadFrame, Connection
+from holdfast.actors.kernel.codec import MAX_BYTES
+from holdfast.actors.process.wire import frames
+from holdfast.actors.process.wire.connection import HIGH_BYTES, MAX_FRAME, READ_BYTES, BadFrame, Connection
 
 LENGTH = struct.Struct("<I")
 SECONDS = 20.0

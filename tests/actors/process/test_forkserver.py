@@ -19,8 +19,8 @@ import psutil
 import pytest
 
 from holdfast.actors.errors import HoldfastError, ProcessUnavailable
-from holdfast.actors.process.forked import Forked
-from holdfast.actors.process.forkserver import ForkServer
+from holdfast.actors.process.fork.fork_server import ForkServer
+from holdfast.actors.process.fork.forked_process import Forked
 
 SECONDS = 30.0
 

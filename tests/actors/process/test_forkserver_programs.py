@@ -10,12 +10,12 @@ from pathlib import Path
 
 import pytest
 
-from holdfast.actors.process import forkserver
+from holdfast.actors.process.fork import fork_server
 from tests.actors.process.test_forkserver import CHILDREN, SECONDS, is_alive, wait_gone
 
 PROGRAM = """
 import asyncio, sys
-from holdfast.actors.process.forkserver import ForkServer
+from holdfast.actors.process.fork.fork_server import ForkServer
 
 class Account:
     pass
@@ -42,7 +42,7 @@ if __name__ == "__main__":
 
 def import_root() -> str:
     """The directory `holdfast` is imported from, whatever the way it got there."""
-    return str(Path(forkserver.__file__).parents[3])
+    return str(Path(fork_server.__file__).parents[3])
 
 
 def start_program(tmp_path: Path, *arguments: str, text: str = PROGRAM) -> subprocess.Popen[str]:

@@ -10,8 +10,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import LogLine
-from holdfast.actors.process import output
-from holdfast.actors.process.output import LONGEST, OutputReader
+from holdfast.actors.process.program import stdout
+from holdfast.actors.process.program.stdout import LONGEST, OutputReader
 from tests.actors.process.players import Run, Worker
 from tests.actors.process.waiting import next_event, until
 
@@ -105,7 +105,7 @@ async def test_the_end_of_the_pipe_is_the_end_of_the_reader() -> None:
 
 
 async def test_others_have_their_turn_between_the_lines_of_one_read(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output, "SLICE_SECONDS", 0.0)
+    monkeypatch.setattr(stdout, "SLICE_SECONDS", 0.0)
     loop = asyncio.get_running_loop()
     out, into = os.pipe2(os.O_CLOEXEC)
     os.set_blocking(out, False)

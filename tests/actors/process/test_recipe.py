@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process.recipe import loaded, pack_recipe, unpack_recipe
+from holdfast.actors.process.wire.start_codec import loaded, pack_recipe, unpack_recipe
 from holdfast.actors.values import UnsavableValue, encode_value
 from holdfast.supervision.spec import Flags
 from tests.actors.process.players import Account, Where
@@ -103,9 +103,9 @@ def test_a_name_that_is_no_actor_is_refused(name: str, why: str) -> None:
 
 
 def _renamed(name: str) -> Any:
-    from holdfast.actors.process import recipe
+    from holdfast.actors.process.wire import start_codec
 
-    return recipe._Packed(name, (1,), {})
+    return start_codec._Packed(name, (1,), {})
 
 
 def test_data_that_is_no_recipe_is_refused() -> None:

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process import forkserver
+from holdfast.actors.process.fork import fork_server
 from tests.actors.process.players import Account, Add, Total, Where
 from tests.actors.process.waiting import until
 
@@ -67,7 +67,7 @@ async def test_a_refusal_is_told_and_keeps_the_fork_server(
 
 
 async def test_a_fork_server_that_was_replaced_ends_with_the_system(monkeypatch: pytest.MonkeyPatch) -> None:
-    defaults = forkserver.ForkServer.__init__.__kwdefaults__
+    defaults = fork_server.ForkServer.__init__.__kwdefaults__
     assert defaults is not None
     monkeypatch.setitem(defaults, "fork_seconds", 1.0)
     async with hf.ActorSystem("app", log=False) as system:
@@ -92,7 +92,7 @@ async def test_what_cannot_be_received_is_tried_again_in_a_moment(
     first = await system.start(account("first"))
     await warmed_up(system)
     (server,) = servers()
-    refusing = Refusing(monkeypatch, forkserver, "receive", errno.ENOMEM)
+    refusing = Refusing(monkeypatch, fork_server, "receive", errno.ENOMEM)
     refusing.left = 4
     await system.start(account("second"))
     with pytest.raises(hf.StartFailed, match=os.strerror(errno.ENOMEM)):
@@ -113,7 +113,7 @@ async def test_the_death_of_a_fork_server_of_which_nothing_can_be_received(
     first = await system.start(account("first"))
     await warmed_up(system)
     (server,) = servers()
-    refusing = Refusing(monkeypatch, forkserver, "receive", errno.ENOMEM)
+    refusing = Refusing(monkeypatch, fork_server, "receive", errno.ENOMEM)
     refusing.left = times
     server.kill()
     await until(lambda: not refusing.left)

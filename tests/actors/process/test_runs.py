@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process.connection import LARGE_ARRAY, RUN_BYTES
+from holdfast.actors.process.wire.connection import LARGE_ARRAY, RUN_BYTES
 
 
 class Number(hf.Message[int]):

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.cell import Cell
-from holdfast.actors.process.connection import MOST_NAMES
+from holdfast.actors.kernel.cell import Cell
+from holdfast.actors.process.wire.connection import MOST_NAMES
 from tests.actors.process.waiting import SECONDS, next_event
 
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import holdfast as hf
-from holdfast.actors.process.remote import ProcessHost
+from holdfast.actors.process.process_host import ProcessHost
 
 SECONDS = 60.0
 

@@ -13,7 +13,7 @@ import pytest
 from msgpack import ExtType
 
 import holdfast as hf
-from holdfast.actors.codec import decode_array
+from holdfast.actors.kernel.codec import decode_array
 from holdfast.actors.values import DamagedValue, decode_value, encode_value
 from holdfast.actors.values.budget import TooMany, check_containers
 from holdfast.actors.values.forms import DATACLASS, HEAD

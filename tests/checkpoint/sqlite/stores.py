@@ -15,7 +15,7 @@ from holdfast.checkpoint.journal import (
     Saved,
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.sqlite.rows import crc_of
+from holdfast.checkpoint.sqlite.row_codec import crc_of
 
 A, B = "/app/bank/alice", "/app/bank/bob"
 
@@ -61,7 +61,7 @@ def flip(path: Path, bit: int) -> None:
 CHILD = """
 import os, random, signal, sys
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.sqlite.rows import crc_of
+from holdfast.checkpoint.sqlite.row_codec import crc_of
 path, what, seed = sys.argv[1], sys.argv[2], int(sys.argv[3])
 journal = SqliteJournal(path, synchronous="fsync" if seed % 2 else "os")
 print("open", journal.epoch, flush=True)

@@ -19,9 +19,9 @@ from hypothesis import strategies as st
 
 from holdfast.checkpoint.journal import DamagedStore, Entry, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.sqlite import store as sqlite_store
-from holdfast.checkpoint.sqlite.chains import Chain
-from holdfast.checkpoint.sqlite.claim import Claim
+from holdfast.checkpoint.sqlite import open_store as sqlite_store
+from holdfast.checkpoint.sqlite.entry_chains import Chain
+from holdfast.checkpoint.sqlite.ownership import Claim
 from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, made, numbers, reopened
 
 

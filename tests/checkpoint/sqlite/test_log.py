@@ -16,8 +16,8 @@ from typing import Any
 import pytest
 
 from holdfast.checkpoint.journal import DamagedStore, StaleEpoch, StoreFailed
-from holdfast.checkpoint.sqlite import SqliteJournal, log
-from holdfast.checkpoint.sqlite.log import FrontLog
+from holdfast.checkpoint.sqlite import SqliteJournal, append_log
+from holdfast.checkpoint.sqlite.append_log import FrontLog
 from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, made, numbers, reopened
 
 
@@ -77,17 +77,17 @@ def test_few_entries_go_to_the_log_and_then_in_order_to_the_database(path: Path)
         journal.append(inputs(1, B))  # Its address needs a row.
         journal.append([(A, ("in", 414, b"x" * 100_000))])
         assert rows(path) == 416
-        for start in range(415, 415 + 2 * log.MOST_ROWS):
+        for start in range(415, 415 + 2 * append_log.MOST_ROWS):
             journal.append(inputs(1, start=start))
-        assert rows(path) >= 416 + log.MOST_ROWS
+        assert rows(path) >= 416 + append_log.MOST_ROWS
         (file,) = logs(path)
-        assert file.stat().st_size < 100 * log.MOST_ROWS  # It is written over.
+        assert file.stat().st_size < 100 * append_log.MOST_ROWS  # It is written over.
         assert stat.S_IMODE(file.stat().st_mode) == 0o600
         assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
-        assert numbers(journal.load(A)) == list(range(415 + 2 * log.MOST_ROWS))
-        assert numbers(reopened(left(journal))) == list(range(415 + 2 * log.MOST_ROWS))
+        assert numbers(journal.load(A)) == list(range(415 + 2 * append_log.MOST_ROWS))
+        assert numbers(reopened(left(journal))) == list(range(415 + 2 * append_log.MOST_ROWS))
     assert logs(path) == []
-    assert numbers(reopened(path)) == list(range(415 + 2 * log.MOST_ROWS))
+    assert numbers(reopened(path)) == list(range(415 + 2 * append_log.MOST_ROWS))
 
 
 def test_what_a_killed_owner_had_in_the_log_is_there(killed: Path) -> None:
@@ -345,7 +345,7 @@ def test_the_log_goes_on_while_the_database_is_locked(store: SqliteJournal, path
     count = 1
     with closing(sqlite3.connect(path, isolation_level=None)) as rival:
         rival.execute("BEGIN IMMEDIATE")
-        for count in range(1, log.MOST_ROWS + 1):
+        for count in range(1, append_log.MOST_ROWS + 1):
             store.append(inputs(1, start=count))
         count += 1
         for refused in (lambda: store.append(inputs(1, start=count)), lambda: store.load(A)) * 2:
@@ -382,7 +382,7 @@ def test_an_append_that_is_broken_off_after_its_write_is_not_there_twice(
     store.append(inputs(1, start=2))
     write = FrontLog.write
 
-    def interrupted(front: FrontLog, rows: list[log.Row]) -> None:
+    def interrupted(front: FrontLog, rows: list[append_log.Row]) -> None:
         write(front, rows)
         del front.rows[-len(rows) :]
         raise KeyboardInterrupt
@@ -399,7 +399,7 @@ def test_an_append_that_is_broken_off_after_its_write_is_not_there_twice(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_any_mixture_comes_back_in_order(path: Path, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
-    monkeypatch.setattr(log, "MOST_ROWS", 9)
+    monkeypatch.setattr(append_log, "MOST_ROWS", 9)
     draw = random.Random(seed)
     journal = SqliteJournal(path)
     count = 0

@@ -22,7 +22,7 @@ from holdfast.checkpoint.journal import (
     StoreInUse,
 )
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.sqlite.rows import crc_of
+from holdfast.checkpoint.sqlite.row_codec import crc_of
 from tests.checkpoint.sqlite.stores import A, disown, edit, end, inputs, line, made, numbers, reopened, spawn
 
 

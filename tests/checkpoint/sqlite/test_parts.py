@@ -17,8 +17,8 @@ import pytest
 import holdfast as hf
 from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StoreFailed, StoreInUse
 from holdfast.checkpoint.sqlite import SqliteJournal
-from holdfast.checkpoint.sqlite.parts import NOTE
-from holdfast.checkpoint.sqlite.rows import crc_of
+from holdfast.checkpoint.sqlite.row_codec import crc_of
+from holdfast.checkpoint.sqlite.store_parts import NOTE
 from tests.checkpoint.players import Doer, Note, Seen
 from tests.checkpoint.sqlite.stores import A, disown, end, inputs, line, made, numbers, reopened, spawn
 

@@ -36,7 +36,7 @@ from holdfast.diagnosis.board import (
     SwitchChannel,
     WrongCurrent,
 )
-from holdfast.diagnosis.board import server as board_server
+from holdfast.diagnosis.board import tcp_server as board_server
 from holdfast.diagnosis.board.frames import HEAD, AskMeasurements, Decoder, Frame, Refused, Switch, encode
 from holdfast.testing import probe
 

@@ -3,9 +3,9 @@
 from typing import Any
 
 from holdfast.ftm.sec.certificates import Trust, issue, make_list, make_request, make_root, read_request
-from holdfast.ftm.sec.errors import Rejected
 from holdfast.ftm.sec.handshake import Participant
 from holdfast.ftm.sec.keys import SigningKey
+from holdfast.ftm.sec.sec_errors import Rejected
 from holdfast.ftm.sec.session import Session
 
 NOW = 1_800_000_000.0

@@ -15,9 +15,9 @@ from holdfast.ftm.sec.authority import (
     Revoke,
 )
 from holdfast.ftm.sec.certificates import Trust, make_request
-from holdfast.ftm.sec.errors import EnrolmentRefused, NoCertificate, Rejected
 from holdfast.ftm.sec.handshake import Participant
 from holdfast.ftm.sec.keys import SigningKey
+from holdfast.ftm.sec.sec_errors import EnrolmentRefused, NoCertificate, Rejected
 from tests.ftm.sec.parties import meet
 
 Authority = hf.ActorRef[CertificationAuthority]

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import pytest
 
 from holdfast.ftm.sec.certificates import Trust, issue, make_list, make_request, make_root, read_request
-from holdfast.ftm.sec.errors import Rejected
 from holdfast.ftm.sec.keys import SigningKey, raw_public
+from holdfast.ftm.sec.sec_errors import Rejected
 from tests.ftm.sec.parties import NOW, Office
 
 DAY = 86_400.0

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast.ftm.sec.certificates import Trust
-from holdfast.ftm.sec.errors import Rejected
 from holdfast.ftm.sec.handshake import AnswerBody, Hello, Participant, Signed
 from holdfast.ftm.sec.keys import SigningKey
+from holdfast.ftm.sec.sec_errors import Rejected
 from holdfast.ftm.sec.session import Limits
 from tests.ftm.sec.parties import Office, meet
 

@@ -16,8 +16,8 @@ from cryptography.hazmat.primitives.asymmetric.ec import SECP256R1, generate_pri
 
 from holdfast.actors.errors import UnsavableValue
 from holdfast.actors.values import encode_value
-from holdfast.ftm.sec.errors import UnsafeKeyFile
 from holdfast.ftm.sec.keys import SigningKey, is_signed, raw_public
+from holdfast.ftm.sec.sec_errors import UnsafeKeyFile
 from tests.ftm.sec.parties import Office, meet
 
 

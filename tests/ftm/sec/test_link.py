@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.bricks.sealed_frames import TELLS, Agree, Back, Call, Greet, LinkLost, Part, Refused, SecuredLink
 from holdfast.ftm.mechanisms.sec import SEC
-from holdfast.ftm.sealed import TELLS, Agree, Back, Call, Greet, LinkLost, Part, Refused, SecuredLink
 from holdfast.ftm.sec.authority import CertificationAuthority, GetRoot, Revoke
 from holdfast.ftm.sec.certificates import make_list
-from holdfast.ftm.sec.errors import Rejected
+from holdfast.ftm.sec.sec_errors import Rejected
 
 CA = "/app/ca"
 PROXY, REPLICA = "/app/c/ftm/proxy", "/app/c/ftm/r1"

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from holdfast.ftm.sec import session as sessions
-from holdfast.ftm.sec.errors import Rejected
+from holdfast.ftm.sec.sec_errors import Rejected
 from holdfast.ftm.sec.session import HEAD, LEAP, TAG_BYTES, Limits, Session, Window
 from tests.ftm.sec.parties import Office, meet
 

@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 
 import holdfast as hf
-from holdfast.actors.process import frames
-from holdfast.actors.process.connection import Connection
+from holdfast.actors.process.wire import frames
+from holdfast.actors.process.wire.connection import Connection
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.actors.process.hostile.players import Add, Evil, Ping, Victim
 

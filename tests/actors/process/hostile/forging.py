@@ -8,8 +8,8 @@ from typing import Any
 
 import msgspec
 
-from holdfast.actors.message import message_name
-from holdfast.actors.process import frames as f
+from holdfast.actors.kernel.message import message_name
+from holdfast.actors.process.wire import frames as f
 from tests.actors.process.hostile.players import LENGTH, Add, Anything
 
 VICTIM, OTHER, EVIL, SUP = "/app/sup/victim", "/app/sup/other", "/app/sup/evil", "/app/sup"

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import pytest
 
-from holdfast.actors.process import frames as f
+from holdfast.actors.process.wire import frames as f
 from tests.actors.process.hostile.conftest import World
 from tests.actors.process.hostile.corpus import corpus
 from tests.actors.process.hostile.forging import framed

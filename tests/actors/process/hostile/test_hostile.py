@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process import frames as f
+from holdfast.actors.process.wire import frames as f
 from tests.actors.process.hostile.conftest import World
 from tests.actors.process.hostile.forging import BREACHES, EVIL, HARMLESS, SUP, VICTIM, command, frame, note, raw, tell
 from tests.actors.process.hostile.players import Add, BeDeaf, Evil, Ping, SetPage, Victim, Write, WriteLater

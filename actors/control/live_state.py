@@ -1,0 +1,121 @@
+"""An actor's state as control sees it: a copy to look at, or to change and put back."""
+
+from __future__ import annotations
+
+import dataclasses
+import operator
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, cast
+
+from ..errors import ControlFailed, error_text, portable, type_name
+from ..values import UnsavableValue, decode_value, encode_value
+from ..values.classes import slots_of
+
+if TYPE_CHECKING:
+    from ..kernel.actor import Actor
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Opaque:
+    """Stands in a state for a value that cannot leave its process: a socket, a lock, a ref."""
+
+    text: str
+
+
+def live_state(actor: Actor) -> Any:
+    """The state itself: what `get_state()` gives if the class has it, else a dict of the key variables."""
+    get_state = getattr(actor, "get_state", None)
+    if get_state is not None:
+        return get_state()
+    root, names = actor._state_root(), actor.key_variables
+    if names is None:
+        return {name: value for name, value in attributes(root) if not name.startswith("_") and name != "ctx"}
+    return {name: operator.attrgetter(name)(root) for name in names}
+
+
+def attributes(root: object) -> list[tuple[str, Any]]:
+    """Names and values of the attributes of an object, also of one with slots."""
+    slots = [(name, getattr(root, name)) for name in slots_of(type(root)) if hasattr(root, name)]
+    return [*getattr(root, "__dict__", {}).items(), *slots]
+
+
+def _holder(root: object, path: str) -> tuple[Any, str]:
+    """What has the variable at a dotted path, and its name there."""
+    above, _, name = path.rpartition(".")
+    return operator.attrgetter(above)(root) if above else root, name
+
+
+def copied(state: Any, otherwise: Callable[[Any], Any]) -> Any:
+    """A copy of a state; `otherwise` says what becomes of a value that cannot be copied."""
+    try:
+        return decode_value(encode_value(state))
+    except UnsavableValue:
+        if type(state) is not dict:
+            return otherwise(state)
+    values: dict[str, Any] = {}
+    for name, value in cast("dict[str, Any]", state).items():
+        try:
+            values[name] = decode_value(encode_value(value))
+        except UnsavableValue:
+            values[name] = otherwise(value)
+    return values
+
+
+def state_to_show(actor: Actor) -> Any:
+    """A copy that can be sent anywhere."""
+    return copied(live_state(actor), lambda value: Opaque(portable(repr(value))))
+
+
+def state_to_change(actor: Actor) -> Any:
+    """A copy that can be put back: what cannot be copied is in it as it is."""
+    return copied(live_state(actor), lambda value: value)
+
+
+def put_state(actor: Actor, state: Any) -> None:
+    """Make `state` the actor's: through `set_state` if the class has `get_state`, else variable by variable.
+
+    Raises:
+        ControlFailed: it is no state of this actor. Anything else: the class's own code raised.
+    """
+    where = actor.ctx.path
+    if hasattr(actor, "get_state"):
+        set_state = getattr(actor, "set_state", None)
+        if set_state is None:
+            raise ControlFailed(where, "replace_state", f"{type_name(type(actor))} has get_state but no set_state")
+        set_state(state)
+        return
+    if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
+        raise ControlFailed(where, "replace_state", f"the state must be a dict of variables, not {state!r}")
+    root = actor._state_root()
+    for name in live_state(actor):
+        if name not in state:
+            delattr(*_holder(root, name))
+    for name, value in state.items():
+        setattr(*_holder(root, name), value)
+
+
+def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
+    """Put `change(state)` in the place of the state. If anything raises, the state is as before.
+
+    Raises:
+        ControlFailed: `change` raised, or what it returned is no state, or cannot be kept.
+    """
+    ctx = actor.ctx
+    ctx.may_replace()
+    kind, before = type(actor), dict(vars(actor))
+    hooked = state_to_change(actor) if hasattr(actor, "set_state") else None
+    values = None if hasattr(actor, "get_state") else live_state(actor)
+    try:
+        put_state(actor, change(state_to_change(actor)))
+        ctx.replaced()
+    except BaseException as error:
+        actor.__class__ = kind
+        vars(actor).clear()
+        vars(actor).update(before)
+        if values is not None:
+            put_state(actor, values)  # They may be another object's than the actor's.
+        if hooked is not None:
+            actor.set_state(hooked)  # type: ignore[attr-defined]  # it has one, see above
+        if not isinstance(error, Exception) or isinstance(error, ControlFailed):
+            raise
+        raise ControlFailed(ctx.path, "replace_state", f"{type_name(type(error))}: {error_text(error)}") from error

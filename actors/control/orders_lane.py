@@ -1,0 +1,184 @@
+"""Asks on the system lane: an order goes to an actor ahead of all messages, wherever it lives, and is answered."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from ..errors import ActorStopped, ControlFailed, HoldfastError, error_text, type_name
+from ..kernel.cell import GONE, Cell
+from ..kernel.envelope import Ask, Item
+from ..kernel.message import Message
+from ..process.wire import frames
+from ..process.wire.connection import BadFrame
+from ..process.wire.peer import Peer, RelayedAsk
+from ..values import decode_value, encode_value
+from .orders import ORDERS, Mark, Order, status_of
+
+if TYPE_CHECKING:
+    from ..process.worker_node import Guest
+
+
+class Ordered(Message[bytes]):
+    """Stands for an order in its ask: what comes over a border as the reply is a value, encoded."""
+
+
+ORDERED = Ordered()
+
+
+class OrderAsk(Ask, eq=False):
+    """The ask of an order, where it was given."""
+
+    call: Any = None  # what was sent to another process: it may have to be sent elsewhere
+
+    def answer(self, reply: object) -> None:
+        """The reply came from another process."""
+        try:
+            value = decode_value(reply, imports=False)  # type: ignore[arg-type]  # bytes: it is the reply of `Ordered`
+        except HoldfastError as error:
+            self.fail(error)
+        else:
+            self.give(value)
+
+    def give(self, value: object) -> None:
+        """The order was carried out in this very process."""
+        if not self.future.done():
+            self.future.set_result(value)
+
+
+class Call(Item):
+    """An order in the queue of its actor: a command, ahead of all messages (but for `Mark`)."""
+
+    __slots__ = ("ask", "order")
+    of_life = False
+
+    def __init__(self, ask: Ask, order: Order) -> None:
+        self.ask, self.order = ask, order
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        call: Call = item
+        ask, ctx = call.ask, actor.ctx
+        if ask.is_done or ask.deadline <= ctx.cell.node.loop.time():
+            return None  # Whoever gave it was told that it was not carried out.
+        if ctx.postpones(call):
+            return None
+        ask.started = True
+        try:
+            value = call.order.run(ctx.cell, actor)
+        except HoldfastError as error:
+            ask.fail(error)
+        except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.
+            ask.fail(ControlFailed(ctx.path, call.order.verb, f"{type_name(type(error))}: {error_text(error)}"))
+        else:
+            call.give(value)
+        return None
+
+    def give(self, value: object) -> None:
+        """Answer whoever waits."""
+        ask = self.ask
+        if isinstance(ask, OrderAsk):
+            ask.give(value)
+            return
+        try:
+            ask.answer(encode_value(value))
+        except HoldfastError as error:
+            ask.fail(error)
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        self.ask.undelivered(cell, reason)
+
+    @property
+    def is_urgent(self) -> bool:
+        """Whether it goes ahead of the messages."""
+        return type(self.order) is not Mark
+
+
+def order(cell: Cell, wanted: Order, timeout: float) -> asyncio.Future[Any]:
+    """Give an order to the actor at `cell`.
+
+    Returns:
+        A future of what comes of it; never without an outcome.
+
+    Raises (by the future):
+        ActorStopped: nobody lives there. AskTimeout: it was not carried out in time (`handled` False), or nobody
+        knows. AskFailed: the actor's process ended meanwhile. ControlFailed: it could not be carried out.
+
+    Raises (at once):
+        SpecError: the actor lives in another process, and the order cannot be sent there.
+    """
+    node = cell.node
+    future: asyncio.Future[Any] = node.loop.create_future()
+    living = cell if cell.state is not GONE else node.successor(cell)
+    if living is None or living.is_dead:
+        future.set_exception(ActorStopped(cell.path, "nobody lives there"))
+        return future
+    ask = OrderAsk(ORDERED, None, (), timeout, node.loop.time() + timeout, future, living)
+    node.deadlines.add(ask)
+    try:
+        living.host.control(living, Call(ask, wanted))
+    except BaseException:
+        future.cancel()
+        raise
+    return future
+
+
+def send_call(peer: Peer, path: str, call: Call) -> None:
+    """Give the order to the actor at `path` on the other side of a connection.
+
+    Raises:
+        SpecError: it cannot be sent.
+    """
+    data = encode_value(call.order.pack(path), where=f"{call.order.verb} of {path}")
+    if isinstance(call.ask, OrderAsk):
+        call.ask.call = call
+    _send(peer, path, call.ask, call.order.verb, data)
+
+
+def _send(peer: Peer, path: str, ask: Ask, verb: str, data: bytes) -> None:
+    left = ask.deadline - peer.node.loop.time()
+    key = peer.expect(ask)
+    connection = peer.connection
+    fields = {"id": key, "order": verb, "data": data, "left": left}
+    connection.send(frames.Command(connection.name_out(path), "control", fields), path)
+    ask.started = True  # From here on we cannot know.
+
+
+def ask_status(peer: Peer, cell: Cell, timeout: float) -> asyncio.Future[Any]:
+    """The status that the process of an actor gives of it."""
+    node = cell.node
+    future: asyncio.Future[Any] = node.loop.create_future()
+    ask = OrderAsk(ORDERED, None, (), timeout, node.loop.time() + timeout, future, cell)
+    node.deadlines.add(ask)
+    _send(peer, cell.path, ask, "status", encode_value({}))
+    return future
+
+
+def obey_order(guest: Guest, cell: Cell, frame: frames.Command) -> None:
+    """Do what the root orders of an actor in this process.
+
+    Raises:
+        BadFrame: it is no such order.
+    """
+    data = frame.data
+    key, verb, body, left = data.get("id"), data.get("order"), data.get("data"), data.get("left")
+    if not isinstance(key, int) or not isinstance(body, bytes) or not isinstance(left, (int, float)):
+        raise BadFrame(f"order {verb!r} is no order")
+    deadline = guest.node.loop.time() + left
+    ask = RelayedAsk(ORDERED, None, (), left, deadline, None, cell, False, guest, key)
+    if cell.is_dead:
+        ask.fail(ActorStopped(cell.path, "nobody lives there"))
+        return
+    if verb == "status":
+        ask.answer(encode_value(status_of(cell)))
+        return
+    kind = ORDERS.get(str(verb))
+    if kind is None:
+        raise BadFrame(f"unknown order {verb!r}")
+    try:
+        fields: Any = decode_value(body)
+        call = Call(ask, kind.unpack(fields))
+    except HoldfastError as error:
+        ask.fail(error)
+        return
+    cell.host.control(cell, call)

@@ -1,0 +1,273 @@
+"""The actor class: state, handlers and hooks, as a user writes them."""
+
+from __future__ import annotations
+
+import inspect
+import typing
+from collections.abc import Callable, Coroutine, Iterable
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Protocol, TypeVar, cast, overload
+
+import msgspec
+
+from ..errors import type_name
+from ..safe_state import SafeStateChange, watch
+from .bindings import Binding
+from .envelope import Table
+from .message import Message
+from .threads import in_thread
+
+if TYPE_CHECKING:
+    from ..exit_reasons import ExitReason
+    from .context import ActorContext
+    from .envelope import ReplyHandle
+    from .ref import ActorRef
+
+R = TypeVar("R")
+S = TypeVar("S")
+M = TypeVar("M", bound=Message[Any])
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+class _On(Protocol[R]):
+    """What `@on(M)` accepts: a method that takes the message and gives its reply, now, later, or by a handle."""
+
+    @overload
+    def __call__(
+        self, handler: Callable[[S, M], Coroutine[Any, Any, R | ReplyHandle[R]]]
+    ) -> Callable[[S, M], Coroutine[Any, Any, R | ReplyHandle[R]]]: ...
+    @overload
+    def __call__(self, handler: Callable[[S, M], R | ReplyHandle[R]]) -> Callable[[S, M], R | ReplyHandle[R]]: ...
+
+
+class Handles(typing.NamedTuple):
+    """What `@on` notes on a method."""
+
+    kind: type[Message[Any]]
+    readonly: bool
+    to_thread: bool
+    supersedes: str | bool | Callable[[Any], Any] | None = None
+
+
+def on(
+    kind: type[Message[R]],
+    *,
+    readonly: bool = False,
+    to_thread: bool = False,
+    supersedes: str | Literal[True] | Callable[[Any], Any] | None = None,
+) -> _On[R]:
+    """Make a method the handler of one message type (and of types derived from it that have none of their own).
+
+    Args:
+        kind: the message class; the method's return type must be the reply it declares.
+        readonly: the handler changes no state, so a replay may leave it out.
+        to_thread: the handler, a plain `def`, blocks: it is run in a worker thread. The actor handles nothing else
+            meanwhile. In it, `self.ctx` and refs' `tell` work, and what has to be awaited does not.
+        supersedes: the handler overwrites all that it wrote for an earlier message with the same key, and reads
+            nothing: the latest wins. A replay may leave the earlier ones out. The key is the field of this name, what
+            a function makes of the message, or (True) the same for all messages of this type.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Message)):
+        raise TypeError(f"@on takes a Message class, not {kind!r}")
+    if isinstance(supersedes, str):
+        if supersedes not in kind.__struct_fields__:
+            raise TypeError(f"@on({kind.__name__}, supersedes={supersedes!r}): {kind.__name__} has no such field")
+    elif supersedes is not None and supersedes is not True and not callable(supersedes):
+        raise TypeError(f"@on({kind.__name__}): supersedes is a field, a function or True, not {supersedes!r}")
+    if readonly and supersedes is not None:
+        raise TypeError(f"@on({kind.__name__}): a readonly handler writes nothing, so it supersedes nothing")
+
+    def mark(handler: Any) -> Any:
+        handler.__handles__ = (*getattr(handler, "__handles__", ()), Handles(kind, readonly, to_thread, supersedes))
+        return handler
+
+    return cast("_On[R]", mark)
+
+
+def subscribe(topic: str) -> Callable[[F], F]:
+    """Subscribe the actor to a topic from its start; goes above `@on` on a handler of that topic's messages."""
+    if not topic.startswith("/"):
+        raise ValueError(f"topic {topic!r} must start with '/'")
+
+    def mark(handler: F) -> F:
+        cast("Any", handler).__topics__ = (*getattr(handler, "__topics__", ()), topic)
+        return handler
+
+    return mark
+
+
+class Actor:
+    """Base of all actors: one message at a time, state in attributes.
+
+    `ctx` is there before `__init__` runs. Construct in `__init__`, act in `on_start`: an actor that is restored runs
+    `__init__` again.
+    """
+
+    ctx: ActorContext
+
+    deterministic: ClassVar[bool] = True
+    """False refuses recovery methods that replay messages."""
+    key_variables: ClassVar[tuple[str, ...] | None] = None
+    """What a snapshot saves; None saves every instance attribute without a leading underscore."""
+    schema_version: ClassVar[int] = 1
+    """Raise it when the saved state changes its shape."""
+    formerly: ClassVar[tuple[str, ...]] = ()
+    """Classes, as "module:Class", whose records this one takes over: its own earlier names, or what it replaces."""
+
+    _keeps_promises: ClassVar[bool] = False
+    """Whether its reply handles belong to the address: the next life answers, or whatever `node.kept` has of it."""
+    _table: ClassVar[Table] = Table()
+    _declared: ClassVar[dict[type, Handles]] = {}
+    _topics: ClassVar[tuple[str, ...]] = ()
+    _bindings: ClassVar[frozenset[str]] = frozenset()
+    _is_part: ClassVar[bool] = False
+    """Whether it is a part of the runtime: from another process only who was granted its address speaks to it."""
+
+    @classmethod
+    def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
+        """Addresses to which an actor that begins so may give orders from its process, besides what it starts."""
+        return ()
+
+    @classmethod
+    def _speaks_for(cls, start: Start[Any]) -> tuple[str, ...]:
+        """Addresses besides its own of which an actor that begins so may tell events from its process."""
+        return ()
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if inspect.iscoroutinefunction(cls.__init__):
+            raise TypeError(f"{type_name(cls)}.__init__ cannot be async: what has to be awaited goes into on_start")
+        table, declared, topics = Table(), dict[type, Handles](), list[str]()
+        members = dict[str, Any]()
+        for one in reversed(cls.__mro__):
+            members.update(vars(one))
+        for name in sorted(members):
+            handler = members[name]
+            for handles in getattr(handler, "__handles__", ()):
+                if not any(vars(one).get(name) is handler for one in cls.__mro__[1:] if issubclass(one, Actor)):
+                    _check(cls, name, handler, handles.kind)  # Else it was when the base was made; this is slow.
+                if handles.kind in table:
+                    raise TypeError(f"{type_name(cls)} has two handlers for {type_name(handles.kind)}: see {name}")
+                table[handles.kind] = in_thread(handler) if handles.to_thread else handler
+                declared[handles.kind] = handles
+            if getattr(handler, "__topics__", ()) and not getattr(handler, "__handles__", ()):
+                raise TypeError(f"{type_name(cls)}.{name} has @subscribe without @on: nothing would ever reach it")
+            topics.extend(getattr(handler, "__topics__", ()))
+        _check_state(cls)
+        cls._table, cls._declared, cls._topics = table, declared, tuple(topics)
+        cls._bindings = cls._bindings | _declared_bindings(cls)
+
+    def on_start(self, restored: bool) -> Any:
+        """Called first at each life, `restored` says whether state came back; may be async. Turn 0."""
+
+    def on_stop(self, reason: ExitReason) -> Any:
+        """Called last, at every end in good order and after a crash; may be async.
+
+        Not called when the life is killed, when its start failed, or when an EXIT ends it that it does not trap. If it
+        returns an exit reason, that becomes the life's own; if it raises, so does the crash, unless there was one.
+        """
+
+    def on_exit(self, source: ActorRef[Any], reason: ExitReason) -> Any:
+        """A linked actor ended, and this one traps exits (`ctx.trap_exits`)."""
+
+    def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> Any:
+        """A monitored life, or a watched address, ended."""
+
+    def on_undelivered(self, message: Message[Any]) -> Any:
+        """A queued message that will not be handled, because the actor stops; without this it is a dead letter."""
+
+    def on_safe_state(self, entered: bool) -> Any:
+        """An actor whose recovery method names this one begins to be recovered (True), or is back (False).
+
+        May be async. Of several recoveries at a time it hears once: of the first beginning, and of the last end.
+        """
+
+    @on(SafeStateChange)
+    def _on_safe_state(self, message: SafeStateChange) -> Any:
+        """An ordinary message, in its place, and journaled if we are recorded."""
+        watch(self.ctx.cell, message)
+        return self.on_safe_state(message.entered)
+
+    def on_recovered(self) -> Any:
+        """State and messages are back; called before new messages are let in."""
+
+    def _state_root(self) -> Any:
+        """Whose attributes the key variables are."""
+        return self
+
+    def _outside(self) -> Iterable[Coroutine[Any, Any, Any]]:
+        """What it does outside its turns, and waits."""
+        return ()
+
+    def _is_starting(self) -> bool:
+        """Whether the start goes on though `on_start` has returned; the end of it is `lives.came_up`."""
+        return False
+
+    async def _stop_children(self) -> None:
+        """The life ends: its children go first, newest first."""
+        for child in reversed(list((self.ctx.cell.children or {}).values())):
+            await child.node.stop_child(child)
+
+
+def _check(cls: type, name: str, handler: Any, kind: type) -> None:
+    """Refuse a handler whose message annotation contradicts `@on`, when the class is made."""
+    if any(handles.to_thread for handles in handler.__handles__) and inspect.iscoroutinefunction(handler):
+        raise TypeError(f"{type_name(cls)}.{name} is `async def`: to_thread is for handlers that block")
+    parameters = list(inspect.signature(handler).parameters.values())
+    if len(parameters) != 2:
+        raise TypeError(f"{type_name(cls)}.{name} must take self and the message, nothing else")
+    try:
+        declared = typing.get_type_hints(handler).get(parameters[1].name)
+    except NameError:  # A name that is only imported for checking, or defined further down.
+        return
+    if isinstance(declared, type) and declared is not Any and not issubclass(kind, declared):
+        raise TypeError(f"{type_name(cls)}.{name} is @on({kind.__name__}) but takes a {declared.__name__}")
+
+
+def _check_state(cls: type[Actor]) -> None:
+    """Refuse what cannot say which variables are saved, when the class is made."""
+    names = cast("Any", cls.key_variables)
+    if names is not None and (isinstance(names, str) or not all(isinstance(name, str) for name in names)):
+        raise TypeError(f"{type_name(cls)}.key_variables must be names, such as ('goal', 'pose.x'), not {names!r}")
+    if not isinstance(cls.schema_version, int) or isinstance(cls.schema_version, bool):
+        raise TypeError(f"{type_name(cls)}.schema_version must be a whole number, not {cls.schema_version!r}")
+
+
+def _declared_bindings(cls: type) -> frozenset[str]:
+    """Make `name: Binding[X]` in the class body a port; returns the names."""
+    names: set[str] = set()
+    for name, declared in vars(cls).get("__annotations__", {}).items():
+        text = declared if isinstance(declared, str) else getattr(declared, "__qualname__", "")
+        origin = typing.get_origin(declared) or declared
+        if origin is Binding or text.split("[")[0].rpartition(".")[2] == "Binding":
+            port: Binding[Any] = Binding()
+            port.__set_name__(cls, name)
+            setattr(cls, name, port)
+            names.add(name)
+    return frozenset(names)
+
+
+class Start(msgspec.Struct, Generic[S], frozen=True):
+    """A recipe for a new actor: class and arguments, never a live object. Made by `start`."""
+
+    kind: type[S]
+    args: tuple[Any, ...] = ()
+    kwargs: dict[str, Any] = {}
+
+    def check(self) -> None:
+        """Raise TypeError if the arguments do not fit the class."""
+        inspect.signature(self.kind).bind(*self.args, **self.kwargs)
+
+
+P = typing.ParamSpec("P")
+A = TypeVar("A", bound=Actor)
+
+
+def start(kind: Callable[P, A], *args: P.args, **kwargs: P.kwargs) -> Start[A]:
+    """A recipe for an actor: `start(Account, 100)`. Typed like the class's `__init__`; nothing runs yet.
+
+    Raises:
+        TypeError: `kind` is no Actor class. (Arguments are checked where a child spec is made of it.)
+    """
+    if not (isinstance(kind, type) and issubclass(kind, Actor)):
+        raise TypeError(f"start takes an Actor class, not {kind!r}")
+    return Start(cast("type[A]", kind), args, kwargs)

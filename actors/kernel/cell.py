@@ -1,0 +1,390 @@
+"""The cell: one address's place in this process. Its mailbox outlives every life at the address."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+from ..errors import ActorStopped, UnknownMessage, type_name
+from ..exit_reasons import SHUTDOWN, ExitReason
+from . import mailbox
+from .envelope import AnyTable, Ask, Item, Table
+from .message import Message, Order, require_message
+from .ref import ActorRef
+
+if TYPE_CHECKING:
+    from ..control.orders_lane import Call
+    from ..control.tracing import Tap
+    from ..errors import StartFailed
+    from .actor import Actor, Start
+    from .context import ActorContext
+    from .loop import Suspended
+    from .mailbox import Bound
+    from .node import Node
+
+Admit = Callable[["Cell", Any], None]
+
+# What a cell may be in. Only a running cell is ever on the run queue for user messages.
+DOWN = "down"  # between two lives, or before the first: the queue is kept
+RUNNING = "running"
+ENDING = "ending"  # hooks and children are being wound down
+GONE = "gone"  # for good: the address is free
+
+ANY = AnyTable()
+
+
+class Host(Protocol):
+    """Where and how the lives at an address are lived: in this process, in another one, recorded or not."""
+
+    @property
+    def takes_parcels(self) -> bool:
+        """Whether messages that came encoded are passed on as they are."""
+        ...
+
+    def start(self, cell: Cell) -> asyncio.Future[None] | None:
+        """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
+        ...
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        """Ask the life to end in good order."""
+        ...
+
+    def kill(self, cell: Cell) -> None:
+        """End the life at once."""
+        ...
+
+    def retired(self, cell: Cell) -> None:
+        """The address is gone for good; called before its queue is drained."""
+        ...
+
+    def push(self, cell: Cell, item: Item) -> None:
+        """Put an item of the runtime's own in its place behind the messages."""
+        ...
+
+    def progress(self, cell: Cell) -> object:
+        """How far the start that is under way has come: it is another value when it has come further, and while it
+        waits for somebody else. None: it has no steps."""
+        ...
+
+    def recovers(self, reason: ExitReason) -> bool:
+        """Whether a life that ended for this reason is brought back with its state."""
+        ...
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        """Admit a message for a sender that waits until it is accepted. None: it is."""
+        ...
+
+    def control(self, cell: Cell, call: Call) -> None:
+        """Have an order carried out between two turns of the actor, ahead of all messages."""
+        ...
+
+    def is_up(self, cell: Cell) -> bool:
+        """Whether a life takes messages now: it has started, and is not being recovered."""
+        ...
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
+        ...
+
+    def backlog(self, cell: Cell) -> int:
+        """Messages that wait, as far as is known in this process."""
+        ...
+
+    def load(self, cell: Cell) -> int:
+        """Messages that wait and those in hand, as far as is known in this process; cheap, for it may be a guess."""
+        ...
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """A link or monitor at this cell was made or removed: its actor's own process has to know."""
+        ...
+
+
+class More:
+    """What only some cells have; made when first needed, so that an idle actor stays small.
+
+    So are the collections in it: most supervised actors never have any of them.
+    """
+
+    __slots__ = (
+        "bindings",
+        "bound",
+        "calls",
+        "enders",
+        "has_ties",
+        "last",
+        "links",
+        "monitors",
+        "names",
+        "outlet",
+        "reason",
+        "start",
+        "start_error",
+        "starting",
+        "stash",
+        "suspended",
+        "tap",
+        "tasks",
+        "timers",
+        "topics",
+        "trap_exits",
+        "turn",
+        "urgent",
+        "watching",
+    )
+
+    bindings: dict[str, Cell]
+    calls: list[Call]  # control that waits for the actor's process to be up
+    links: dict[Cell, None]
+    monitors: list[Any]  # who watches us (links.Monitor)
+    names: list[str]
+    tasks: set[asyncio.Task[Any]]
+    timers: set[Any]
+    topics: set[str]
+    watching: dict[Any, None]  # whom we watch (links.Monitor)
+
+    def __init__(self) -> None:
+        self.bound: Bound | None = None
+        self.enders: list[asyncio.Future[ExitReason]] | None = None
+        self.has_ties = False  # whether any of the collections was made
+        self.last: Actor | None = None  # the actor of the ended life, if it wants what stays undelivered
+        self.outlet: Any = None  # what messages go through: the way into another process, or the actor's home
+        self.reason: ExitReason = SHUTDOWN
+        self.start: Start[Any] | None = None
+        self.start_error: StartFailed | None = None  # why `on_start` of this life failed; told when it has ended
+        self.starting: asyncio.Future[None] | None = None  # whoever waits for `on_start` of this life waits for it
+        self.stash: deque[Any] | None = None
+        self.suspended = False
+        self.tap: Tap | None = None  # whoever counts or follows what the actor does
+        self.trap_exits = False
+        self.turn: Suspended | None = None
+        self.urgent: deque[Item] | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        """A collection is asked for the first time. (Python calls this for an empty slot only.)"""
+        make = _COLLECTIONS.get(name)
+        if make is None:
+            raise AttributeError(name)
+        made = make()
+        self.has_ties = True
+        setattr(self, name, made)
+        return made
+
+
+_COLLECTIONS: dict[str, Callable[[], Any]] = {
+    "bindings": dict,
+    "calls": list,
+    "links": dict,
+    "monitors": list,
+    "names": list,
+    "tasks": set,
+    "timers": set,
+    "topics": set,
+    "watching": dict,
+}
+
+
+class _Hot:
+    """What every message touches: the slots of one class lie side by side, and memory is read in lines."""
+
+    __slots__ = ("actor", "admit", "context", "item", "node", "queue", "scheduled", "table")
+
+    actor: Actor | None
+    admit: Admit
+    context: contextvars.Context | None
+    item: Any
+    node: Node
+    queue: deque[Any] | None
+    scheduled: bool
+    table: Table
+
+
+class Cell(_Hot):
+    """One address: its queue, the life that is lived there now, and its place in the tree."""
+
+    __slots__ = ("__weakref__", "children", "ctx", "host", "life", "more", "name", "parent", "spec", "state")
+
+    def __init__(self, node: Node, parent: Cell | None, name: str, host: Host) -> None:
+        self.node = node
+        self.parent = parent
+        self.name = name
+        self.host = host
+        self.admit = mailbox.admit_first
+        self.table = ANY
+        self.queue = None
+        self.item = None  # what is being handled, or was last
+        self.scheduled = True  # Nothing runs before the first life begins: messages wait in the queue.
+        self.state = DOWN
+        self.life = 0
+        self.actor = None
+        self.ctx: ActorContext | None = None
+        self.context = None
+        self.children: dict[str, Cell] | None = None
+        self.more: More | None = None
+        self.spec: Any = None  # the supervisor's child spec; None: nobody restarts this actor
+
+    @property
+    def path(self) -> str:
+        """The address in full."""
+        parent = self.parent
+        return self.name if parent is None else f"{parent.path}/{self.name}"
+
+    @property
+    def ref(self) -> ActorRef[Any]:
+        """A handle on this address."""
+        return ActorRef(self)
+
+    @property
+    def is_dead(self) -> bool:
+        """Nobody lives here and nobody will be restarted here."""
+        return self.state is GONE or (self.state is DOWN and self.spec is None)
+
+    def extra(self) -> More:
+        """The rarely needed part, made now if it was not."""
+        if self.more is None:
+            self.more = More()
+        return self.more
+
+    # -- sending to this address ------------------------------------------------------------------------------------
+
+    def require(self, message: Message[Any]) -> None:
+        """Refuse what no handler is there for.
+
+        Raises:
+            UnknownMessage: the class is known and handles nothing of this type. BadMessage: this is no message.
+            NotGranted: it is an order, and this process may give none there.
+        """
+        if isinstance(message, Order) and self.node.uplink is not None:
+            self.node.uplink.require_granted(self.path, type_name(type(message)))
+        if not self.table.knows(type(message)):
+            require_message(self.path, message)
+            raise UnknownMessage(self.path, type_name(type(message)))
+
+    def push(self, item: Item) -> None:
+        """Put an item of the runtime's own at the end of the queue: no bound, no type check."""
+        if self.state is GONE:
+            item.undelivered(self, "stopped")
+        else:
+            self.host.push(self, item)
+
+    def urge(self, item: Item) -> None:
+        """Put a command ahead of all messages; commands keep their order among themselves.
+
+        Between two turns only: what is left to do after a turn that was killed or raised comes first.
+        """
+        if self.state is GONE:
+            item.undelivered(self, "stopped")
+            return
+        more = self.extra()
+        if more.urgent is None:
+            more.urgent = deque()
+        more.urgent.append(item)
+        queue = mailbox.queue_of(self)
+        front = queue[0] if queue else None
+        if isinstance(front, Item) and front.ends_turn:
+            queue[0] = NEXT_URGENT
+            queue.appendleft(front)
+        else:
+            queue.appendleft(NEXT_URGENT)
+        self.schedule()
+
+    def schedule(self) -> None:
+        """See to it that the run loop looks at the queue."""
+        if not self.scheduled:
+            self.scheduled = True
+            self.node.make_ready(self)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now, wherever and however the actor lives; nobody begins to wait.
+
+        Only a mailbox whose policy is to wait, a journal at its limit and a process that does not keep up say no.
+        """
+        more = self.more
+        if more is None:
+            return True
+        if more.outlet is not None and not more.outlet.has_room:
+            return False
+        return more.bound is None or more.bound.has_room(self)
+
+    def room(self) -> asyncio.Future[None] | None:
+        """None when a message would be taken now; else a future that ends when it is worth trying again.
+
+        Raises:
+            ActorStopped: the address has ended for good.
+        """
+        if self.state is GONE:
+            successor = self.node.successor(self)
+            if successor is None:
+                raise ActorStopped(self.path)
+            return successor.room()
+        more = self.more
+        if more is None:
+            return None
+        if self.admit is mailbox.admit_closing:
+            raise ActorStopped(self.path, "it is stopping")
+        if more.outlet is not None and (wait := more.outlet.room()) is not None:
+            return wait  # type: ignore[no-any-return]
+        return more.bound.room(self) if more.bound is not None else None
+
+    # -- life cycle, asked for from outside -------------------------------------------------------------------------
+
+    def request_stop(self, reason: ExitReason = SHUTDOWN) -> None:
+        """Ask for an end in good order; on a cell that is down or ending it changes nothing."""
+        self.host.stop(self, reason)
+
+    def kill(self) -> None:
+        """End the life at once, without hooks."""
+        self.host.kill(self)
+
+    def ended(self) -> asyncio.Future[ExitReason]:
+        """A future of the reason with which the present life ends; done already when there is none."""
+        future: asyncio.Future[ExitReason] = self.node.loop.create_future()
+        if self.state in (DOWN, GONE):
+            future.set_result(self.more.reason if self.more is not None else SHUTDOWN)
+        else:
+            more = self.extra()
+            if more.enders is None:
+                more.enders = []
+            more.enders.append(future)
+        return future
+
+    # -- the fate of what is left -----------------------------------------------------------------------------------
+
+    def stopped_error(self, reason: str) -> ActorStopped:
+        """What an asker gets whose message was never run."""
+        return ActorStopped(self.path, reason)
+
+    def undelivered(self, message: Message[Any], reason: str) -> None:
+        """A message that will not be handled: offered to `on_undelivered`, else a dead letter."""
+        last = self.more.last if self.more is not None else None
+        if last is None:
+            self.node.dead_letter(self, message, reason)
+            return
+        try:
+            last.on_undelivered(message)
+        except BaseException as error:
+            self.node.dead_letter(self, message, f"{reason}; on_undelivered raised {type_name(type(error))}: {error}")
+
+    def __repr__(self) -> str:
+        return f"<Cell {self.path} {self.state} life {self.life}>"
+
+
+class _NextUrgent(Item):
+    """Stands at the front of a queue for the next command in `more.urgent`."""
+
+    __slots__ = ()
+    is_command = True
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        more: More | None = actor.ctx.cell.more
+        if more is None or not more.urgent:
+            return None
+        command = more.urgent.popleft()
+        return command.run(actor, command)
+
+
+NEXT_URGENT = _NextUrgent()

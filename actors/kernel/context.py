@@ -1,0 +1,495 @@
+"""`self.ctx`: what an actor may do besides handling messages. One per life."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import uuid
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from contextvars import ContextVar, copy_context
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
+
+from ..errors import ActorStopped, AskDeadlock, HoldfastError, remote_crash
+from ..exit_reasons import NORMAL, ExitReason
+from . import links, mailbox
+from .envelope import Ask, Chain, Envelope, Item, ReplyHandle
+from .links import Monitor
+from .message import Message, require_message
+from .timers import Timer
+from .topics import NOT_TAKEN, publish
+
+if TYPE_CHECKING:
+    from .actor import Actor, Start
+    from .cell import Cell
+    from .ref import ActorRef
+
+A = TypeVar("A", bound="Actor")
+T = TypeVar("T")
+R = TypeVar("R")
+
+begun_in: ContextVar[Any] = ContextVar("begun_in", default=None)
+"""In a background task: what was being handled when it was created. That turn may wait for it, a later one does not."""
+
+
+class StashError(HoldfastError, text="{why}"):
+    """Only a message can be stashed, once per turn."""
+
+    why: str
+
+
+class ActorContext:
+    """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
+
+    __slots__ = ("_asking", "_promised", "_random", "_turn", "cell", "closed")
+
+    may_fail_fast: ClassVar[bool] = True
+    """Whether an ask may end by what the receiver happens to be doing; a replay could not repeat that."""
+
+    def __init__(self, cell: Cell) -> None:
+        self.cell = cell
+        self.closed = False
+        self._asking: Any = None
+        self._turn = 0
+        self._random: random.Random | None = None
+        self._promised: list[Ask] | None = None  # asks that may be answered later
+
+    # -- who, when --------------------------------------------------------------------------------------------------
+
+    @property
+    def item(self) -> Any:
+        """What is being handled, or was last; it stands in the cell, so that most turns need not touch this object."""
+        return None if self.closed else self.cell.item
+
+    @property
+    def ref(self) -> ActorRef[Any]:
+        """A ref to this actor."""
+        return self.cell.ref
+
+    @property
+    def path(self) -> str:
+        """This actor's address."""
+        return self.cell.path
+
+    @property
+    def life(self) -> int:
+        """The number of this life at the address, from 1."""
+        return self.cell.life
+
+    @property
+    def sender(self) -> ActorRef[Any] | None:
+        """Who sent the message in hand; None if it was no actor."""
+        sender = getattr(self.item, "sender", None)
+        return None if sender is None else cast("Cell", sender).ref
+
+    def now(self) -> float:
+        """Unix time in seconds; in a journaled actor, that of the input in hand."""
+        return self.cell.node.wall()
+
+    @property
+    def random(self) -> random.Random:
+        """A random generator; in a journaled actor the same numbers come again under replay."""
+        if self._random is None:
+            self._random = random.Random(self.cell.node.seed())
+        return self._random
+
+    def uuid(self) -> uuid.UUID:
+        """A new random UUID, drawn from `random`."""
+        return uuid.UUID(int=self.random.getrandbits(128), version=4)
+
+    # -- sending (called by ActorRef for sends inside a turn) -------------------------------------------------------
+
+    def tell(self, cell: Cell, message: Message[Any]) -> None:
+        """Send from this actor: the receiver sees the sender."""
+        self._alive()
+        if type(message) not in cell.table:
+            cell.require(message)
+        cell.admit(cell, Envelope(message, self.cell))
+
+    async def send(self, cell: Cell, message: Message[Any]) -> None:
+        """Send and wait until it is accepted. Nobody waits for room at itself: that raises MailboxFull, as a tell."""
+        self._alive()
+        while cell is not self.cell and (room := cell.room()) is not None:
+            await room
+            self._alive()
+        if type(message) not in cell.table:
+            cell.require(message)
+        accepted = cell.host.offer(cell, Envelope(message, self.cell))
+        if accepted is not None:
+            await accepted
+
+    def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
+        """Ask from this actor: the chain of waiting turns goes along, so that a circle is refused at once."""
+        self._alive()
+        if type(message) not in cell.table:
+            cell.require(message)
+        node = self.cell.node
+        future: asyncio.Future[R] = node.loop.create_future()
+        chain = self.chain()
+        if waits_for(self, cell, chain):
+            future.set_exception(AskDeadlock(cell.path, tuple(path for path, _ in chain)))
+            return future
+        ask = Ask(message, self.cell, chain, timeout, node.loop.time() + timeout, future, cell)
+        node.deadlines.add(ask)
+        try:
+            cell.admit(cell, ask)
+        except BaseException:
+            future.cancel()
+            raise
+        return future
+
+    def chain(self) -> Chain:
+        """This turn, and those that wait for it; nothing in a background task whose turn is over."""
+        if self.is_left_behind():
+            return ()
+        if self._asking is not self.item:
+            self._asking = self.item
+            self._turn = self.cell.node.next_turn()
+        return ((self.path, self._turn), *getattr(self.item, "chain", ()))
+
+    def turn_in(self, chain: Chain) -> bool:
+        """Whether this actor's suspended turn is one of those in the chain."""
+        more = self.cell.more
+        if more is None or more.turn is None:  # Its last turn has ended: nobody waits here.
+            return False
+        return self._asking is self.item and (self.path, self._turn) in chain
+
+    def is_left_behind(self) -> bool:
+        """Whether a background task asks, and something else than in its turn is being handled now."""
+        begun = begun_in.get()
+        return begun is not None and begun is not self.item
+
+    def in_turn(self) -> bool:
+        """Whether a turn of this actor runs, seen from its own code: from a background task it may be idle."""
+        more = self.cell.more
+        return (more is not None and more.turn is not None) or self.cell.node.is_stepping()
+
+    def _alive(self) -> None:
+        if self.closed:
+            raise ActorStopped(self.path, "this life is over; its leftovers may not send")
+
+    def forward(self, to: ActorRef[Any]) -> None:
+        """Hand the message in hand on: the receiver sees the original sender, and its reply goes to the asker."""
+        self._alive()
+        item = self.item
+        if isinstance(item, Ask):
+            cell: Cell = to._cell
+            cell.require(item.message)
+            self.cell.item = Stashed.of(item)
+            cell.admit(cell, item)
+        elif isinstance(item, Envelope):
+            to._cell.admit(to._cell, Envelope(item.message, item.sender))
+        elif (message := getattr(item, "message", item)) is not None:  # A timer's or a pipe's is an item of this life.
+            to._cell.admit(to._cell, message)
+
+    def reply_handle(self) -> ReplyHandle[Any]:
+        """The right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
+        item = self.item
+        return self.promise(item) if isinstance(item, Ask) else ReplyHandle(None)
+
+    def promise(self, ask: Ask) -> ReplyHandle[Any]:
+        """A reply handle for an ask, which is remembered while it waits."""
+        promised = self._promised
+        if promised is None:
+            promised = self._promised = []
+        elif len(promised) >= 64 and len(promised) & (len(promised) - 1) == 0:  # At each power of two.
+            promised[:] = [one for one in promised if not one.is_done]
+        promised.append(ask)
+        return ReplyHandle(ask)
+
+    def promised(self) -> tuple[Ask, ...]:
+        """The asks for which there are reply handles; those that are over may be among them."""
+        return tuple(self._promised or ())
+
+    def hand_on_promises(self) -> None:
+        """The actor lives elsewhere now, and answers from there."""
+        self._promised = None
+
+    async def publish(self, topic: str, message: Message[Any]) -> None:
+        """Publish from this actor, and return when every subscriber has accepted; it waits for room at bounded ones.
+
+        Not at itself, for it would wait for its own turn: without recovery what finds its own mailbox full is a dead
+        letter there.
+        """
+        uplink = self.cell.node.uplink
+        if uplink is not None:  # The subscribers are known to the root only.
+            self._alive()
+            require_message(topic, message)
+            await uplink.publish(topic, message, self.cell)
+            return
+
+        async def send(cell: Cell) -> None:
+            try:
+                await self.send(cell, message)
+            except NOT_TAKEN:
+                self._alive()  # Else it is this life that is over, and no fault of the subscriber's.
+                raise
+
+        await publish(self.cell.node, topic, message, send, self.cell)
+
+    async def flush(self) -> None:
+        """Release what this turn has sent so far (a journaled actor otherwise releases at the end of the turn)."""
+
+    # -- later ------------------------------------------------------------------------------------------------------
+
+    def tell_after(self, delay: float, message: Message[Any]) -> Timer:
+        """The message comes to this actor itself after `delay` seconds; the timer ends with this life."""
+        self._alive()
+        return Timer(self.cell, message, delay, None)
+
+    def every(self, interval: float, message: Message[Any]) -> Timer:
+        """The message comes every `interval` seconds; ticks that fall due while one waits are left out."""
+        self._alive()
+        return Timer(self.cell, message, interval, interval)
+
+    def pipe_to_self(
+        self,
+        work: Awaitable[T],
+        then: Callable[[T], Message[Any]],
+        failed: Callable[[BaseException], Message[Any]] | None = None,
+    ) -> None:
+        """Await `work` in the background; its result comes back as a message.
+
+        Args:
+            work: what is awaited, in a task that ends with this life.
+            then: makes the message from the result.
+            failed: makes a message from what the work raised, CancelledError if it was cancelled; without it that
+                crashes this actor. What `then` or `failed` raises does too, and so does what is no message of its.
+        """
+        self._alive()
+        self._beside(self._pipe(work, then, failed), "pipe")
+
+    async def _pipe(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> None:
+        try:
+            outcome = Piped(await self._outcome(work, then, failed), None)
+        except BaseException as error:
+            outcome = Piped(None, self._uncaught(error))
+        if not self.closed:
+            self.cell.push(outcome)
+
+    async def _outcome(self, work: Awaitable[T], then: Callable[[T], Message[Any]], failed: Any) -> Message[Any]:
+        """The message that background work ends with, whatever becomes of it.
+
+        Raises what the work raised, if nobody takes that, or what a callback did.
+        """
+        try:
+            result = await work
+        except BaseException as error:
+            if self.closed or failed is None:
+                raise
+            message: Message[Any] = failed(error)
+        else:
+            message = then(result)
+        self.cell.require(message)
+        return message
+
+    def _uncaught(self, error: BaseException) -> BaseException:
+        """What the end of background work crashes this actor with; raises it if this life is over."""
+        if self.closed:
+            raise error
+        if isinstance(error, asyncio.CancelledError):  # By whoever else had the work in hand; that is no result.
+            return HoldfastError(f"{self.path}: work that was given to pipe_to_self was cancelled")
+        return error
+
+    # -- stash ------------------------------------------------------------------------------------------------------
+
+    def stash(self) -> None:
+        """Put the message in hand aside; it comes again after `unstash`. Its turn ends without a reply."""
+        self._alive()
+        item = self.item
+        if isinstance(item, Stashed):
+            raise StashError(f"{self.path}: this message was stashed or forwarded already")
+        if isinstance(item, Item) and item.of_life:
+            raise StashError(f"{self.path}: only a message can be stashed")
+        more = self.cell.extra()
+        if more.stash is None:
+            more.stash = deque()
+        more.stash.append(item)
+        if isinstance(item, Item):
+            item.stashed()
+        self.cell.item = Stashed.of(item)
+
+    def unstash(self) -> None:
+        """Put all stashed messages back, in order, in front of what is queued."""
+        self._alive()
+        more = self.cell.extra()
+        stash = more.stash
+        if not stash:
+            return
+        if more.bound is not None:
+            more.bound.count += len(stash)
+        mailbox.put_back(self.cell, stash)
+        stash.clear()
+        self.cell.schedule()
+
+    # -- others -----------------------------------------------------------------------------------------------------
+
+    def spawn(self, start: Start[A], name: str | None = None) -> ActorRef[A]:
+        """Start a child below this actor; it ends with this life and is not restarted.
+
+        Raises:
+            NameTaken: a child of that name is alive. StartFailed: its `__init__` raised.
+        """
+        self._alive()
+        return cast("ActorRef[A]", self.cell.node.spawn(start, name, parent=self.cell).ref)
+
+    def find(self, path: str, kind: type[A]) -> ActorRef[A]:
+        """A ref to the actor at `path`.
+
+        In a turn of a recorded actor it is one to the address, whether somebody lives there or not: a replay must go
+        the same way again, when perhaps nobody does.
+
+        Raises:
+            NoSuchActor: nobody lives there. WrongActor: another class does.
+        """
+        return self.cell.node.find_ref(path, kind)
+
+    @property
+    def trap_exits(self) -> bool:
+        """Whether EXIT signals come to `on_exit` instead of ending this actor."""
+        more = self.cell.more
+        return more is not None and more.trap_exits
+
+    @trap_exits.setter
+    def trap_exits(self, value: bool) -> None:
+        self.cell.extra().trap_exits = value
+
+    def link(self, other: ActorRef[Any]) -> None:
+        """Link two lives: an abnormal end of one ends the other."""
+        self._alive()
+        links.link(self.cell, other._cell)
+
+    def unlink(self, other: ActorRef[Any]) -> None:
+        """Remove a link; nothing more comes from it."""
+        links.unlink(self.cell, other._cell)
+
+    def monitor(self, other: ActorRef[Any]) -> Monitor:
+        """`on_down` hears of the end of the present life there."""
+        self._alive()
+        return links.monitor(self.cell, other._cell, for_good=False)
+
+    def watch(self, other: ActorRef[Any]) -> Monitor:
+        """`on_down` hears once, when the address is gone for good."""
+        self._alive()
+        return links.monitor(self.cell, other._cell, for_good=True)
+
+    def subscribe(self, topic: str) -> None:
+        """Get what is published there from now on."""
+        self._alive()
+        self.cell.node.topics.subscribe(topic, self.cell)
+
+    def unsubscribe(self, topic: str) -> None:
+        """No more of it."""
+        self.cell.node.topics.unsubscribe(topic, self.cell)
+
+    def bound(self, port: str) -> ActorRef[Any] | None:
+        """What a binding points to now."""
+        more = self.cell.more
+        target = more.bindings.get(port) if more is not None else None
+        return None if target is None else target.ref
+
+    def stop(self, reason: ExitReason = NORMAL) -> None:
+        """End this life after the turn in hand."""
+        self._alive()
+        self.cell.request_stop(reason)
+
+    # -- control (called between two turns, by what carries orders out) --------------------------------------------
+
+    def depart(self, owe: Callable[[Ask], int]) -> bytes:
+        """Pack the state of an actor that is to be moved; a journaled one takes its last snapshot here instead.
+
+        Raises whatever keeps it from being packed.
+        """
+        from ..migration.luggage import StatePacker
+
+        actor = self.cell.actor
+        assert actor is not None
+        return StatePacker(actor, owe).pack()
+
+    def postpones(self, call: Item) -> bool:
+        """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""
+        return False
+
+    def may_replace(self) -> None:
+        """The state is about to be replaced from outside. Raises ControlFailed if it cannot be now."""
+
+    def replaced(self) -> None:
+        """The state was replaced from outside: a journaled actor saves it before anything else happens.
+
+        Raises whatever keeps it from being saved.
+        """
+
+    def close(self) -> None:
+        """The life is over."""
+        self.closed = True
+
+    def create_task(self, work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+        """A background task that ends with this life; an exception in it crashes the actor."""
+        self._alive()
+        task = self._beside(work, "task")
+        task.add_done_callback(self._task_done)
+        return task
+
+    def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
+        """A task of this life, which knows in what turn it was begun."""
+        tasks, context = self.cell.extra().tasks, copy_context()
+        context.run(begun_in.set, self.item)
+        task = self.cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
+        tasks.add(task)
+        task.add_done_callback(tasks.discard)
+        task.add_done_callback(lambda _: work.close())  # If it was cancelled before its first step, it never began.
+        return task
+
+    def _task_done(self, task: asyncio.Task[Any]) -> None:
+        if not task.cancelled() and (error := task.exception()) is not None and not self.closed:
+            self.cell.push(Piped(None, uncontained(error)))
+
+
+async def contained(work: Coroutine[Any, Any, T]) -> T:
+    """Run `work` in a task: what asyncio would let end the whole program ends whoever waits for this.
+
+    Raises:
+        RemoteCrash: in place of SystemExit and KeyboardInterrupt.
+    """
+    try:
+        return await work
+    except (SystemExit, KeyboardInterrupt) as error:
+        raise remote_crash(error) from error
+
+
+def uncontained(error: BaseException) -> BaseException:
+    """What was raised in `contained` work that has failed with `error`."""
+    cause = error.__cause__
+    return cause if isinstance(cause, (SystemExit, KeyboardInterrupt)) else error
+
+
+class Stashed(Envelope, eq=False):
+    """The rest of a turn whose message was stashed or forwarded: whatever the handler returns is no reply."""
+
+    @classmethod
+    def of(cls, item: Any) -> Stashed:
+        """In place of `item`."""
+        return cls(getattr(item, "message", item), getattr(item, "sender", None))
+
+
+class Piped(Item):
+    """The result of background work."""
+
+    __slots__ = ("error", "message")
+
+    def __init__(self, message: Message[Any] | None, error: BaseException | None) -> None:
+        self.message, self.error = message, error
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        if item.message is None:
+            raise item.error
+        return actor._table[type(item.message)](actor, item.message)
+
+
+def waits_for(asker: ActorContext, cell: Cell, chain: Chain) -> bool:
+    """Whether the turn that runs at `cell` is in the chain: an ask to it would wait for itself."""
+    ctx = cell.ctx
+    if ctx is asker:
+        return asker.in_turn() and not asker.is_left_behind()
+    return ctx is not None and ctx.turn_in(chain)

@@ -1,0 +1,79 @@
+"""Deadlines of asks: one queue per time-out value and one timer per queue, none per ask."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import TYPE_CHECKING
+
+from ..errors import SpecError
+
+if TYPE_CHECKING:
+    from .envelope import Ask
+
+
+class Deadlines:
+    """All asks of one time-out value expire in the order they were made, so a queue is a sorted list."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._queues: dict[float, _Queue] = {}
+
+    def add(self, ask: Ask) -> None:
+        """See to it that the ask has an outcome at its deadline."""
+        queue = self._queues.get(ask.timeout)
+        if queue is None:
+            if not ask.timeout > 0:
+                raise SpecError("ask", f"timeout must be a number of seconds > 0, not {ask.timeout!r}")
+            queue = self._queues[ask.timeout] = _Queue(self._loop, self._queues, ask.timeout)
+        asks = queue.asks
+        while asks and asks[0].future.done():
+            asks.popleft()
+        asks.append(ask)
+        if len(asks) > queue.limit:
+            queue.tidy()
+        if queue.timer is None:
+            queue.arm()
+
+    def close(self) -> None:
+        """Forget all timers."""
+        for queue in self._queues.values():
+            if queue.timer is not None:
+                queue.timer.cancel()
+        self._queues.clear()
+
+
+class _Queue:
+    """The asks of one time-out value, oldest first."""
+
+    __slots__ = ("_loop", "_queues", "_timeout", "asks", "limit", "timer")
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, queues: dict[float, _Queue], timeout: float) -> None:
+        self._loop, self._queues, self._timeout = loop, queues, timeout
+        self.asks: deque[Ask] = deque()
+        self.limit = 1024
+        self.timer: asyncio.TimerHandle | None = None
+
+    def tidy(self) -> None:
+        """Drop answered asks behind one that still waits, so that they do not stay to the deadline."""
+        self.asks = deque(ask for ask in self.asks if not ask.future.done())
+        self.limit = max(1024, 2 * len(self.asks))
+
+    def arm(self) -> None:
+        """Wake at the deadline of the oldest ask that waits."""
+        while self.asks and self.asks[0].future.done():
+            self.asks.popleft()
+        if self.asks:
+            self.timer = self._loop.call_at(self.asks[0].deadline, self._expire)
+        else:  # Computed time-outs are nearly all different: a queue without asks goes.
+            self.timer = None
+            self._queues.pop(self._timeout, None)
+
+    def _expire(self) -> None:
+        now = self._loop.time()
+        asks = self.asks
+        while asks and asks[0].deadline <= now:
+            ask = asks.popleft()
+            if not ask.future.done():
+                ask.expire()
+        self.arm()

@@ -1,0 +1,246 @@
+"""What stands in a mailbox: bare messages, envelopes, asks, and the runtime's own items.
+
+The run loop knows nothing of these kinds. It looks up `table[type(item)]` and calls what it finds: a user's handler
+for a message, `run` for everything else.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
+
+import msgspec
+
+from ..errors import AskTimeout, HoldfastError, UnknownMessage, type_name
+from .message import Message, MessageText, Refusal, by_name, message_of
+
+if TYPE_CHECKING:
+    from .cell import Cell
+    from .context import ActorContext
+
+R = TypeVar("R")
+
+Chain = tuple[tuple[str, int], ...]
+"""Who waits for this ask, nearest first: (address, turn)."""
+
+LEAVE = object()
+"""Returned by an item that took its actor off the run queue: the loop goes on with the next actor."""
+
+
+class Item:
+    """Anything in a mailbox that is no message: it runs itself, in its turn."""
+
+    __slots__ = ()
+    of_life: ClassVar[bool] = True
+    """Whether it concerns one life only, and is dropped when that ends; messages stay with the address."""
+    is_command: ClassVar[bool] = False
+    """Whether it stands at the front of the queue for a command, ahead of all messages."""
+    ends_turn: ClassVar[bool] = False
+    """Whether it is what is left of the turn before: nothing, not even a command, comes between the two."""
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        """Do the item's work; a coroutine is stepped by the loop, LEAVE takes the actor off the run queue."""
+        raise TypeError(f"{type(item).__name__} cannot be run")
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        """The address is gone before the item's turn came."""
+
+    def hook(self) -> str:
+        """The actor's hook that it calls, if that is what it does."""
+        return ""
+
+    def stashed(self) -> None:
+        """Its turn puts it aside: it will come again, out of its order."""
+
+    def is_start(self) -> bool:
+        """Whether its turn is the start of a life: if that fails, there is nothing that `on_stop` could take down."""
+        return False
+
+
+def item_name(item: object) -> str:
+    """What a mailbox item is, in a word: the type of the message in it, or the hook that it runs."""
+    if isinstance(item, MessageText):
+        return item.type_name
+    message = message_of(item)
+    if message is not None:
+        return type_name(type(message))
+    return (item.hook() if isinstance(item, Item) else "") or type_name(type(item))
+
+
+Handler = Callable[[Any, Any], object]
+
+
+class Table(dict[type, Handler]):
+    """Handlers by the type of what stands in the mailbox.
+
+    Items run themselves, and a derived message goes to the handler of its base; both are found once and remembered.
+    """
+
+    def __init__(self) -> None:
+        super().__init__({Envelope: Envelope.run, Ask: Ask.run})
+        self.named: dict[str, type[Message[Any]]] = {}  # found by wire name so far; the codec's
+
+    def __missing__(self, kind: type) -> Handler:
+        if issubclass(kind, Item):
+            self[kind] = kind.run
+        else:
+            found = next((self[base] for base in kind.__mro__[1:] if base in self), None)
+            if found is None:
+                return unhandled  # Not remembered: what is in the table is admitted without another look.
+            self[kind] = found
+        return self[kind]
+
+    def knows(self, kind: type) -> bool:
+        """Whether messages of this type have a handler."""
+        return self[kind] is not unhandled
+
+    def kind_named(self, name: str) -> type[Message[Any]]:
+        """The handled message type with this wire name. Raises UnknownMessage."""
+        kind = self.named.get(name)
+        if kind is None:
+            kind = by_name(self).get(name)
+            if kind is None:
+                raise UnknownMessage("the actor", name.replace(":", "."))
+            self.named[name] = kind
+        return kind
+
+
+class AnyTable(Table):
+    """The table of an actor whose class is not known here: its home decides what is unknown."""
+
+    def __contains__(self, kind: object) -> bool:
+        return True
+
+    def knows(self, kind: type) -> bool:
+        return True
+
+
+def unhandled(actor: Any, message: Any) -> object:
+    """Stands in the table for types without a handler."""
+    ctx: ActorContext = actor.ctx
+    ctx.cell.node.dead_letter(ctx.cell, message, f"{type(actor).__name__} has no handler for it")
+    return None
+
+
+class Envelope(Item, msgspec.Struct, eq=False):
+    """A message whose sender is known. (A struct, as an ask is: it is made with every send, and made at once.)"""
+
+    of_life = False
+
+    message: Any
+    sender: Any  # the sending actor's Cell
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        message = item.message
+        return actor._table[type(message)](actor, message)
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        cell.undelivered(self.message, reason)
+
+
+Coroutine_ = types.CoroutineType
+
+
+class Ask(Item, msgspec.Struct, eq=False):
+    """A message that somebody waits for: exactly one outcome reaches `future`."""
+
+    of_life = False
+
+    message: Any
+    sender: Any  # the asking actor's Cell; None from outside
+    chain: Chain
+    timeout: float
+    deadline: float  # on the loop's clock
+    future: Any  # asyncio.Future; what else there may be has `done()` too
+    to: Any = None  # the Cell that is asked
+    started: int = False  # True: a turn may have begun; a number: it was handed on so, and the host of `to` may know
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        cell: Cell = actor.ctx.cell
+        if item.deadline <= cell.node.now:  # Nobody waits any more: not run (unless the wait was only cancelled).
+            item.expire()
+            return None
+        item.started = True
+        message = item.message
+        handler = actor._table[type(message)]
+        if handler is unhandled:
+            item.fail(UnknownMessage(cell.path, type_name(type(message))))
+            return None
+        try:
+            result = handler(actor, message)
+        except Refusal as no:
+            item.fail(no)
+            return None
+        if type(result) is Coroutine_:
+            return _finish(cell, item, result)
+        if cell.item is item:  # Else the ask was forwarded or stashed: it is not ours to answer any more.
+            item.answer(result)
+        return None
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the outcome is known, or nobody waits for it."""
+        return self.future.done()  # type: ignore[no-any-return]  # a bool, of whatever future it is
+
+    def answer(self, reply: object) -> None:
+        """Hand the reply to the asker; a late one is dropped and counted."""
+        if type(reply) is ReplyHandle:
+            return  # The handler keeps the handle and answers later.
+        if not self.future.done():
+            self.future.set_result(reply)
+        elif self.to is not None:
+            self.to.node.late_replies += 1
+
+    def fail(self, error: BaseException) -> None:
+        """End the wait with a typed failure."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
+    def expire(self) -> None:
+        """The deadline has passed; a turn that has not begun will not begin."""
+        started = self.started
+        is_sure = not started or (started is not True and not self.to.host.may_have_begun(self.to, self))
+        self.deadline = 0.0
+        self.fail(AskTimeout(self.to.path, self.timeout, False if is_sure else None))
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        self.fail(cell.stopped_error(reason))
+
+
+async def _finish(cell: Cell, ask: Ask, handler: Coroutine[Any, Any, object]) -> None:
+    """The turn of an async handler that was asked."""
+    try:
+        reply = await handler
+    except Refusal as no:
+        ask.fail(no)
+    else:
+        if cell.item is ask:
+            ask.answer(reply)
+
+
+class ReplyHandle(Generic[R]):
+    """The right to answer one ask later. `return self.ctx.reply_handle()` ends the turn without a reply."""
+
+    __slots__ = ("_ask",)
+
+    def __init__(self, ask: Ask | None) -> None:
+        self._ask = ask
+
+    @property
+    def ask(self) -> Ask | None:
+        """What is to be answered; None if nobody waits."""
+        return self._ask
+
+    def reply(self, value: R) -> None:
+        """Answer; a second answer and one after the deadline are dropped."""
+        if self._ask is not None:
+            self._ask.answer(value)
+
+    def fail(self, error: HoldfastError) -> None:
+        """Answer with a Refusal or another typed error."""
+        if self._ask is not None:
+            self._ask.fail(error)

@@ -1,0 +1,584 @@
+"""Lives: how an actor in this process begins, crashes, is stopped or killed, and what follows from its end.
+
+The order of an end: children (newest first), `on_stop`, replies that were promised, timers and tasks, names, links and
+monitors, then the supervisor is told, or the address is given up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import signal
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from .. import exit_reasons
+from ..errors import ActorStopped, AskFailed, Ignore, StartFailed, StartIgnored, remote_crash
+from ..events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
+from ..exit_reasons import KILLED, NORMAL, SHUTDOWN, Crash, ExitReason
+from . import links, mailbox
+from .actor import Actor
+from .cell import DOWN, ENDING, GONE, RUNNING, Cell
+from .context import ActorContext
+from .envelope import LEAVE, Ask, Item
+from .message import Refusal
+from .ref import current
+
+if TYPE_CHECKING:
+    from ..control.orders_lane import Call
+    from .actor import Start
+    from .loop import Suspended
+
+GRACE = 1.0
+"""Seconds a killed turn may take to end after its cancellation, before its life is abandoned."""
+KILLED_WITHIN = 5.0
+"""Seconds until a killed child is given up that has not ended; a process that was sent SIGKILL takes less."""
+
+
+class LocalHost:
+    """Lives as turns in this very process."""
+
+    takes_parcels = False
+
+    def progress(self, cell: Cell) -> object:
+        return None
+
+    def recovers(self, reason: ExitReason) -> bool:
+        return False
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
+
+    def start(self, cell: Cell) -> asyncio.Future[None] | None:
+        start = cell.extra().start
+        assert start is not None
+        return begin(cell, start)
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        if cell.state is not RUNNING:
+            return
+        actor: Any = cell.actor
+        if cell.scheduled or cell.children or type(actor).on_stop is not Actor.on_stop:
+            urge(cell, Stop(reason))
+        else:
+            ended(cell, reason)  # Idle, and nothing of the user's has to run: it is over at once.
+
+    def kill(self, cell: Cell) -> None:
+        turn = cell.more.turn if cell.more is not None else None
+        if turn is not None:
+            turn.kill()
+            cell.node.loop.call_later(GRACE, abandon, turn)
+        elif cell.state is RUNNING:
+            cell.urge(Kill())
+
+    def retired(self, cell: Cell) -> None:
+        pass
+
+    def push(self, cell: Cell, item: Item) -> None:
+        mailbox.queue_of(cell).append(item)
+        cell.schedule()
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        cell.admit(cell, item)
+        return None
+
+    def control(self, cell: Cell, call: Call) -> None:
+        if call.is_urgent:
+            urge(cell, call)
+        else:
+            mailbox.queue_of(cell).append(call)
+            cell.schedule()
+
+    def is_up(self, cell: Cell) -> bool:
+        return is_up(cell)
+
+    def backlog(self, cell: Cell) -> int:
+        return sum(map(mailbox.counts, cell.queue or ()))
+
+    def load(self, cell: Cell) -> int:
+        return len(cell.queue or ()) + (cell.more is not None and cell.more.turn is not None)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        pass
+
+
+def is_up(cell: Cell) -> bool:
+    """Whether a life has begun in this process, `on_start` included."""
+    if cell.state is not RUNNING:
+        return False
+    starting = cell.more.starting if cell.more is not None else None
+    return starting is None or starting.done()
+
+
+def urge(cell: Cell, command: Item) -> None:
+    """Put a command ahead of all messages, but behind `on_start`: `on_stop` would find nothing done."""
+    queue = cell.queue
+    if queue and type(queue[0]) is FirstTurn:
+        first = deque.popleft(queue)
+        cell.urge(command)
+        queue.appendleft(first)
+    else:
+        cell.urge(command)
+
+
+LOCAL = LocalHost()
+
+
+def begin(
+    cell: Cell, start: Start[Any], *, restored: bool = False, context_type: type[ActorContext] = ActorContext
+) -> asyncio.Future[None] | None:
+    """Begin a life: construct the actor, then `on_start` as its first turn if the class has one.
+
+    Returns:
+        None if the life is up now; else a future that ends with `on_start` (StartFailed if that raises).
+
+    Raises:
+        StartFailed: `__init__` raised. StartIgnored: it raised `Ignore`.
+    """
+    cell.life += 1
+    build(cell, start, context_type)
+    cell.state = RUNNING
+    node = cell.node
+    if node.watched:
+        node.emit(ActorStarted(cell.path, cell.life))
+    for topic in start.kind._topics:
+        node.topics.subscribe(topic, cell)
+    if start.kind.on_start is Actor.on_start:
+        up(cell)
+        return None
+    started: asyncio.Future[None] = node.loop.create_future()
+    if cell.more is not None or getattr(start.kind, "_supervises", False):
+        cell.extra().starting = started  # Somebody waits, also if the life ends before its first turn has.
+    mailbox.queue_of(cell).appendleft(FirstTurn(restored, started))
+    up(cell)
+    return started
+
+
+def build(cell: Cell, start: Start[Any], context_type: Callable[[Cell], ActorContext]) -> None:
+    """Construct the actor with its `ctx`."""
+    kind: Any = start.kind
+    ctx = context_type(cell)
+    actor = kind.__new__(kind)
+    actor.ctx = ctx
+    cell.actor, cell.ctx, cell.table, cell.context, cell.item = actor, ctx, kind._table, None, None
+    try:
+        actor.__init__(*start.args, **start.kwargs)
+    except BaseException as error:
+        pass_on(cell, error)
+        ctx.close()
+        _kill_orphans(cell)
+        if cell.more is not None:
+            _undo(cell)
+        cell.actor = cell.ctx = None
+        reason = NORMAL if isinstance(error, Ignore) else exit_reasons.crash(error)
+        if cell.more is not None:
+            cell.more.reason = reason
+        if isinstance(error, Ignore):
+            raise StartIgnored(cell.path, error.why) from error
+        raise StartFailed(cell.path, str(reason)) from error
+    if cell.more is not None and cell.more.tap is not None:
+        cell.more.tap.attach()
+
+
+def up(cell: Cell) -> None:
+    """Let the run loop at the queue."""
+    cell.scheduled = False
+    if cell.queue:
+        cell.schedule()
+
+
+def open_context(cell: Cell) -> contextvars.Context:
+    """The life's own context, in which `current` names it for good: sends find their sender there."""
+    context = cell.node.base_context.copy()
+    context.run(current.set, cell.ctx)  # type: ignore[arg-type]  # a life that runs has its context
+    cell.context = context
+    return context
+
+
+class FirstTurn(Item):
+    """Turn 0: `on_start`."""
+
+    __slots__ = ("restored", "started")
+
+    def __init__(self, restored: bool, started: asyncio.Future[None]) -> None:
+        self.restored, self.started = restored, started
+
+    def is_start(self) -> bool:
+        return True
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        try:
+            result = actor.on_start(item.restored)
+        except Refusal as no:  # Nobody asked: an actor that refuses to start has failed to.
+            raise StartFailed(actor.ctx.path, str(no)) from no
+        if asyncio.iscoroutine(result):
+            return _first(actor, result, item.started)
+        _first_over(actor, item.started)
+        return None
+
+    def hook(self) -> str:
+        return "on_start"
+
+    def ignored(self, cell: Cell, why: str) -> bool:
+        start_fails(cell, self, StartIgnored(cell.path, why))
+        return True
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        self.fail_start(StartFailed(cell.path, reason))
+
+    def fail_start(self, error: StartFailed) -> None:
+        """Whoever waits for the start hears of it."""
+        if not self.started.done():
+            self.started.set_exception(error)
+            self.started.exception()  # Seen: if nobody waits for it, asyncio need not complain.
+
+
+async def _first(actor: Actor, hook: Any, started: asyncio.Future[None]) -> None:
+    try:
+        await hook
+    except Refusal as no:
+        raise StartFailed(actor.ctx.path, str(no)) from no
+    _first_over(actor, started)
+
+
+def _first_over(actor: Actor, started: asyncio.Future[None]) -> None:
+    """`on_start` has returned; the start may go on without it, and then ends with `came_up`, or with the life."""
+    if not actor._is_starting() and not started.done():
+        started.set_result(None)
+
+
+def came_up(cell: Cell) -> None:
+    """A start that went on after `on_start` is over: whoever waits for it hears of it."""
+    starting = cell.more.starting if cell.more is not None else None
+    if starting is not None and not starting.done():
+        starting.set_result(None)
+
+
+class Stop(Item):
+    """A command: end in good order."""
+
+    __slots__ = ("reason",)
+
+    def __init__(self, reason: ExitReason) -> None:
+        self.reason = reason
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        stop(actor.ctx.cell, item.reason, item)
+        return LEAVE
+
+
+class Kill(Item):
+    """A command: end now, without hooks."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        killed(actor.ctx.cell)
+        return LEAVE
+
+
+def pass_on(cell: Cell, error: BaseException) -> None:
+    """Let Ctrl+C end the program, too, where Python's own handler raises it wherever it strikes.
+
+    `run`, `asyncio.run` and processes of actors have handlers of their own: there, what is raised here was raised by
+    the actor, or is the second Ctrl+C of a program that stops already, and ends nothing but this life.
+    """
+    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        cell.node.loop.call_soon(_raise, error)  # Behind this slice: the run loop must be fit to stop all in order.
+
+
+def _raise(error: BaseException) -> None:
+    raise error
+
+
+def crash(cell: Cell, item: Any, error: BaseException) -> None:
+    """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
+    pass_on(cell, error)
+    if isinstance(error, Ignore) and hasattr(item, "ignored") and item.ignored(cell, error.why):
+        finish(cell, NORMAL, is_orderly=False)  # No crash: it does not want to live.
+        return
+    is_start = isinstance(item, Item) and item.is_start()
+    reason = exit_reasons.crash(error)
+    fail = getattr(item, "fail", None)
+    if fail is not None:
+        fail(remote_crash(error))
+    elif isinstance(item, FirstTurn):
+        start_fails(cell, item, StartFailed(cell.path, str(reason)))
+        if isinstance(error, StartFailed) and getattr(type(cell.actor), "_supervises", False):
+            finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).
+            return
+    tell_crash(cell, reason, item)
+    finish(cell, reason, is_orderly=not is_start)
+
+
+def tell_crash(cell: Cell, reason: ExitReason, item: object) -> None:
+    """The life ends by a crash, be it that its code raised or that it says so."""
+    node = cell.node
+    if node.watched:
+        node.emit(ActorCrashed(cell.path, cell.life, reason, item))
+
+
+def start_fails(cell: Cell, item: FirstTurn, error: StartFailed) -> None:
+    """`on_start` has failed: who waits hears of it when the life is over, for only then can the next one begin."""
+    if cell.more is None:
+        item.fail_start(error)
+    else:
+        cell.more.start_error = error
+
+
+def killed(cell: Cell) -> None:
+    """The life ends without hooks; its children are killed with it."""
+    if cell.children:
+        _wind_down(cell, End(KILLED), _kill_children(cell))
+    else:
+        ended(cell, KILLED)
+
+
+def cut_off(cell: Cell, item: Any) -> None:
+    """The turn of `item` was killed: its asker hears of it now, not at the deadline."""
+    if isinstance(item, Ask):  # An input of a recorded actor will be handled again instead.
+        item.fail(AskFailed(cell.path, str(KILLED)))
+
+
+def stop(cell: Cell, reason: ExitReason, item: Item) -> None:
+    """A life was told to stop, by itself or by others. Called in the actor's own context."""
+    if isinstance(reason, Crash):
+        tell_crash(cell, reason, item)
+    finish(cell, reason)
+
+
+def finish(cell: Cell, reason: ExitReason, *, is_orderly: bool = True) -> None:
+    """End a life: children, `on_stop`, then `ended`. Called in the actor's own context.
+
+    `on_stop` is left out where nothing was built up that it could take down (a start that failed), and where the life
+    is cut off (an EXIT that is not trapped): `is_orderly` is False then.
+    """
+    actor: Any = cell.actor
+    says = is_orderly and type(actor).on_stop is not Actor.on_stop
+    if cell.children or says:
+        end = End(reason)
+        _wind_down(cell, end, _farewell(cell, end, says))
+    else:
+        ended(cell, reason)
+
+
+class End:
+    """Why a life ends; `on_stop` may say otherwise."""
+
+    __slots__ = ("reason",)
+
+    def __init__(self, reason: ExitReason) -> None:
+        self.reason = reason
+
+
+def _wind_down(cell: Cell, end: End, farewell: Any) -> None:
+    cell.state = ENDING
+    cell.scheduled = True
+    if cell.node.step(cell, None, farewell):
+        ended(cell, end.reason)
+        return
+    turn = cell.extra().turn
+    assert turn is not None
+    turn.then = lambda: ended(cell, KILLED if turn.killed else end.reason)
+
+
+async def _farewell(cell: Cell, end: End, says: bool) -> None:
+    """Stop the children, then say good-bye."""
+    actor = cell.actor
+    assert actor is not None
+    await actor._stop_children()
+    if not says:
+        return
+    try:
+        result = actor.on_stop(end.reason)
+        if asyncio.iscoroutine(result):
+            result = await result
+    except BaseException as error:  # A failing hook must not keep the end from being told.
+        result = exit_reasons.crash(error)
+        cell.node.emit(HookFailed(cell.path, "on_stop", result))
+        if isinstance(end.reason, Crash):
+            return  # The first cause is told.
+    else:
+        if isinstance(result, Crash):
+            tell_crash(cell, result, None)
+    if isinstance(result, ExitReason):
+        end.reason = result
+
+
+async def _kill_children(cell: Cell) -> None:
+    for child in reversed(list((cell.children or {}).values())):
+        gone = child.ended()
+        child.kill()
+        await asyncio.wait((gone,), timeout=KILLED_WITHIN)  # Whatever holds it, it does not hold us.
+        retire(child, "its parent was killed")
+
+
+def abandon(turn: Suspended) -> None:
+    """A killed turn that swallows its cancellation: its life is over all the same, and its sends are refused."""
+    cell = turn.cell
+    more = cell.more
+    if more is None or more.turn is not turn:
+        return
+    more.turn = None
+    more.bindings.update(turn.rebinds or {})
+    cut_off(cell, turn.item)
+    cell.node.turns_held -= 1
+    cell.node.emit(LifeAbandoned(cell.path, cell.life))
+    _kill_orphans(cell)
+    ended(cell, KILLED)
+
+
+def _kill_orphans(cell: Cell) -> None:
+    """Kill the children of a life that cannot wait for their end; their names are free at once."""
+    children, cell.children = cell.children, None
+    for child in reversed(list((children or {}).values())):
+        child.kill()
+
+
+def ended(cell: Cell, reason: ExitReason) -> None:
+    """The life is over: undo what it had, tell who wants to know, and pass the address on."""
+    cell.state = DOWN
+    cell.scheduled = True
+    more, ctx = cell.more, cell.ctx
+    if more is not None:
+        more.reason = reason
+    if ctx is not None:
+        if not getattr(type(cell.actor), "_keeps_promises", False):
+            for ask in ctx.promised():  # Nobody else can answer these.
+                ask.fail(AskFailed(cell.path, str(reason)))
+        ctx.close()
+    actor = cell.actor
+    if actor is not None and type(actor).on_undelivered is not Actor.on_undelivered:
+        cell.extra().last = actor  # It may yet be handed what was queued.
+    cell.actor = cell.ctx = cell.context = cell.item = None
+    if more is not None:
+        starting, more.starting = more.starting, None
+        error, more.start_error = more.start_error, None
+        if starting is not None and not starting.done():
+            starting.set_exception(error or StartFailed(cell.path, str(reason)))
+            starting.exception()  # Seen: a supervisor may have given up this start meanwhile.
+        _undo(cell)
+    if cell.spec is not None and cell.parent is not None:
+        if more is not None:
+            links.announce(cell, reason, recovering=cell.host.recovers(reason) and cell.spec.restarts(reason))
+            tell_enders(more, reason)
+        cell.parent.push(ChildExit(cell, cell.life, reason))
+    else:
+        retire(cell, reason)
+        if more is not None:
+            links.announce(cell, reason, recovering=False)
+            tell_enders(more, reason)
+
+
+def tell_enders(more: Any, reason: ExitReason) -> None:
+    """Whoever waits for the end hears of it."""
+    enders, more.enders = more.enders, None
+    for future in enders or ():
+        if not future.done():
+            future.set_result(reason)
+
+
+def _undo(cell: Cell) -> None:
+    """Whatever belongs to the life ends with it: timers, tasks, subscriptions, names, trapping, the suspension.
+
+    The stash goes back to the queue.
+    """
+    more = cell.extra()
+    if more.has_ties:
+        for timer in list(more.timers):
+            timer.cancel()
+        for task in more.tasks:
+            task.cancel()
+        more.tasks.clear()
+        for topic in list(more.topics):
+            cell.node.topics.unsubscribe(topic, cell)
+        for name in more.names:
+            cell.node.names.pop(name, None)
+        more.names.clear()
+        more.watching.clear()
+    more.suspended = more.trap_exits = False
+    queue = cell.queue
+    if queue:
+        kept = deque.copy(queue) if type(queue) is deque else deque(queue)
+        deque.clear(queue)
+        queue.extend(item for item in kept if not isinstance(item, Item) or not item.of_life)
+    urgent, more.urgent = more.urgent, None
+    for command in urgent or ():  # Control of the address waits for the next life; stop and kill were for this one.
+        if not command.of_life:
+            cell.urge(command)
+    if more.stash:
+        mailbox.queue_of(cell).extendleft(reversed(more.stash))
+        if more.bound is not None:
+            more.bound.count += len(more.stash)
+        more.stash.clear()
+
+
+def retire(cell: Cell, why: object) -> None:
+    """The address is given up: its name is free, and what is queued will not be handled."""
+    if cell.state is GONE:
+        return
+    cell.state = GONE
+    cell.admit = mailbox.admit_gone  # Closed before it is drained, so that no ask waits on the dead.
+    cell.host.retired(cell)
+    kept = cell.node.kept.pop(cell, None)
+    if kept is not None:
+        kept.given_up(ActorStopped(cell.path, str(why)))
+    parent = cell.parent
+    if parent is not None and parent.children is not None and parent.children.get(cell.name) is cell:
+        del parent.children[cell.name]
+    queue, cell.queue = cell.queue, None
+    more = cell.more
+    if more is not None:
+        if more.bound is not None:
+            waiting, more.bound.waiting = more.bound.waiting, deque()
+            for ask in waiting:
+                ask.undelivered(cell, str(why))
+            more.bound.release()
+        links.announce(cell, more.reason, recovering=False)  # Links of a recorded actor wait for this.
+        links.gone(cell, more.reason)
+        commands: list[Item] = [*(more.calls if more.has_ties else ()), *(more.urgent or ())]
+        if more.has_ties:
+            more.calls = []
+        more.urgent = None
+        for command in commands:
+            command.undelivered(cell, str(why))
+        if more.tap is not None:
+            more.tap.close()
+    while queue:
+        item = deque.popleft(queue)
+        if isinstance(item, Item):
+            item.undelivered(cell, str(why))
+        else:
+            cell.undelivered(item, str(why))
+
+
+def parent_ended(cell: Cell) -> bool:
+    """Whether it is the supervisor of a retired cell that has ended, and both may be started again."""
+    if cell.parent is None or cell.parent.state is RUNNING:
+        return False
+    above: Cell | None = cell
+    while above is not None and above.state is not RUNNING:
+        if above.spec is not None and not above.spec.comes_back:
+            return False
+        above = above.parent
+    return True
+
+
+class ChildExit(Item):
+    """A child's life has ended: its supervisor decides what follows."""
+
+    __slots__ = ("child", "life", "reason")
+
+    def __init__(self, child: Cell, life: int, reason: ExitReason) -> None:
+        self.child, self.life, self.reason = child, life, reason
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        return actor.child_exited(item.child, item.life, item.reason)
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        retire(self.child, "its supervisor has stopped")

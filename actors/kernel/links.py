@@ -1,0 +1,186 @@
+"""Links and monitors: who hears of an end, and what it does to them. Erlang's rules.
+
+A link is two-sided: an abnormal end ends the other side with the same reason, unless that one traps exits. A monitor is
+one-sided and only informs: of one life (`monitor`), or of the address (`watch`: once, when it is gone for good).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ..exit_reasons import NOPROC, NORMAL, ExitReason
+from .envelope import LEAVE, Item
+
+if TYPE_CHECKING:
+    from .cell import Cell
+
+
+class Monitor:
+    """One watch of `target` by `watcher`."""
+
+    __slots__ = ("active", "for_good", "life", "target", "watcher")
+
+    def __init__(self, watcher: Cell, target: Cell, for_good: bool) -> None:
+        self.watcher, self.target, self.for_good = watcher, target, for_good
+        self.active = True
+        self.life = watcher.life  # a watch ends with the life that set it
+
+    def cancel(self) -> None:
+        """No DOWN arrives after this, not even one that is queued already."""
+        self.active = False
+        target = self.target
+        self.forget()
+        if target.more is not None and self in target.more.monitors:
+            target.more.monitors.remove(self)
+            target.host.told(target, "demonitor", {"watcher": self.watcher.path, "for_good": self.for_good})
+
+    def forget(self) -> None:
+        """It is over: its DOWN has been told, or is not wanted."""
+        if self.watcher.more is not None:
+            self.watcher.more.watching.pop(self, None)
+
+
+def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
+    """Start a watch; if nobody lives there, DOWN with NOPROC comes at once."""
+    watch = Monitor(watcher, target, for_good)
+    if target.is_dead:
+        watcher.push(Down(watch, NOPROC, recovering=False))
+    else:
+        target.extra().monitors.append(watch)
+        watcher.extra().watching[watch] = None
+        target.host.told(target, "monitor", {"watcher": watcher.path, "for_good": for_good})
+    return watch
+
+
+def demonitor(watcher: Cell, target: Cell, *, for_good: bool) -> None:
+    """Cancel one such watch, whichever: they are alike."""
+    for watch in target.more.monitors if target.more is not None else ():
+        if watch.watcher is watcher and watch.for_good is for_good:
+            watch.cancel()
+            return
+
+
+def link(one: Cell, other: Cell) -> None:
+    """Link two lives; at most one link per pair."""
+    if one is other:
+        return
+    if other.is_dead:
+        one.push(Exit(other, NOPROC))
+        return
+    one.extra().links[other] = None
+    other.extra().links[one] = None
+    other.host.told(other, "link", {"peer": one.path})
+
+
+def unlink(one: Cell, other: Cell) -> None:
+    """Remove the link; no EXIT from it arrives afterwards, not even one that is queued already."""
+    if sever(one, other):
+        other.host.told(other, "unlink", {"peer": one.path})
+    for item in one.queue or ():
+        if type(item) is Exit and item.source is other:
+            item.active = False
+
+
+def sever(one: Cell, other: Cell) -> bool:
+    """Forget the link on both sides. Returns whether there was one."""
+    found = False
+    for cell, peer in ((one, other), (other, one)):
+        if cell.more is not None and peer in cell.more.links:
+            del cell.more.links[peer]
+            found = True
+    return found
+
+
+def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
+    """A life has ended: EXIT over its links, DOWN to its monitors."""
+    more = cell.more
+    if more is None or not more.has_ties:
+        return
+    if more.links and not recovering:
+        peers, more.links = more.links, {}
+        for peer in peers:
+            if peer.more is not None and peer.more.links.pop(cell, 0) is None:
+                peer.push(Exit(cell, reason))
+    if more.monitors:
+        stay: list[Monitor] = []
+        for watch in more.monitors:
+            if watch.for_good:
+                stay.append(watch)
+            else:
+                watch.watcher.push(Down(watch, reason, recovering))
+                if recovering:
+                    stay.append(watch)
+                else:
+                    watch.forget()
+        more.monitors = stay
+
+
+def gone(cell: Cell, reason: ExitReason) -> None:
+    """The address is gone for good: tell who watches it."""
+    more = cell.more
+    if more is None or not more.has_ties or not more.monitors:
+        return
+    watchers = [watch for watch in more.monitors if watch.for_good]
+    more.monitors = [watch for watch in more.monitors if not watch.for_good]
+    for watch in watchers:
+        watch.forget()
+        watch.watcher.push(Down(watch, reason, recovering=False))
+
+
+def down_arrived(watcher: Cell, target: Cell, reason: ExitReason, *, recovering: bool, for_good: bool) -> None:
+    """A DOWN came from another process: it belongs to the oldest such watch that is still wanted."""
+    monitors: list[Monitor] = target.more.monitors if target.more is not None else []
+    for watch in monitors:
+        if watch.watcher is watcher and watch.for_good is for_good:
+            monitors.remove(watch)
+            if recovering:
+                monitors.append(watch)  # Behind those like it: each gets its own DOWN.
+            else:
+                watch.forget()
+            watcher.push(Down(watch, reason, recovering))
+            return
+
+
+class Exit(Item):
+    """An EXIT signal over a link, in its place after earlier messages."""
+
+    __slots__ = ("active", "reason", "source")
+
+    def __init__(self, source: Cell, reason: ExitReason) -> None:
+        self.source, self.reason = source, reason
+        self.active = True
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        cell: Cell = actor.ctx.cell
+        if not item.active:
+            return None
+        if cell.more is not None and cell.more.trap_exits:
+            return actor.on_exit(item.source.ref, item.reason)
+        if item.reason == NORMAL:
+            return None
+        from . import lifecycle
+
+        lifecycle.finish(cell, item.reason, is_orderly=False)
+        return LEAVE
+
+    def hook(self) -> str:
+        return "on_exit"
+
+
+class Down(Item):
+    """A monitor's notice."""
+
+    __slots__ = ("reason", "recovering", "watch")
+
+    def __init__(self, watch: Monitor, reason: ExitReason, recovering: bool) -> None:
+        self.watch, self.reason, self.recovering = watch, reason, recovering
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        if not item.watch.active or item.watch.life != actor.ctx.life:
+            return None
+        return actor.on_down(item.watch.target.ref, item.reason, item.recovering)
+
+    def hook(self) -> str:
+        return "on_down"

@@ -1,0 +1,327 @@
+"""How a message gets into a mailbox: one `admit` function per situation, swapped when the situation changes.
+
+`cell.admit(cell, item)` is called for every message; which function stands there says what happens to it. No flag is
+tested per message.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Literal, get_args
+
+from ..errors import MailboxFull, SpecError
+from .envelope import LEAVE, Ask, Envelope, Item
+
+if TYPE_CHECKING:
+    from .cell import Cell
+
+Overflow = Literal["block", "fail", "drop_newest", "drop_oldest", "latest"]
+
+
+def admit_first(cell: Cell, item: Any) -> None:
+    """The first message: make the queue (an empty deque is 760 bytes), then go on as `admit_queue`."""
+    if type(item) not in cell.table:
+        cell.require(item)
+    queue_of(cell).append(item)
+    cell.schedule()
+
+
+def admit_queue(cell: Cell, item: Any) -> None:
+    """The unbounded mailbox: the hot path."""
+    if type(item) not in cell.table:
+        cell.require(item)
+    cell.queue.append(item)  # type: ignore[union-attr]  # this function stands there only when the queue is made
+    if not cell.scheduled:
+        cell.scheduled = True
+        node = cell.node
+        node.ready.append(cell)
+        if not node.awake:
+            node.wake()
+
+
+def admit_bounded(cell: Cell, item: Any) -> None:
+    """A mailbox with a capacity: what does not fit goes by the overflow policy."""
+    if type(item) not in cell.table:
+        cell.require(item)
+    bound = cell.extra().bound
+    assert bound is not None
+    bound.admit(cell, item)
+
+
+def admit_closing(cell: Cell, item: Any) -> None:
+    """The actor handles what is queued and then stops: nothing new is let in. (`Cell.room` refuses a `send`.)"""
+    if isinstance(item, Ask):
+        item.fail(cell.stopped_error("it is stopping"))
+    else:
+        cell.node.dead_letter(cell, item.message if isinstance(item, Envelope) else item, "the actor is stopping")
+
+
+def admit_gone(cell: Cell, item: Any) -> None:
+    """The address has ended: another life may have been started there since, else it is a dead letter."""
+    successor = cell.node.successor(cell)
+    if successor is not None:
+        successor.admit(successor, item)
+    elif isinstance(item, Item):
+        item.undelivered(cell, "it has stopped")
+    else:
+        cell.node.dead_letter(cell, item, "the actor has stopped")
+
+
+def queue_of(cell: Cell) -> deque[Any]:
+    """The cell's queue, made now if there was none."""
+    if cell.queue is None:
+        bound = cell.more.bound if cell.more is not None else None
+        cell.queue = deque() if bound is None else BoundedQueue(cell)
+        if cell.admit is admit_first:
+            cell.admit = admit_queue
+    return cell.queue
+
+
+def put_back(cell: Cell, items: Iterable[Any]) -> None:
+    """Put items at the front of the queue, in order, but behind the commands that stand there."""
+    queue = queue_of(cell)
+    commands: list[Any] = []
+    while queue and isinstance(queue[0], Item) and queue[0].is_command:
+        commands.append(deque.popleft(queue))
+    queue.extendleft(reversed(list(items)))
+    queue.extendleft(reversed(commands))
+
+
+class Senders:
+    """Who waits for room to send, first in, first served: one wakes for each free place, and tries again.
+
+    Whoever has woken need not take the place: it may have been cancelled, have lost its life, or have gone elsewhere.
+    Then it is the next one's, and nobody has to remember to say so.
+    """
+
+    __slots__ = ("_waiting",)
+
+    def __init__(self) -> None:
+        self._waiting: deque[asyncio.Future[None]] = deque()
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def wait(self, loop: asyncio.AbstractEventLoop) -> asyncio.Future[None]:
+        """A future that ends when it is worth trying again."""
+        future: asyncio.Future[None] = loop.create_future()
+        self._waiting.append(future)
+        return future
+
+    def wake(self, has_room: Callable[[], bool]) -> None:
+        """Wake the first one, if there is room, and when it has had its turn the next one, if there still is."""
+        while self._waiting and has_room():
+            sender = self._waiting.popleft()
+            if not sender.done():
+                sender.set_result(None)
+                sender.get_loop().call_soon(self.wake, has_room)
+                break
+
+    def release(self) -> None:
+        """Wake them all."""
+        waiting, self._waiting = self._waiting, deque()
+        for sender in waiting:
+            if not sender.done():
+                sender.set_result(None)
+
+
+def take_back(cell: Cell, queue: deque[Any]) -> None:
+    """Take the newest item out of a queue again: its sender is told that it was refused."""
+    item = deque.pop(queue)
+    if counts(item) and cell.more is not None and cell.more.bound is not None:
+        cell.more.bound.count -= 1
+
+
+class Bound:
+    """A mailbox's capacity, its overflow policy, and who waits for room.
+
+    Only messages count, and only while they are queued: commands and signals always fit.
+    """
+
+    __slots__ = ("capacity", "count", "overflow", "senders", "waiting")
+
+    def __init__(self, capacity: int, overflow: Overflow) -> None:
+        self.capacity = capacity
+        self.overflow: Overflow = overflow
+        self.count = 0
+        self.waiting: deque[Ask] = deque()  # asks that wait for room, first in, first served
+        self.senders = Senders()
+
+    def admit(self, cell: Cell, item: Any) -> None:
+        """Take the item, or let the policy decide."""
+        if self.count < self.capacity and not self.waiting:
+            self.put(cell, item)
+            return
+        match self.overflow:
+            case "block" if isinstance(item, Ask):
+                self.waiting.append(item)
+            case "block" | "fail":
+                self._refuse(cell, item)
+            case "drop_newest":
+                self._lose(cell, item)
+            case "drop_oldest":
+                self._lose_queued(cell, keep=self.capacity - 1)
+                self.put(cell, item)
+            case "latest":
+                self._lose_queued(cell, keep=0)
+                self.put(cell, item)
+
+    def inherit(self, old: Bound) -> Bound:
+        """Take over who waits at the bound that stood here before."""
+        self.count, self.waiting, self.senders = old.count, old.waiting, old.senders
+        return self
+
+    def put(self, cell: Cell, item: Any) -> None:
+        """Append, counted."""
+        self.count += 1
+        queue_of(cell).append(item)
+        cell.schedule()
+
+    def taken(self, cell: Cell) -> None:
+        """One message has left the queue: let the next one in."""
+        self.count -= 1
+        while self.waiting and self.count < self.capacity:
+            ask = self.waiting.popleft()
+            if not ask.is_done:  # Expired or given up while it waited: never admitted.
+                self.put(cell, ask)
+        self.senders.wake(self._is_below)
+
+    def moved(self, cell: Cell) -> None:
+        """The actor, in another process, has begun or ended turns."""
+
+    def has_room(self, cell: Cell) -> bool:
+        """Whether a message would be taken now (or lost: only the policy "block" has a sender wait)."""
+        return self.overflow != "block" or (self._is_below() and not self.waiting)
+
+    def _is_below(self) -> bool:
+        return self.count < self.capacity
+
+    def room(self, cell: Cell) -> asyncio.Future[None] | None:
+        """For `send`: None if there is room."""
+        return None if self.has_room(cell) else self.senders.wait(cell.node.loop)
+
+    def release(self) -> None:
+        """The address is gone: whoever waits shall see it."""
+        self.senders.release()
+
+    def _refuse(self, cell: Cell, item: Any) -> None:
+        error = MailboxFull(cell.path, self.capacity)
+        if isinstance(item, Ask):
+            item.fail(error)
+            return
+        raise error
+
+    def _lose(self, cell: Cell, item: Any) -> None:
+        message = item.message if isinstance(item, (Envelope, Ask)) else item
+        if isinstance(item, Ask):
+            item.fail(MailboxFull(cell.path, self.capacity))
+        cell.node.dead_letter(cell, message, f"mailbox full ({self.capacity}, {self.overflow})")
+
+    def _lose_queued(self, cell: Cell, keep: int) -> None:
+        """Drop queued messages, oldest first, until `keep` are left."""
+        queue = queue_of(cell)
+        kept: list[Any] = []
+        while self.count > keep and queue:
+            item = deque.popleft(queue)
+            if counts(item):
+                self.count -= 1
+                self._lose(cell, item)
+            else:
+                kept.append(item)
+        queue.extendleft(reversed(kept))
+
+
+def counts(item: Any) -> bool:
+    """Whether an item takes one of a bounded mailbox's places: messages do, the runtime's own do not."""
+    return not isinstance(item, Item) or not item.of_life
+
+
+class _Nothing(Item):
+    """A turn in which nothing is done."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        return None
+
+
+NOTHING = _Nothing()
+
+
+class _Hold(Item):
+    """Stands between the commands and the messages of a suspended actor: none of those is run, none is out of order."""
+
+    __slots__ = ()
+    is_command = True
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        cell: Cell = actor.ctx.cell
+        queue_of(cell).appendleft(item)
+        cell.scheduled = False
+        return LEAVE
+
+
+HOLD = _Hold()
+
+
+def hold(cell: Cell) -> None:
+    """Suspend: called between two turns."""
+    put_back(cell, (HOLD,))
+
+
+def release(cell: Cell) -> None:
+    """Resume: called between two turns."""
+    queue = queue_of(cell)
+    for index, item in enumerate(queue):  # Not removed: the run loop has counted it.
+        if item is HOLD:
+            queue[index] = NOTHING
+            return
+
+
+class BoundedQueue(deque[Any]):
+    """The queue of a bounded mailbox: taking a message makes room. Only these actors pay for it."""
+
+    def __init__(self, cell: Cell) -> None:
+        super().__init__()
+        self._cell = cell
+
+    def popleft(self) -> Any:
+        if not self:
+            return NOTHING  # A turn of this slice has made an overflow drop what the run loop had counted.
+        item = super().popleft()
+        if counts(item):
+            bound = self._cell.extra().bound
+            assert bound is not None
+            bound.taken(self._cell)
+        return item
+
+
+@dataclasses.dataclass(frozen=True, slots=True, repr=False)
+class Bounded:
+    """The choice of a bounded mailbox, for a child spec; made by `bounded`."""
+
+    capacity: int
+    overflow: Overflow
+
+    def __repr__(self) -> str:
+        return f"bounded({self.capacity}, overflow={self.overflow!r})"
+
+
+def bounded(capacity: int, *, overflow: Overflow = "block") -> Bounded:
+    """A mailbox for at most `capacity` messages.
+
+    Args:
+        capacity: messages, >= 1.
+        overflow: "block" (tell raises MailboxFull, send waits, ask waits to its deadline), "fail" (all raise),
+            "drop_newest", "drop_oldest", or "latest" (only the newest is kept); the loser goes to dead letters.
+    """
+    if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
+        raise SpecError("bounded", f"capacity must be a whole number of messages >= 1, not {capacity!r}")
+    if overflow not in get_args(Overflow):
+        raise SpecError("bounded", f"overflow must be one of {', '.join(get_args(Overflow))}, not {overflow!r}")
+    return Bounded(capacity, overflow)

@@ -1,0 +1,291 @@
+"""The node: an OS process that hosts actors. It owns the run loop, the tree of cells, and what they share."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import itertools
+import random
+import time
+import weakref
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from ..errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
+from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
+from ..exit_reasons import KILLED, ExitReason
+from ..persistence import Keeper, NothingKept
+from . import lifecycle, stopping
+from .cell import DOWN, GONE, RUNNING, Cell, Host
+from .codec import Codec
+from .deadlines import Deadlines
+from .lifecycle import LOCAL
+from .loop import RunLoop
+from .mailbox import Bound, Bounded, admit_bounded, admit_gone
+from .message import Refusal
+from .threads import Threads
+from .topics import Topics
+
+if TYPE_CHECKING:
+    from ..deadline_thread import Overdue
+    from .actor import Actor, Start
+    from .ref import ActorRef
+
+A = TypeVar("A", bound="Actor")
+
+
+class Kept(Protocol):
+    """What belongs to an address, whoever lives there."""
+
+    def given_up(self, error: ActorStopped) -> None:
+        """The address is gone for good: whoever waits for something there hears of it."""
+        ...
+
+
+class Node(RunLoop):
+    """One process's actors. All of a node runs on one event loop, in one thread."""
+
+    def __init__(self, name: str, loop: asyncio.AbstractEventLoop, *, seed: int | None = None) -> None:
+        super().__init__(loop)
+        if not name or "/" in name:
+            raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
+        self.name = name
+        self.base_context = contextvars.copy_context()
+        self.deadlines = Deadlines(loop)
+        self.codec = Codec(self.cell_at)
+        self.watched = False  # whether anybody looks at events: else they are not even made
+        self.events = EventHub(self._watch)
+        self.topics = Topics()
+        self.threads = Threads()
+        self.names: dict[str, Cell] = {}
+        self.kept: weakref.WeakKeyDictionary[Cell, Kept] = weakref.WeakKeyDictionary()  # outlives an actor's lives
+        self.remains: dict[asyncio.Future[Any], str] = {}  # what killed lives have left and is still ending: address
+        self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
+        self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead
+        self.gave_up: SupervisorGaveUp | None = None  # the last supervisor here that did
+        self.dead_letters = 0
+        self.late_replies = 0
+        self.wall: Callable[[], float] = time.time
+        self.outside: Callable[[str], Cell | None] | None = None  # finds cells of other processes
+        self.root: Cell | None = None
+        self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
+        self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
+        self.overdue: Overdue | None = None  # in an actor process: who ends it when it is blocked
+        self.here: Host = LOCAL  # lives in this very process
+        self.awaited: dict[str, list[Callable[[], None]]] = {}  # what is done when somebody comes to live at a path
+        self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
+        self.keeper: Keeper = NothingKept()
+        self.complete: Callable[[Any, str], Any] = lambda spec, path: spec  # what else is known of a child spec
+        self.respec: Callable[[Cell, Start[Any]], None] = begin_with  # has an actor's next lives begin with this
+        self._seeds = random.Random(seed)
+        self._numbers = itertools.count(1)
+        self._turns = itertools.count(1)
+
+    def begin_limit(self, what: str, seconds: float) -> Callable[[], None]:
+        """Somebody keeps a time limit by a timer here; what is returned is called when it is void.
+
+        In an actor process that has a thread of its own blocked beyond it ends; see `deadline_thread.py`.
+        """
+        return self.overdue.begin(what, seconds) if self.overdue is not None else _void
+
+    async def close(self) -> None:
+        """End every runner, and what still waits for its time."""
+        for timer in self.safe.values():
+            timer.cancel()
+        self.safe.clear()
+        self.threads.close()
+        await super().close()
+
+    # -- events -----------------------------------------------------------------------------------------------------
+
+    def _watch(self, watched: bool) -> None:
+        self.watched = watched
+
+    def emit(self, event: Event) -> None:
+        """Put an event on the stream."""
+        self.events.emit(event)
+
+    def dead_letter(self, cell: Cell, message: object, why: str) -> None:
+        """A message that nobody handles: counted, and told to who looks, opened if it came packed."""
+        self.dead_letters += 1
+        if self.watched:
+            self.events.emit(DeadLetter(cell.path, self.codec.opened(cell, message), why))
+
+    def not_taken(self, cell: Cell, message: object, error: HoldfastError) -> None:
+        """A subscriber could not take what was published; one that has ended meanwhile is no subscriber any more."""
+        if not isinstance(error, ActorStopped):
+            self.dead_letter(cell, message, str(error))
+
+    def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
+        """A tell was answered with a Refusal: there is nobody to hand it to."""
+        if self.watched:
+            self.events.emit(DeadLetter(cell.path, item, f"refused: {no}"))
+
+    # -- numbers ----------------------------------------------------------------------------------------------------
+
+    def seed(self) -> int:
+        """A seed for an actor's random generator."""
+        return self._seeds.getrandbits(64)
+
+    def next_turn(self) -> int:
+        """A number for a turn that asks."""
+        return next(self._turns)
+
+    # -- the tree ---------------------------------------------------------------------------------------------------
+
+    def cell_below(self, parent: Cell | None, name: str | None, host: Host | None = None) -> Cell:
+        """A new cell in the tree.
+
+        Raises:
+            NameTaken: there is one of that name.
+        """
+        if name is None:
+            name = f"${next(self._numbers)}"
+        elif parent is not None and (not name or "/" in name):
+            raise SpecError("name", f"an actor's name must be text without '/', not {name!r}")
+        cell = Cell(self, parent, name, self.here if host is None else host)
+        if parent is not None:
+            if parent.children is None:
+                parent.children = {}
+            elif name in parent.children:
+                raise NameTaken(f"{parent.path}/{name}")
+            parent.children[name] = cell
+        if self.awaited:
+            for come in self.awaited.pop(cell.path, ()):
+                self.loop.call_soon(come)  # It is not started yet.
+        return cell
+
+    def spawn(
+        self, start: Start[Any], name: str | None = None, *, parent: Cell | None = None, mailbox: Bounded | None = None
+    ) -> Cell:
+        """Start an actor in this process that nobody restarts. It is up when this returns, but for its `on_start`."""
+        cell = self.cell_below(parent if parent is not None else self.root, name)
+        if mailbox is not None:
+            self.bound(cell, mailbox)
+        try:
+            lifecycle.begin(cell, start)
+        except BaseException:
+            lifecycle.retire(cell, "it could not be started")
+            raise
+        return cell
+
+    def bound(self, cell: Cell, choice: Bounded) -> None:
+        """Give a cell without messages a bounded mailbox."""
+        cell.extra().bound = Bound(choice.capacity, choice.overflow)
+        cell.admit = admit_bounded
+
+    async def stop_child(self, cell: Cell) -> ExitReason:
+        """Stop a child in good order, as its parent ends: by its spec, if it has one."""
+        if cell.state is DOWN or cell.state is GONE:
+            lifecycle.retire(cell, "its parent has stopped")
+            return cell.extra().reason
+        stop = getattr(cell.spec, "stop", None)
+        reason: ExitReason = await (stop(cell) if stop is not None else stopping.stop_in_time(cell))
+        lifecycle.retire(cell, "its parent has stopped")
+        return reason
+
+    def find(self, path: str) -> Cell | None:
+        """The cell at an address, here or (through `outside`) in another process."""
+        root = self.root
+        if root is not None and (path == root.path or path.startswith(root.path + "/")):
+            cell: Cell | None = root
+            for name in path[len(root.path) :].split("/")[1:]:
+                cell = cell.children.get(name) if cell is not None and cell.children else None
+                if cell is None:
+                    break
+            if cell is not None:
+                return cell
+        return self.outside(path) if self.outside is not None else None
+
+    def cell_at(self, path: str) -> Cell:
+        """The cell at an address; if there is none, a stand-in whose messages are dead letters."""
+        return self.find(path) or self.nowhere(path)
+
+    def nowhere(self, path: str) -> Cell:
+        """A stand-in for an address where nobody lives; somebody may come to live there."""
+        cell = Cell(self, None, path, LOCAL)
+        cell.state, cell.admit = GONE, admit_gone
+        return cell
+
+    def successor(self, cell: Cell) -> Cell | None:
+        """The living cell at the address of a dead one."""
+        found = self.find(cell.path)
+        return None if found is None or found.state is GONE else found
+
+    def find_ref(self, path: str, kind: type[A]) -> ActorRef[A]:
+        """A ref to the actor at `path`.
+
+        Raises:
+            NoSuchActor: nobody lives there. WrongActor: another class does.
+        """
+        from .ref import ActorRef
+
+        cell = self.find(path)
+        if cell is None or cell.is_dead:
+            raise NoSuchActor(path)
+        found = cell_kind(cell)
+        if found is not None and not issubclass(found, kind):
+            raise WrongActor(path, type_name(kind), type_name(found))
+        return ActorRef(cell)
+
+    def register(self, name: str, cell: Cell) -> None:
+        """Give an actor a name beside its path; it is free again before anybody hears of the actor's end.
+
+        Raises:
+            NameTaken: another living actor has it.
+        """
+        holder = self.names.get(name)
+        if holder is cell:
+            return
+        if holder is not None:
+            raise NameTaken(name)
+        if cell.state is not RUNNING:
+            raise ActorStopped(cell.path)
+        self.names[name] = cell
+        cell.extra().names.append(name)
+
+    def unregister(self, name: str) -> None:
+        """Free a name; unknown ones are fine."""
+        cell = self.names.pop(name, None)
+        if cell is not None and cell.more is not None and name in cell.more.names:
+            cell.more.names.remove(name)
+
+    def bind(self, cell: Cell, port: str, target: Cell) -> None:
+        """Point a binding elsewhere; the owner sees it from its next turn on.
+
+        Raises:
+            SpecError: the class has no such binding.
+        """
+        kind = cell_kind(cell)
+        if kind is not None and port not in kind._bindings:
+            known = ", ".join(sorted(kind._bindings)) or "none"
+            raise SpecError(cell.path, f"{type_name(kind)} has no binding {port!r} (it has: {known})")
+        more = cell.extra()
+        soon = more.turn.rebinds if more.turn is not None else None
+        before = (soon or {}).get(port) or more.bindings.get(port)
+        if before is not None and before.path != target.path and cell.host.recovers(KILLED):
+            led = self.led.setdefault(cell.path, {})
+            same = {before.path, target.path, *led.get(before.path, ()), *led.get(target.path, ())}
+            led.update(dict.fromkeys(same, same))
+        if more.turn is None:
+            more.bindings[port] = target
+        else:  # One turn sees one target, also if it waits meanwhile.
+            more.turn.rebinds = {**(more.turn.rebinds or {}), port: target}
+        cell.host.told(cell, "bind", {"port": port, "target": target.path})
+
+
+def _void() -> None:
+    """Nobody watches."""
+
+
+def begin_with(cell: Cell, start: Start[Any]) -> None:
+    """The next lives at `cell` begin with `start`; what its supervisor knows of it is the composition root's."""
+    cell.extra().start = start
+
+
+def cell_kind(cell: Cell) -> type[Actor] | None:
+    """The actor class that lives at a cell, as far as it is known here."""
+    if cell.actor is not None:
+        return type(cell.actor)
+    start = cell.more.start if cell.more is not None else None
+    return None if start is None else start.kind

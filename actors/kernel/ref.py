@@ -1,0 +1,156 @@
+"""Refs: the handles through which actors are reached."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+from typing import TYPE_CHECKING, Any, Generic, Literal, TypeVar
+
+from ..errors import ActorRestarting, SpecError
+from .envelope import Ask
+from .message import Message
+
+if TYPE_CHECKING:
+    from .actor import Actor
+    from .cell import Cell
+    from .context import ActorContext
+
+A_co = TypeVar("A_co", bound="Actor", covariant=True)
+R = TypeVar("R")
+
+Restarting = Literal["wait", "fail"]
+"""What an ask does at an actor that is between two lives."""
+
+DEFAULT_TIMEOUT = 5.0
+"""Seconds an ask waits when nothing else is said."""
+
+current: contextvars.ContextVar[ActorContext] = contextvars.ContextVar("holdfast_current_actor")
+"""The actor whose turn (or background task) this is. Set once in each life's own `contextvars.Context`."""
+
+
+class ActorRef(Generic[A_co]):
+    """A handle on an address: it stays good over restarts, may travel in messages, and compares by address.
+
+    What it sends takes one path: the address's `admit` (mailbox.py), its queue, and a turn (loop.py).
+    """
+
+    __slots__ = ("_cell",)
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell = cell
+
+    @property
+    def path(self) -> str:
+        """The address, such as `/app/bank/alice`."""
+        return self._cell.path
+
+    def tell(self, message: Message[Any]) -> None:
+        """Send without waiting.
+
+        Raises:
+            UnknownMessage: the actor's class is known and has no handler for it.
+            MailboxFull: the mailbox is bounded and refuses. Who cannot be told, because the mailbox is in another
+                process, or the sender a recorded turn whose sends leave later, has a dead letter made of the message.
+            BadMessage: the message cannot be coded and has to be.
+            WrongThread: the system runs in another thread, and this call would have to wake it; see
+                `ActorSystem.from_thread`. (While it is awake a call from another thread may pass unnoticed.)
+        """
+        cell = self._cell
+        sender = current.get(None)
+        if sender is None:
+            cell.admit(cell, message)
+        else:
+            sender.tell(cell, message)
+
+    async def send(self, message: Message[Any]) -> None:
+        """Send, and return when the message is accepted: the tell with back-pressure.
+
+        Raises:
+            ActorStopped: the address has ended for good.
+            UnknownMessage, MailboxFull, BadMessage: as `tell`.
+        """
+        cell = self._cell
+        sender = current.get(None)
+        if sender is not None:
+            await sender.send(cell, message)
+            return
+        cell.node.check_thread(cell.path)
+        while (room := cell.room()) is not None:
+            await room
+        if type(message) not in cell.table:
+            cell.require(message)
+        accepted = cell.host.offer(cell, message)
+        if accepted is not None:
+            await accepted
+
+    def ask(
+        self, message: Message[R], timeout: float = DEFAULT_TIMEOUT, *, restarting: Restarting = "wait"
+    ) -> asyncio.Future[R]:
+        """Send now, and return an awaitable with exactly one outcome.
+
+        Args:
+            message: what is asked; its class declares the reply's type.
+            timeout: seconds until the deadline, > 0; it travels with the message and runs on during recovery.
+            restarting: "fail" sends nothing to an actor that is between two lives, or being recovered: the awaitable
+                raises ActorRestarting. (Of actors in another process than the root an actor process knows too little:
+                it waits. A recorded actor always waits, for its replay to do the same.)
+
+        Returns:
+            A future of the reply. Cancelling it ends the wait, never the turn.
+
+        Raises (by the awaitable):
+            Refusal: the handler's typed "no".
+            AskTimeout, ActorStopped, AskFailed, RemoteCrash, MailboxFull, AskDeadlock: see `errors.py`.
+        """
+        cell = self._cell
+        sender = current.get(None)
+        if restarting != "wait" and (failed := _restarting(cell, restarting, sender)) is not None:
+            return failed
+        if sender is not None:
+            return sender.ask(cell, message, timeout)
+        if type(message) not in cell.table:
+            cell.require(message)
+        node = cell.node
+        node.check_thread(cell.path)
+        future: asyncio.Future[R] = node.loop.create_future()
+        ask = Ask(message, None, (), timeout, node.loop.time() + timeout, future, cell)
+        node.deadlines.add(ask)
+        try:
+            cell.admit(cell, ask)
+        except BaseException:
+            future.cancel()  # Refused at the call: nobody holds the future.
+            raise
+        return future
+
+    def stop(self) -> None:
+        """Ask the actor to stop after what it has begun; a second stop is no error."""
+        self._cell.node.check_thread(self.path)
+        self._cell.request_stop()
+
+    def kill(self) -> None:
+        """End this life at once, without its hooks. A supervisor treats it as a crash."""
+        self._cell.node.check_thread(self.path)
+        self._cell.kill()
+
+    def __repr__(self) -> str:
+        return f"<ActorRef {self.path}>"
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, ActorRef):
+            return NotImplemented
+        theirs: Cell = other._cell
+        return theirs is self._cell or (theirs.node is self._cell.node and theirs.path == self._cell.path)
+
+    def __hash__(self) -> int:
+        return hash(self._cell.path)
+
+
+def _restarting(cell: Cell, restarting: str, sender: ActorContext | None) -> asyncio.Future[Any] | None:
+    """The failed ask to an actor that is not up now; None if the ask is to be made."""
+    if restarting != "fail":
+        raise SpecError("ask", f"restarting must be 'wait' or 'fail', not {restarting!r}")
+    if cell.is_dead or cell.host.is_up(cell) or (sender is not None and not sender.may_fail_fast):
+        return None
+    future: asyncio.Future[Any] = cell.node.loop.create_future()
+    future.set_exception(ActorRestarting(cell.path))
+    return future

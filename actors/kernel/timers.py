@@ -1,0 +1,127 @@
+"""Timers: messages that come later, through the mailbox like any other."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from ..errors import SpecError
+from .envelope import Item
+from .message import Message
+
+if TYPE_CHECKING:
+    from .cell import Cell
+
+
+class Timer:
+    """A handle on one timer; it ends with the life that set it."""
+
+    __slots__ = ("_cell", "_due", "_handle", "_interval", "_queued", "message")
+
+    def __init__(self, cell: Cell, message: Message[Any], delay: float, interval: float | None) -> None:
+        if not delay >= 0 or (interval is not None and not interval > 0):
+            raise SpecError(cell.path, f"a timer takes seconds > 0, not {delay!r}")
+        cell.require(message)
+        self._cell = cell
+        self.message = message
+        self._interval = interval
+        self._queued = False
+        self._due = cell.node.loop.time() + delay
+        self._handle: asyncio.TimerHandle | None = None
+        cell.extra().timers.add(self)
+        self._arm()
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the message may still come."""
+        return self._handle is not None or self._queued
+
+    def cancel(self) -> None:
+        """The message does not come any more, not even if it is queued already."""
+        if self._handle is not None:
+            self._handle.cancel()
+        self._handle = None
+        self._queued = False
+        if self._cell.more is not None:
+            self._cell.more.timers.discard(self)
+
+    def pause(self) -> None:
+        """Its actor is being moved: nothing comes until `resume`."""
+        if self._handle is not None:
+            self._handle.cancel()  # Kept: what has a handle is armed again.
+
+    def resume(self) -> None:
+        """The actor stays after all."""
+        if self._handle is not None:
+            self._arm()
+
+    def packed(self) -> tuple[Message[Any], float | None, float | None, bool]:
+        """Message, seconds left (None: it has fallen due), interval, and whether a tick of it is queued."""
+        left = None if self._handle is None else max(0.0, self._due - self._cell.node.loop.time())
+        return self.message, left, self._interval, self._queued
+
+    @classmethod
+    def unpacked(
+        cls, cell: Cell, message: Message[Any], left: float | None, interval: float | None, queued: bool
+    ) -> Timer:
+        """The timer of an actor that has been moved here."""
+        timer = cls(cell, message, left or 0.0, interval)
+        timer.pause()
+        if left is None:
+            timer._handle = None
+        else:
+            timer._arm()
+        if queued:
+            timer._queued = True
+            cell.push(Tick(timer))
+        return timer
+
+    def ended(self, cell: Cell) -> None:
+        """Be a timer whose message has come, or never will."""
+        self._cell, self._handle, self._queued, self._interval, self._due = cell, None, False, None, 0.0
+
+    def belongs_to(self, cell: Cell) -> None:
+        """Its actor lives at this cell from now on."""
+        self._cell = cell
+
+    def _arm(self) -> None:
+        self._handle = self._cell.node.loop.call_at(self._due, self._fire)
+
+    def _fire(self) -> None:
+        self._handle = None
+        if not self._queued:
+            self._queued = True
+            self._cell.push(Tick(self))
+        if self._interval is not None:
+            now = self._cell.node.loop.time()
+            missed = max(0, int((now - self._due) / self._interval))
+            self._due += self._interval * (missed + 1)
+            self._arm()
+
+    def taken(self) -> bool:
+        """Its turn has come: whether it still counts."""
+        counts, self._queued = self._queued, False
+        if self._interval is None and self._cell.more is not None:
+            self._cell.more.timers.discard(self)
+        return counts
+
+
+class Tick(Item):
+    """A timer's message in the mailbox."""
+
+    __slots__ = ("timer",)
+
+    def __init__(self, timer: Timer) -> None:
+        self.timer = timer
+
+    @property
+    def message(self) -> Message[Any]:
+        """What the timer sends."""
+        return self.timer.message
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        timer: Timer = item.timer
+        if not timer.taken():
+            return None
+        return actor._table[type(timer.message)](actor, timer.message)

@@ -1,0 +1,129 @@
+"""Who occupies the event loop: a thread that looks, now and then, at what the loop's thread is doing.
+
+Nothing is measured per message: a turn that is seen twice, in the very same call, without the loop having come to
+anything else in between, has been going on all the while.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import types
+from typing import TYPE_CHECKING, Any
+
+from .errors import SpecError, type_name
+from .events import LoopLagged, TurnSlow
+from .kernel import loop as run_loop
+
+if TYPE_CHECKING:
+    from .kernel.node import Node
+
+LOOKS = 4
+"""How often a turn is looked at within the time it may take."""
+TURN = run_loop.run_turns.__code__
+"""In its frame: the cell. The frame above it is the handler's, or that of the item it is in; new for each turn."""
+RUNNER = run_loop.Runner._run.__code__
+"""In its frame: the turn that the runner has."""
+
+
+def check_limits(lag: float | None, turns: float | None) -> tuple[float | None, float | None]:
+    """The limits, if each is None or a number > 0. Raises SpecError."""
+    for name, limit in (("watch_lag", lag), ("watch_turns", turns)):
+        if limit is not None and not (isinstance(limit, (int, float)) and 0 < limit < float("inf")):
+            raise SpecError("ActorSystem", f"{name} must be seconds > 0, not {limit!r}")
+    return lag, turns
+
+
+class LoopWatch:
+    """Tells of turns that occupy the loop, and of a loop that lags. Off unless it is asked for.
+
+    Args:
+        node: whose loop and events.
+        lag: seconds by which the loop may come late before LoopLagged is told; None: it is not watched.
+        turns: seconds a turn may occupy the loop before TurnSlow is told; None: they are not watched.
+    """
+
+    def __init__(self, node: Node, lag: float | None, turns: float | None) -> None:
+        self._node, self._lag, self._turns = node, lag, turns
+        self._over = threading.Event()
+        self._loop_thread = threading.get_ident()
+        self._thread: threading.Thread | None = None
+        self._timer: Any = None
+        self._let_go = True  # whether the loop has come to something else since the last look
+
+    def open(self) -> None:
+        """Begin to watch the loop that runs in this thread."""
+        if self._lag is not None:
+            self._arm(self._lag)
+        if self._turns is not None:
+            self._thread = threading.Thread(target=self._look, name="holdfast watch", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """No more of it."""
+        self._over.set()
+        if self._timer is not None:
+            self._timer.cancel()
+        if self._thread is not None:
+            self._thread.join()
+
+    # -- the loop ---------------------------------------------------------------------------------------------------
+
+    def _arm(self, lag: float) -> None:
+        loop = self._node.loop
+        self._timer = loop.call_later(lag, self._came, time.monotonic() + lag, lag)
+
+    def _came(self, due: float, lag: float) -> None:
+        late = time.monotonic() - due
+        if late > lag:
+            self._node.emit(LoopLagged(self._node.name, late))
+        self._arm(lag)
+
+    # -- the turns (in the watching thread) -------------------------------------------------------------------------
+
+    def _look(self) -> None:
+        limit = self._turns
+        assert limit is not None
+        seen: types.FrameType | None = None
+        since = 0.0
+        is_told = False
+        while not self._over.wait(limit / LOOKS):
+            found = _running(sys._current_frames().get(self._loop_thread))
+            now, let_go, self._let_go = time.monotonic(), self._let_go, found is None
+            if found is not None:
+                self._node.loop.call_soon_threadsafe(self._lets_go)
+            if found is None or let_go or found[0] is not seen:
+                seen, since, is_told = (None if found is None else found[0]), now, False
+            elif not is_told and now - since >= limit:
+                is_told = True
+                self._node.loop.call_soon_threadsafe(self._tell, found[1], found[2], since)
+
+    def _lets_go(self) -> None:
+        self._let_go = True
+
+    def _tell(self, address: str, message: str, since: float) -> None:
+        """Comes to run when the turn lets the loop go: then it is known how long it took."""
+        self._node.emit(TurnSlow(address, message, time.monotonic() - since))
+
+
+def _running(frame: types.FrameType | None) -> tuple[types.FrameType, str, str] | None:
+    """The turn in a stack: the frame that stands for it, the actor's address, the type of what it handles."""
+    above: types.FrameType | None = None
+    while frame is not None:
+        code = frame.f_code
+        if code is TURN and above is not None:
+            cell, item = frame.f_locals.get("cell"), frame.f_locals.get("item")
+            return (above, *_named(cell, item)) if cell is not None else None
+        if code is RUNNER and above is not None:
+            turn = frame.f_locals.get("turn")
+            if turn is None:
+                return None
+            return (above, *_named(turn.cell, turn.item))
+        above, frame = frame, frame.f_back
+    return None
+
+
+def _named(cell: Any, item: Any) -> tuple[str, str]:
+    message = getattr(item, "message", None)
+    return cell.path, type_name(type(item if message is None else message))

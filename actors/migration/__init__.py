@@ -1,0 +1,1 @@
+"""Migration: the same life goes on at another place."""

@@ -1,0 +1,319 @@
+"""Moving a life: how the old one is brought to rest between two turns, and the new one held until it is the one.
+
+What both sides of a process border need is here; who decides is `system/live_moves.py`.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+from ..control.orders_lane import Call
+from ..errors import HoldfastError, error_text
+from ..kernel import lifecycle, mailbox
+from ..kernel.cell import GONE, RUNNING, Cell, Host
+from ..kernel.codec import Parcel
+from ..kernel.context import Piped
+from ..kernel.envelope import LEAVE, Ask, Envelope, Item
+from ..kernel.lifecycle import LOCAL, Kill
+from ..kernel.timers import Tick
+from ..process.wire.peer import RelayedAsk
+from .luggage import Owe, Stays
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from ..exit_reasons import ExitReason
+    from ..kernel.actor import Actor
+
+ATTEMPTS = itertools.count(1)
+"""Numbers of attempts to have an actor in another process come to rest: what it says to an earlier one is void."""
+LOOK_AGAIN = 0.005
+"""Seconds between two looks at whether background work is over."""
+
+
+class Take(Item):
+    """A command: come to rest, as soon as no background work is out, with the state packed. Until then all goes on."""
+
+    __slots__ = ("_ignored", "_owe", "_refused", "_taken", "is_done", "is_void", "why")
+
+    def __init__(
+        self,
+        owe: Owe,
+        taken: Callable[[Actor, bytes], None],
+        refused: Callable[[str], None],
+        ignored: tuple[str, ...] = (),
+    ) -> None:
+        self._owe, self._taken, self._refused = owe, taken, refused
+        self._ignored = ignored  # children that are not the actor's own
+        self.is_done = False  # the actor is at rest
+        self.is_void = False  # it is not wanted any more
+        self.why = "a turn of it has not ended"
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        take: Take = item
+        ctx = actor.ctx
+        cell: Cell = ctx.cell
+        if take.is_void or ctx.postpones(take) or any(map(_ends, cell.extra().urgent or ())):
+            return None
+        take.why = _busy(cell)
+        if take.why:
+            cell.node.loop.call_later(LOOK_AGAIN, take._again, cell, cell.life)
+            return None
+        try:
+            children = [name for name in cell.children or () if name not in take._ignored]
+            if children:
+                raise Stays(
+                    f"it has children of its own ({', '.join(children)}): have a supervisor start them beside it"
+                )
+            state = ctx.depart(take._owe)
+            take._taken(actor, state)
+        except BaseException as error:  # The user's own code, such as `get_state`: no reason to end the actor.
+            take._refused(str(error) if isinstance(error, HoldfastError) else error_text(error))
+            return None
+        take.is_done = True
+        for timer in cell.extra().timers:
+            timer.pause()
+        return LEAVE  # And stays `scheduled`, so that nobody puts it on the run queue.
+
+    def _again(self, cell: Cell, life: int) -> None:
+        if not self.is_void and cell.state is RUNNING and cell.life == life:
+            lifecycle.urge(cell, self)
+
+
+def _ends(command: Item) -> bool:
+    """Whether a command is one to stop or to be killed."""
+    return isinstance(command, Kill) or hasattr(command, "reason")
+
+
+def _busy(cell: Cell) -> str:
+    """Why an actor cannot be brought to rest yet; "" if it can."""
+    more = cell.extra()
+    if more.tasks:
+        return "background work (pipe_to_self, create_task) is out"
+    own = cell.node.uplink if cell is cell.node.root else None  # Else what it has passed on is answered from here on.
+    for item in cell.queue or ():
+        if isinstance(item, Piped):
+            return "the result of background work waits for its turn"
+        if own is not None and isinstance(item, Ask) and not isinstance(item, RelayedAsk) and not item.is_done:
+            return "it waits for a reply of its own"
+    if own is not None and any(isinstance(ask, RelayedAsk) and not ask.is_done for ask in own.pending.values()):
+        return "an ask that it has passed on is not answered"
+    return ""
+
+
+def resume(cell: Cell) -> None:
+    """The life that had been brought to rest goes on where it was."""
+    for timer in cell.extra().timers:
+        timer.resume()
+    lifecycle.up(cell)
+
+
+class Settle(Item):
+    """Behind `on_start` in the queue of a new life: it is up, and handles nothing until it is let go."""
+
+    __slots__ = ("settled",)
+
+    def __init__(self, settled: asyncio.Future[None]) -> None:
+        self.settled = settled
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        if not item.settled.done():
+            item.settled.set_result(None)
+        return LEAVE
+
+
+class Transit:
+    """Stands for the host of an actor that is at rest: what is asked for is done when it is known where it lives."""
+
+    def __init__(self, old: Host, give_up: Callable[[str], None]) -> None:
+        self.old, self._give_up = old, give_up
+        self.waiting: list[Callable[[Host], object]] = []
+        self.is_killed = False
+        self.takes_parcels = old.takes_parcels
+
+    def start(self, cell: Cell) -> asyncio.Future[None] | None:
+        raise HoldfastError(f"{cell.path} is alive: it is being moved")
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.waiting.append(lambda host: host.stop(cell, reason))
+
+    def kill(self, cell: Cell) -> None:
+        self.is_killed = True
+        self._give_up("it is killed")
+
+    def retired(self, cell: Cell) -> None:
+        self.old.retired(cell)
+
+    def push(self, cell: Cell, item: Item) -> None:
+        self.waiting.append(lambda host: host.push(cell, item))
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
+
+    def progress(self, cell: Cell) -> object:
+        return None
+
+    def recovers(self, reason: ExitReason) -> bool:
+        return self.old.recovers(reason)
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        cell.admit(cell, item)
+        return None
+
+    def control(self, cell: Cell, call: Call) -> None:
+        self.waiting.append(lambda host: host.control(cell, call))
+
+    def is_up(self, cell: Cell) -> bool:
+        return True
+
+    def backlog(self, cell: Cell) -> int:
+        return sum(map(mailbox.counts, cell.queue or ()))
+
+    def load(self, cell: Cell) -> int:
+        return len(cell.queue or ())
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        self.waiting.append(lambda host: host.told(cell, verb, data))
+
+    def over(self, cell: Cell, host: Host) -> None:
+        """It is known where the actor lives: there."""
+        cell.host = host
+        for do in self.waiting:
+            do(host)
+        if self.is_killed:
+            host.kill(cell)
+
+
+def twin(cell: Cell) -> Cell:
+    """Another cell at the same address, found by nobody: for a life that is not the one there yet, or any more."""
+    other = Cell(cell.node, cell.parent, cell.name, LOCAL)
+    other.table, other.life, other.state = cell.table, cell.life, RUNNING
+    return other
+
+
+def settle(twin: Cell, cell: Cell) -> None:
+    """The life at a twin, which is at rest, becomes that of the cell itself. The queues are left to the caller."""
+    ctx, node = twin.ctx, cell.node
+    assert ctx is not None
+    cell.actor, cell.ctx, cell.context, cell.table = twin.actor, ctx, twin.context, twin.table
+    ctx.cell = cell
+    mine, its = cell.extra(), twin.extra()
+    mine.timers, mine.tasks, mine.stash = its.timers, its.tasks, its.stash
+    mine.trap_exits = its.trap_exits
+    for timer in mine.timers:
+        timer.belongs_to(cell)
+    for topic in list(its.topics):
+        node.topics.unsubscribe(topic, twin)
+        node.topics.subscribe(topic, cell)
+    for name in its.names:
+        node.names[name] = cell
+        mine.names.append(name)
+    for peer in its.links:
+        peer.extra().links.pop(twin, None)
+        peer.extra().links[cell] = mine.links[peer] = None
+    for watch in its.watching:
+        watch.watcher, watch.life = cell, cell.life
+        mine.watching[watch] = None
+    mine.monitors += its.monitors
+    for watch in its.monitors:
+        watch.target = cell
+    for child in (twin.children or {}).values():
+        child.parent = cell
+        cell.children = {**(cell.children or {}), child.name: child}
+    _forward(twin)
+
+
+def _forward(twin: Cell) -> None:
+    """Whoever has a ref to the twin reaches the actor all the same."""
+    twin.actor = twin.ctx = twin.context = twin.children = twin.queue = twin.more = None
+    twin.state, twin.admit = GONE, mailbox.admit_gone
+
+
+def part(cell: Cell) -> Cell:
+    """The life at a cell, which is at rest, becomes that of a twin; the cell has none in this process any more.
+
+    What belongs to the address (links, monitors, names, topics, bindings, the queue) stays.
+    """
+    old, more = twin(cell), cell.extra()
+    ctx = cell.ctx
+    assert ctx is not None
+    old.actor, old.ctx, old.context = cell.actor, ctx, cell.context
+    ctx.cell = old
+    its = old.extra()
+    its.timers, more.timers = more.timers, set()
+    its.tasks, more.tasks = more.tasks, set()
+    its.bindings = more.bindings
+    for timer in list(its.timers):
+        timer.belongs_to(old)
+        timer.cancel()
+    cell.actor = cell.ctx = cell.context = None
+    more.trap_exits = more.suspended = False
+    more.stash = None
+    return old
+
+
+def farewell(old: Cell, stop: Item) -> None:
+    """Have the life at a twin end; nobody is told but the actor itself."""
+    old.queue = None
+    if old.ctx is not None:
+        old.ctx.hand_on_promises()
+    mailbox.queue_of(old).append(stop)
+    lifecycle.up(old)
+
+
+# -- the queue -------------------------------------------------------------------------------------------------------
+
+
+def sorted_out(cell: Cell, *, ticks: bool = False) -> tuple[list[Any], list[Item]]:
+    """Empty the queue of a cell: what is for the actor wherever it lives, and the commands ahead of it."""
+    more = cell.extra()
+    items: list[Any] = []
+    for item in list(cell.queue or ()):
+        if isinstance(item, Item) and (item is mailbox.HOLD or item is mailbox.NOTHING or item.is_command):
+            continue
+        if isinstance(item, Settle) or (isinstance(item, Tick) and not ticks):
+            continue  # Ticks of an actor that leaves are with its timers.
+        items.append(item)
+    commands = list(more.urgent or ())
+    more.urgent, cell.queue = None, None
+    return items, commands
+
+
+def obey_commands(cell: Cell, commands: list[Item]) -> None:
+    """What had been ordered of a life before it was moved is ordered of it now."""
+    for command in commands:
+        if isinstance(command, Call):
+            cell.host.control(cell, command)
+        elif isinstance(command, Kill):
+            cell.host.kill(cell)
+        elif _ends(command):
+            cell.host.stop(cell, command.reason)  # type: ignore[attr-defined]  # each kind of stop has one
+
+
+def decoded(cell: Cell, item: Any) -> Any:
+    """An item whose message came encoded, as its actor takes it here; None if it is none of its messages."""
+    message = item.message if isinstance(item, (Ask, Envelope)) else item
+    if type(message) is not Parcel:
+        return item
+    try:
+        plain = cell.node.codec.decode(cell.table.kind_named(message.name), message.body)
+    except Exception as error:  # msgspec's own, or what a hook raised: all say that it does not fit.
+        if isinstance(item, Ask):
+            item.fail(error if isinstance(error, HoldfastError) else HoldfastError(str(error)))
+        else:
+            cell.node.dead_letter(cell, message, error_text(error))
+        return None
+    if item is message:
+        return plain
+    item.message = plain
+    return item
+
+
+def now() -> float:
+    """A clock that all processes of this machine share."""
+    return time.monotonic()

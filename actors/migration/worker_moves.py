@@ -1,0 +1,298 @@
+"""Moves as an actor process sees them: an actor that arrives here, or leaves."""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, cast
+
+from ..errors import HoldfastError, error_text
+from ..exit_reasons import unpack_exit
+from ..kernel import lifecycle, mailbox
+from ..kernel.actor import Actor, Start
+from ..kernel.cell import RUNNING, Cell
+from ..kernel.context import ActorContext
+from ..kernel.envelope import Ask, Item
+from ..kernel.links import Monitor
+from ..process.wire import frames
+from ..process.wire.connection import BadFrame, Connection
+from ..process.wire.peer import Arrived, RelayedAsk
+from ..process.wire.start_codec import unpack_recipe
+from ..values import decode_value, encode_value
+from .luggage import pack_items, pack_rest, unpack
+from .quiesce import Settle, Take, now, resume
+
+if TYPE_CHECKING:
+    from ..kernel.cell import Admit
+    from ..process.worker_node import Guest
+
+PIECE = 4 * 1024 * 1024
+"""Bytes of luggage per frame: it may be larger than a frame can be."""
+
+
+def send_step(connection: Connection, path: str, attempt: int, step: str, **told: Any) -> None:
+    """Send one word of a move. It carries the number of its attempt, both ways: words of an earlier one are void."""
+    data = {"step": step, "attempt": attempt, **told}
+    connection.send(frames.Command(connection.name_out(path), "move", data), path)
+
+
+def send_luggage(connection: Connection, path: str, attempt: int, step: str, luggage: dict[str, Any]) -> None:
+    """Send what an actor takes along, in pieces."""
+    data = encode_value(luggage, where=path)
+    for at in range(0, len(data), PIECE):
+        is_last = at + PIECE >= len(data)
+        connection.send(frames.Piece(connection.name_out(path), attempt, step, data[at : at + PIECE], is_last), path)
+
+
+def word_of(piece: frames.Piece) -> dict[str, Any]:
+    """A piece as a word of its move."""
+    return {"step": piece.step, "attempt": piece.attempt, "part": piece.part, "is_last": piece.is_last}
+
+
+class Luggage:
+    """What comes in pieces; `imports`: from the root, which may have modules imported."""
+
+    def __init__(self, *, imports: bool) -> None:
+        self._imports = imports
+        self._parts: list[bytes] = []
+
+    def take(self, data: dict[str, Any]) -> dict[str, Any] | None:
+        """One more piece; the whole if it was the last."""
+        self._parts.append(data["part"])
+        if not data["is_last"]:
+            return None
+        whole = b"".join(self._parts)
+        self._parts.clear()
+        return cast("dict[str, Any]", decode_value(whole, imports=self._imports))
+
+
+class GuestMoves:
+    """The moves of the actors of a process: its own, or those below its supervisor; one attempt at a time for each."""
+
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+        self._attempts: dict[str, GuestMove] = {}  # by address: the actor that arrives has no cell yet
+
+    def obey(self, cell: Cell, data: dict[str, Any]) -> None:
+        """Do the next step of a move. The words of the root come in order: a new number ends an earlier attempt.
+
+        Raises:
+            BadFrame: there is no such step.
+        """
+        step, number = data.get("step"), data.get("attempt")
+        if step == "leave":  # It follows no attempt: the actor lives elsewhere, for good.
+            self._attempts.pop(cell.path, None)
+            _leave(cell, data)
+            return
+        if not isinstance(number, int):
+            raise BadFrame(f"step {step!r} of a move has no attempt")
+        attempt = self._attempts.get(cell.path)
+        if attempt is None or attempt.number != number:
+            attempt = self._attempts[cell.path] = GuestMove(self._guest, number)
+        attempt.obey(cell, data)
+
+    @staticmethod
+    def prepare(recipe: bytes) -> None:
+        """Import what an actor needs, and see whether it can be constructed.
+
+        Raises:
+            SpecError: its class cannot be imported. TypeError: its arguments do not fit.
+        """
+        unpack_recipe(recipe).check()
+
+    def begin(self, cell: Cell, start: Start[Any]) -> asyncio.Future[None]:
+        """Begin the life of an actor that is moved here; the future ends when it is up. It handles nothing yet.
+
+        Raises:
+            HoldfastError, or what `set_state` raises.
+        """
+        attempt = self._attempts.get(cell.path)
+        if attempt is None:
+            raise BadFrame("an actor came without its state")
+        return attempt.begin(cell, start)
+
+
+class GuestMove:
+    """One attempt to move one actor into this process or out of it."""
+
+    def __init__(self, guest: Guest, number: int) -> None:
+        self._guest = guest
+        self.number = number
+        self._incoming = Luggage(imports=True)
+        self._luggage: dict[str, Any] | None = None
+        self._take: Take | None = None
+        self._state = b""
+        self._stash: list[Any] = []
+        self._admit: Admit | None = None
+
+    def _say(self, step: str, **told: Any) -> None:
+        root = self._guest.node.root
+        assert root is not None
+        send_step(self._guest.connection, root.path, self.number, step, **told)
+
+    def obey(self, cell: Cell, data: dict[str, Any]) -> None:
+        """Do the next step.
+
+        Raises:
+            BadFrame: there is no such step.
+        """
+        match data.get("step"):
+            case "luggage":
+                self._luggage = self._incoming.take(data)
+            case "stash":
+                self._admit, cell.admit = cell.admit, self._put_aside
+            case "go":
+                self._go(cell, suspended=bool(data["suspended"]))
+            case "take":
+                self._take = Take(_number, self._taken, lambda why: self._say("refused", why=why))
+                if cell.state is RUNNING:
+                    lifecycle.urge(cell, self._take)
+            case "pack":
+                self._pack(cell)
+            case "back":
+                self._back(cell)
+            case step:
+                raise BadFrame(f"a move has no step {step!r}")
+
+    def _put_aside(self, cell: Cell, item: Any) -> None:
+        if isinstance(item, Item):
+            item.stashed()  # It has no place in the order of arrival.
+        self._stash.append(item)
+
+    # -- arriving ---------------------------------------------------------------------------------------------------
+
+    def begin(self, cell: Cell, start: Start[Any]) -> asyncio.Future[None]:
+        """Begin the life that arrives.
+
+        Raises:
+            HoldfastError, or what `set_state` raises.
+        """
+        luggage, self._luggage = self._luggage, None
+        if luggage is None:
+            raise BadFrame("an actor came without its state")
+        cell.life += 1
+        lifecycle.build(cell, start, ActorContext)
+        cell.state = RUNNING
+        actor, rest = cell.actor, luggage["rest"]
+        assert actor is not None
+        watches = [self._watch(cell, path, for_good) for path, for_good in rest["watches"]]
+        for path in rest["links"]:
+            peer = self._guest.node.cell_at(path)
+            cell.extra().links[peer] = peer.extra().links[cell] = None
+        unpack(actor, luggage["state"], rest, self._owed, lambda path, for_good: _found(watches, path, for_good))
+        return await_up(cell, start)
+
+    def _watch(self, cell: Cell, path: str, for_good: bool) -> Monitor:
+        """A watch that the root keeps already."""
+        watch = Monitor(cell, self._guest.node.cell_at(path), for_good)
+        watch.target.extra().monitors.append(watch)
+        cell.extra().watching[watch] = None
+        return watch
+
+    def _owed(self, key: int) -> Ask:
+        """An ask that the root waits with for its reply."""
+        return RelayedAsk(None, None, (), 0.0, 0.0, None, None, True, self._guest, key)
+
+    def _go(self, cell: Cell, *, suspended: bool) -> None:
+        if self._admit is not None:
+            cell.admit, self._admit = self._admit, None
+        more = cell.extra()
+        if self._stash:
+            more.stash, self._stash = deque(self._stash), []
+        if suspended:
+            more.suspended = True
+            mailbox.hold(cell)
+        lifecycle.up(cell)
+        self._say("began", at=now())
+
+    # -- leaving ----------------------------------------------------------------------------------------------------
+
+    def _taken(self, actor: Actor, state: bytes) -> None:
+        self._state = state
+        more = actor.ctx.cell.extra()
+        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=more.suspended)
+
+    def _pack(self, cell: Cell) -> None:
+        """Nothing comes any more: send what there is."""
+        actor, page = cell.actor, self._guest.page
+        assert actor is not None
+
+        def entry(item: Item) -> list[Any] | None:
+            if isinstance(item, RelayedAsk):
+                return ["ask", item.id]
+            if isinstance(item, Arrived) and item.page is page:
+                return ["number", item.number]
+            return None
+
+        try:
+            luggage = {
+                "state": self._state,
+                "rest": pack_rest(actor),
+                "stash": pack_items(cell, cell.extra().stash or (), entry),
+                "queue": pack_items(cell, cell.queue or (), entry),
+            }
+            send_luggage(self._guest.connection, cell.path, self.number, "packed", luggage)
+        except Exception as error:  # Whatever a message of the actor's own raises while it is encoded.
+            why = str(error) if isinstance(error, HoldfastError) else error_text(error)
+            self._say("refused", why=why)
+
+    def _back(self, cell: Cell) -> None:
+        """The actor stays after all, or is not to be taken any more."""
+        take, self._take, self._state = self._take, None, b""
+        if take is None:
+            return
+        take.is_void = True
+        if take.is_done and cell.state is RUNNING:
+            resume(cell)
+
+
+def _leave(cell: Cell, data: dict[str, Any]) -> None:
+    """The actor lives elsewhere: what is left here ends, and tells nobody."""
+    more = cell.extra()
+    for kept in (more.links, more.topics, more.monitors):
+        kept.clear()
+    if cell.queue is not None:
+        cell.queue.clear()
+    more.urgent = more.stash = None
+    if cell.ctx is not None:
+        cell.ctx.hand_on_promises()
+    cell.request_stop(unpack_exit(data["reason"]))
+    lifecycle.up(cell)
+
+
+def await_up(cell: Cell, start: Start[Any]) -> asyncio.Future[None]:
+    """Have `on_start(True)` run as the first turn of a built life, and the life hold still behind it."""
+    loop, more = cell.node.loop, cell.extra()
+    settled: asyncio.Future[None] = loop.create_future()
+    queue = mailbox.queue_of(cell)
+    queue.appendleft(Settle(settled))
+    if start.kind.on_start is not Actor.on_start:
+        more.starting = loop.create_future()
+        more.starting.add_done_callback(lambda done: _failed(done, settled))
+        queue.appendleft(lifecycle.FirstTurn(True, more.starting))
+    cell.scheduled = False
+    cell.schedule()
+    return settled
+
+
+def _failed(started: asyncio.Future[None], settled: asyncio.Future[None]) -> None:
+    error = None if started.cancelled() else started.exception()
+    if error is not None and not settled.done():
+        settled.set_exception(error)
+        settled.exception()  # Seen: whoever waits may have given up.
+
+
+def _number(ask: Ask) -> int:
+    """The number under which the root knows an ask."""
+    if not isinstance(ask, RelayedAsk):
+        raise HoldfastError("it can answer itself only here")
+    return ask.id
+
+
+def _found(watches: list[Monitor], path: str, for_good: bool) -> Monitor:
+    return next(watch for watch in watches if watch.target.path == path and watch.for_good is for_good)
+
+
+Answered = Callable[[dict[str, Any]], None]
+"""Who hears at the root what a process says of a move."""

@@ -1,0 +1,518 @@
+"""Actors in OS processes of their own, seen from the root: their home (queue, what is in flight) and their life.
+
+The home stays when the process dies. What was sent and not begun is sent again to the next life; the page, memory that
+both sides share and that survives a SIGKILL, says how far the dead one came.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Coroutine
+from time import monotonic
+from typing import TYPE_CHECKING, Any
+
+from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
+from ..events import ActorStarted, StoreRefused
+from ..exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
+from ..kernel import lifecycle, links, mailbox
+from ..kernel.cell import DOWN, GONE, RUNNING, Cell
+from ..kernel.codec import Parcel
+from ..kernel.envelope import Ask, Envelope, Item
+from ..migration.worker_moves import word_of
+from ..persistence import child_key
+from .resource_limits import Limits
+from .wire import frames
+from .wire.connection import BadFrame
+from .wire.peer import obey, send_signal
+from .wire.start_codec import pack_recipe
+from .worker_pool import Worker, Workers
+
+if TYPE_CHECKING:
+    from ..control.orders_lane import Call
+    from ..kernel.node import Node
+
+
+class Outlet:
+    """The way from an address to the process its actor lives in, and what is on the way."""
+
+    __slots__ = ("begun", "flight", "path", "sent", "worker")
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.begun = 0  # the newest that has been begun, as far as it was looked at
+        self.worker: Worker | None = None
+        self.flight: deque[tuple[int, Any]] = deque()  # (number, item), oldest first, until the page says done
+        self.sent = 0
+
+    def hand_over(self, cell: Cell, item: Any) -> None:
+        """Send what was queued, the runtime's own signals among it."""
+        worker = self.worker
+        assert worker is not None
+        if isinstance(item, (links.Exit, links.Down)):
+            send_signal(worker, self.path, item)
+        else:
+            self.send(cell, item)
+
+    def send(self, cell: Cell, item: Any) -> None:
+        """Send to the process; raises BadMessage if the item cannot be coded."""
+        worker = self.worker
+        assert worker is not None
+        number = self.sent + 1
+        name = worker.kinds_out.get(type(item))
+        if name is None:
+            worker.send_item(cell, self.path, item, number)
+        else:  # A plain message of a type that was sent before: all names are numbers.
+            connection = worker.connection
+            connection.tell(connection.name_out(self.path), name, item, number, self.path)  # type: ignore[arg-type]
+        self.sent = number
+        flight = self.flight
+        flight.append((number, item))
+        done = worker.page[1]
+        try:
+            while flight[0][0] <= done:  # What has been handled is let go soon: a large message is large memory.
+                flight.popleft()
+        except IndexError:  # Not even this one is left, and it has not gone out yet.
+            worker.breach(f"its page says that message {done} is done, and {number} were sent")
+
+    def trim(self) -> None:
+        """Forget what has been handled."""
+        worker, flight = self.worker, self.flight
+        done = worker.number(1, self.sent) if worker is not None else 0
+        while flight and flight[0][0] <= done:
+            flight.popleft()
+
+    @property
+    def has_room(self) -> bool:
+        """Whether the process keeps up."""
+        return self.worker is None or self.worker.connection.has_room
+
+    def room(self) -> asyncio.Future[None] | None:
+        """None when the process keeps up."""
+        return self.worker.connection.room() if self.worker is not None else None
+
+    def close(self) -> tuple[list[Any], list[Any]]:
+        """The process is gone. Returns what was being handled and what was not begun, in order."""
+        worker, self.worker = self.worker, None
+        numbers = (0, 0) if worker is None else (worker.number(0, self.sent), worker.number(1, self.sent))
+        running, done = numbers
+        flight, self.flight, self.sent, self.begun = self.flight, deque(), 0, 0
+        begun = [item for number, item in flight if number == running > done]
+        queued = [item for number, item in flight if number > max(running, done)]
+        for item in queued:
+            if isinstance(item, Ask):
+                item.started = False
+        return begun, queued
+
+
+def admit_remote(cell: Cell, item: Any) -> None:
+    """The mailbox of an actor in another process: sent at once, or kept until the process is up."""
+    if type(item) not in cell.table and type(item) is not Parcel:
+        _require(cell, item)
+    outlet: Outlet = cell.more.outlet  # type: ignore[union-attr]  # made before this function stands there
+    cell.node.check_thread(outlet.path)
+    if outlet.worker is None:
+        _check_codable(cell, item)
+        mailbox.queue_of(cell).append(item)
+    else:
+        outlet.send(cell, item)
+
+
+def admit_remote_bounded(cell: Cell, item: Any) -> None:
+    """As `admit_remote`, with a capacity: what is queued here counts, and what is sent and not begun."""
+    if type(item) not in cell.table and type(item) is not Parcel:
+        _require(cell, item)
+    more = cell.extra()
+    cell.node.check_thread(cell.path)
+    _check_codable(cell, item)
+    assert more.bound is not None
+    more.bound.admit(cell, item)
+
+
+class RemoteBound(mailbox.Bound):
+    """The bound of a mailbox whose actor lives in another process.
+
+    What is sent cannot be dropped any more. So a policy that drops queued messages sends one at a time.
+    """
+
+    __slots__ = ("_at_once",)
+
+    def __init__(self, bound: mailbox.Bound) -> None:
+        super().__init__(bound.capacity, bound.overflow)
+        self._at_once = 1 if bound.overflow in ("drop_oldest", "latest") else bound.capacity + 1
+
+    def admit(self, cell: Cell, item: Any) -> None:
+        if self.count >= self.capacity:
+            self.moved(cell)  # The page may be ahead of what we were told.
+        super().admit(cell, item)
+
+    def has_room(self, cell: Cell) -> bool:
+        if self.count >= self.capacity:
+            self.moved(cell)
+        return super().has_room(cell)
+
+    def put(self, cell: Cell, item: Any) -> None:
+        self.count += 1
+        mailbox.queue_of(cell).append(item)
+        self.send(cell)
+
+    def send(self, cell: Cell) -> None:
+        """Send what is queued, as far as it may go."""
+        outlet: Outlet = cell.extra().outlet
+        queue = mailbox.queue_of(cell)
+        if outlet.worker is None:
+            return
+        outlet.trim()
+        while queue and len(outlet.flight) < self._at_once:
+            item = deque.popleft(queue)  # It still counts.
+            try:
+                outlet.hand_over(cell, item)
+            except BadMessage as error:
+                self.count -= mailbox.counts(item)
+                undelivered(cell, item, error)
+
+    def moved(self, cell: Cell) -> None:
+        """The actor has begun or ended turns."""
+        outlet: Outlet = cell.extra().outlet
+        if outlet.worker is None:
+            return
+        begun = max(outlet.begun, outlet.worker.number(0, outlet.sent))
+        freed, outlet.begun = begun - outlet.begun, begun
+        for _ in range(freed):
+            self.taken(cell)
+        self.send(cell)
+
+    def recount(self, cell: Cell) -> None:
+        """The process is gone: what counts is what is queued."""
+        self.count = sum(map(mailbox.counts, cell.queue or ()))
+
+
+def undelivered(cell: Cell, item: Any, error: HoldfastError) -> None:
+    """A queued item turned out not to be sendable."""
+    if isinstance(item, Ask):
+        item.fail(error)
+    else:
+        cell.node.dead_letter(cell, item, str(error))
+
+
+def _require(cell: Cell, item: Any) -> None:
+    if not isinstance(item, (Ask, Envelope)):
+        cell.require(item)
+
+
+def _check_codable(cell: Cell, item: Any) -> None:
+    """Refuse now what could not be sent later."""
+    message = item.message if isinstance(item, (Ask, Envelope)) else item
+    if type(message) is not Parcel:
+        cell.node.codec.encode(message, cell.path)
+
+
+class Elsewhere:
+    """What hosts have in common whose lives are lived in another process: what one does is known there."""
+
+    def worker_of(self, cell: Cell) -> Worker | None:
+        """The process that the present life is lived in, if there is one now."""
+        raise NotImplementedError
+
+
+class ProcessHost(Elsewhere):
+    """The host of actors with a process of their own; one per such address."""
+
+    takes_parcels = True
+
+    def progress(self, cell: Cell) -> object:
+        return None
+
+    def recovers(self, reason: Any) -> bool:
+        return False
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        """The process puts a turn's number on its page first, and only then looks whether its deadline is over."""
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None:
+            return True
+        page = outlet.worker.page
+        return ask.started <= max(page[0], page[1]) or monotonic() < ask.deadline
+
+    def __init__(self, workers: Workers, limits: Limits | None, options: dict[str, Any] | None = None) -> None:
+        self._workers = workers
+        self._limits = limits
+        self._options = options or {}
+        self._starting: asyncio.Task[None] | None = None
+        self._stop_wanted: ExitReason | None = None
+        self.stop_sent: ExitReason | None = None  # the life in the process has been told to stop
+
+    # -- beginning --------------------------------------------------------------------------------------------------
+
+    def start(self, cell: Cell) -> asyncio.Future[None]:
+        """Begin a life in a fresh process."""
+        more = cell.extra()
+        assert more.start is not None
+        cell.table = more.start.kind._table
+        if more.outlet is None:
+            more.outlet = Outlet(cell.path)
+            cell.admit = admit_remote
+            if more.bound is not None:
+                more.bound = RemoteBound(more.bound)
+                cell.admit = admit_remote_bounded
+        return self.begin(cell, self._start(cell))
+
+    def begin(self, cell: Cell, start: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
+        """Run the start of a life outside the supervisor's turn."""
+        self._stop_wanted = self.stop_sent = None
+        self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
+        self._starting.add_done_callback(_seen)
+        return self._starting
+
+    async def take(self, cell: Cell) -> tuple[Worker, bytes]:
+        """A process for the next life at `cell`, which is running from now on, and its recipe.
+
+        Raises:
+            StartFailed: there is none to be had, or the actor was stopped meanwhile.
+        """
+        start = cell.extra().start
+        assert start is not None
+        try:
+            recipe = pack_recipe(start, cell.path)
+            worker = await self._workers.take(again=cell.life > 0)
+        except HoldfastError as error:
+            raise StartFailed(cell.path, str(error)) from error
+        if cell.state is not DOWN:
+            worker.kill(KILLED)
+            raise StartFailed(cell.path, "it was stopped while it started")
+        cell.life += 1
+        cell.state = RUNNING
+        worker.adopt(cell, self._limits, self.died)
+        return worker, recipe
+
+    async def _start(self, cell: Cell) -> None:
+        more = cell.extra()
+        start = more.start
+        assert start is not None
+        worker, recipe = await self.take(cell)
+        for topic in start.kind._topics:
+            cell.node.topics.subscribe(topic, cell)
+        try:
+            await worker.launch(cell, recipe, dict(self._options, bounded=more.bound is not None))
+        except StartFailed:
+            await worker.gone()
+            raise
+        if self._workers.of(cell) is not worker:
+            raise StartFailed(cell.path, str(more.reason))  # It was up, and has died before we came to it.
+        self.up(cell, worker)
+
+    def up(self, cell: Cell, worker: Worker) -> None:
+        """The life is up: send what waits."""
+        node = cell.node
+        if node.watched:
+            node.emit(ActorStarted(cell.path, cell.life))
+        outlet: Outlet = cell.extra().outlet
+        outlet.worker = worker
+        bound, queue = cell.extra().bound, cell.queue
+        if isinstance(bound, RemoteBound):
+            bound.send(cell)
+        else:
+            while queue:
+                item = queue.popleft()
+                try:
+                    outlet.hand_over(cell, item)
+                except BadMessage as error:
+                    undelivered(cell, item, error)
+        if self._stop_wanted is not None:
+            self.stop(cell, self._stop_wanted)
+
+    # -- ending -----------------------------------------------------------------------------------------------------
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        """Ask the actor to end in good order; while it starts, when it is up."""
+        worker = self._workers.of(cell)
+        outlet: Outlet | None = cell.extra().outlet
+        start = cell.extra().start
+        if worker is not None and start is not None and getattr(start.kind, "_supervises", False):
+            self.send_stop(worker, cell, reason)  # A supervisor can end while it starts.
+        elif worker is None or outlet is None or outlet.worker is None:
+            self._stop_wanted = reason
+        else:
+            self.send_stop(worker, cell, reason)
+
+    def send_stop(self, worker: Worker, cell: Cell, reason: ExitReason) -> None:
+        """Tell the process that its actor shall end."""
+        self.stop_sent = reason
+        connection = worker.connection
+        connection.send(frames.Command(connection.name_out(cell.path), "stop", {"reason": pack_exit(reason)}))
+
+    def kill(self, cell: Cell) -> None:
+        """SIGKILL the process."""
+        worker = self._workers.of(cell)
+        if worker is not None:
+            worker.kill(KILLED)
+        elif self._starting is not None:
+            self._starting.cancel()
+
+    def died(self, cell: Cell, reason: ExitReason) -> None:
+        """The process is gone, or the life in it has ended: keep what is queued, fail what was begun."""
+        if cell.state in (DOWN, GONE):
+            return
+        outlet: Outlet = cell.extra().outlet
+        worker = self._workers.of(cell)
+        begun, queued = outlet.close()
+        if queued:
+            mailbox.queue_of(cell).extendleft(reversed(queued))
+        bound = cell.extra().bound
+        if isinstance(bound, RemoteBound):
+            bound.recount(cell)
+        for item in begun:
+            if isinstance(item, Ask):
+                item.fail(AskFailed(cell.path, str(reason)))
+        again = {id(item) for item in queued}
+        if worker is not None:
+            for ask in worker.take_pending():
+                if id(ask) not in again:  # Asks from inside the process, or delayed replies: nobody answers them now.
+                    ask.fail(AskFailed(cell.path, str(reason)))
+        lifecycle.ended(cell, reason)
+
+    def retired(self, cell: Cell) -> None:
+        worker = self._workers.of(cell)
+        if worker is not None:
+            worker.kill(KILLED)
+        elif self._starting is not None and not self._starting.done():
+            self._starting.cancel()  # It waits for a process that is not wanted any more.
+
+    def push(self, cell: Cell, item: Item) -> None:
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None or cell.queue:
+            mailbox.queue_of(cell).append(item)
+        else:
+            send_signal(outlet.worker, cell.path, item)
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        cell.admit(cell, item)
+        return None
+
+    def control(self, cell: Cell, call: Call) -> None:
+        from ..control.orders_lane import send_call
+
+        worker = self._workers.of(cell)
+        if worker is not None:
+            send_call(worker, cell.path, call)
+        else:
+            cell.extra().calls.append(call)  # Sent behind the next launch.
+
+    def is_up(self, cell: Cell) -> bool:
+        outlet: Outlet | None = cell.extra().outlet
+        return outlet is not None and outlet.worker is not None
+
+    def backlog(self, cell: Cell) -> int:
+        queued = sum(map(mailbox.counts, cell.queue or ()))
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None:
+            return queued
+        begun = max(outlet.worker.page[0], outlet.worker.page[1])
+        return queued + sum(number > begun for number, _ in outlet.flight)
+
+    def load(self, cell: Cell) -> int:
+        queued = len(cell.queue or ())
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is None or outlet.worker is None:
+            return queued
+        return queued + int(outlet.sent - outlet.worker.page[1])
+
+    def worker_of(self, cell: Cell) -> Worker | None:
+        return self._workers.of(cell)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        worker = self._workers.of(cell)
+        if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
+            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
+
+
+def _seen(start: asyncio.Task[None]) -> None:
+    """If nobody waits for a start any more, asyncio need not complain of its failure."""
+    if not start.cancelled():
+        start.exception()
+
+
+def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
+    """What comes from an actor process, and has passed its gate: messages for others, and replies."""
+    match frame:
+        case frames.Reply():
+            worker.on_reply(frame)
+        case frames.Tell():
+            worker.on_tell(worker.gate.target(frame.to), frame, None)
+        case frames.Ask():
+            worker.on_ask(worker.gate.target(frame.to), frame, None)
+        case frames.Failure():
+            worker.on_failure(frame)
+        case frames.Moved():
+            worker.on_moved()
+        case frames.Offer():
+            worker.on_offer([worker.gate.target(frame.to)], frame)
+        case frames.Publish():
+            worker.on_offer(node.topics.subscribers(frame.topic), frame, frame.topic)
+        case frames.Command():
+            _command(node, worker, frame)
+        case frames.Launched():
+            worker.on_launched(frame)
+        case frames.Ended():
+            worker.on_ended(frame)
+        case frames.Beat():
+            worker.beat()
+        case frames.Note():
+            worker.on_note(frame)
+        case frames.Record():
+            worker.on_record(frame)
+        case frames.Piece():
+            worker.on_move(word_of(frame))
+        case frames.Forget():
+            worker.on_forget(frame)
+        case frames.Launch() | frames.Run():
+            raise AssertionError(f"{type(frame).__name__} has no way in")
+
+
+def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
+    """What an actor process wants done to an address, or tells of its own."""
+    cell = node.cell_at(worker.connection.name_in(frame.to))
+    match frame.verb:
+        case "move":
+            worker.on_move(frame.data)
+        case "subscribe":
+            node.topics.subscribe(frame.data["topic"], cell)
+        case "unsubscribe":
+            node.topics.unsubscribe(frame.data["topic"], cell)
+        case "born":
+            worker.inner.born(cell, frame.data["path"], frame.data["kind"], frame.data["life"])
+        case "gone":
+            reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
+            worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
+        case "keep":
+            keep(node, frame)
+        case _:
+            obey(node, cell, frame)
+
+
+def keep(node: Node, frame: frames.Command) -> None:
+    """What the supervisors in an actor process say to the keeper, of addresses below their process's own.
+
+    Raises:
+        BadFrame: there is nothing like it to be done.
+    """
+    path, keeper = frame.data["path"], node.keeper
+    try:
+        match frame.data["what"]:
+            case "erase":
+                keeper.erase(path, below=bool(frame.data.get("below")))
+            case "roll_back":
+                keeper.roll_back(path, str(frame.data.get("why", "")))
+            case "blame":
+                keeper.blame(path)
+            case "returned":
+                keeper.returned(path, float(frame.data.get("period", 0.0)))
+            case "note":
+                above, _, name = path.rpartition("/")
+                keeper.note(child_key(above, name), frame.data.get("value"))
+            case what:
+                raise BadFrame(f"an actor process cannot have {what!r} done")
+    except BadFrame:
+        raise
+    except HoldfastError as error:  # The process goes on: it was not its fault, and it has gone on already.
+        node.emit(StoreRefused(path, str(error)))

@@ -1,0 +1,1 @@
+"""External programs, each under a small process that owns it."""

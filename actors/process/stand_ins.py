@@ -1,0 +1,107 @@
+"""The actors inside a process besides its own, as the root knows them: an address each, so that they can be reached."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import TYPE_CHECKING, Any
+
+from ..exit_reasons import ExitReason
+from ..kernel import lifecycle, links
+from ..kernel.actor import Actor, Start
+from ..kernel.cell import RUNNING, Cell, Host
+from ..kernel.codec import Parcel
+from .wire.connection import BadFrame
+from .wire.peer import OutsideHost, Peer
+from .wire.start_codec import loaded
+
+if TYPE_CHECKING:
+    from ..kernel.node import Node
+
+
+class Inner:
+    """Stand-ins below the address of a process's own actor. They end with the process."""
+
+    def __init__(self, node: Node, peer: Peer) -> None:
+        self._node = node
+        self._host = OutsideHost(peer)
+        self._cells: dict[str, Cell] = {}
+
+    def cells(self) -> Collection[Cell]:
+        """All of them that are there."""
+        return self._cells.values()
+
+    def born(self, home: Cell, path: str, kind: str, life: int) -> None:
+        """A life has begun at `path` below `home`.
+
+        Raises:
+            BadFrame: that address is not for this process to give.
+        """
+        cell = self._cells.get(path)
+        if cell is None:
+            cell = self._node.cell_below(*self._place(home, path), self._host)
+            self._cells[path] = cell
+            cell.state, cell.admit = RUNNING, self._admit
+        cell.life = life
+        know(cell, kind)
+
+    def homed(self, home: Cell, path: str, cell: Cell | None, host: Host) -> Cell:
+        """An address below `home` whose own home is here: its cell outlives the process.
+
+        Raises:
+            BadFrame: that address is not for this process to give.
+        """
+        parent, name = self._place(home, path)
+        if cell is None:
+            cell = self._node.cell_below(parent, name, host)
+        elif cell.parent is not parent:  # Those above it ended with their process, and are new.
+            cell.parent = parent
+            parent.children = {**(parent.children or {}), name: cell}
+        self._cells[path] = cell
+        return cell
+
+    def lived_there(self, cell: Cell) -> Host:
+        """What is sent to an address goes into the process from now on; returns its host."""
+        cell.admit = self._admit
+        return self._host
+
+    def _place(self, home: Cell, path: str) -> tuple[Cell, str]:
+        """The cell above an address, and its name there."""
+        above, _, name = path.rpartition("/")
+        parent = home if above == home.path else self._cells.get(above)
+        if parent is None:
+            raise BadFrame(f"{path} is not below {home.path}")
+        return parent, name
+
+    def _admit(self, cell: Cell, item: Any) -> None:
+        """The mailbox of a stand-in: the class is known here, so it is known what it handles."""
+        if type(item) not in cell.table and type(item) is not Parcel:
+            cell.require(item)
+        self._host.admit(cell, item)
+
+    def gone(self, path: str, reason: ExitReason, *, with_parent: bool = False) -> None:
+        """The address is free; `with_parent`: because its supervisor has ended."""
+        cell = self._cells.pop(path, None)
+        if cell is None:
+            return
+        if cell.host is not self._host:
+            cell.host.told(cell, "gone", {"with_parent": with_parent})
+        more = cell.extra()
+        more.reason = reason
+        for topic in list(more.topics):
+            self._node.topics.unsubscribe(topic, cell)
+        lifecycle.retire(cell, reason)
+        links.announce(cell, reason, recovering=False)
+        lifecycle.tell_enders(more, reason)
+
+    def close(self, reason: ExitReason) -> None:
+        """The process is gone: children go before their parents; who is homed here stays."""
+        for path, cell in reversed(list(self._cells.items())):
+            if cell.host is self._host:
+                self.gone(path, reason)
+
+
+def know(cell: Cell, kind: str) -> None:
+    """Have a stand-in refuse what its class does not handle, if that is loaded here."""
+    known = loaded(kind, Actor)
+    if known is not None:
+        cell.extra().start, cell.table = Start(known), known._table

@@ -1,0 +1,471 @@
+"""Messages that cross a process border: how they are sent, taken in and answered. The same on both sides."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import types
+from collections.abc import Callable, Iterable
+from time import monotonic
+from typing import TYPE_CHECKING, Any, cast
+
+from ...errors import AskDeadlock, BadMessage, HoldfastError, type_name
+from ...exit_reasons import ExitReason, pack_exit, unpack_exit
+from ...kernel import links
+from ...kernel.codec import Codec, Parcel, Raw
+from ...kernel.envelope import Ask, Envelope, Item
+from ...kernel.message import Message, message_name
+from . import frames
+from .connection import BadFrame, Connection
+from .pending_sends import Offered
+
+if TYPE_CHECKING:
+    from ...control.orders_lane import Call
+    from ...kernel.cell import Cell
+    from ...kernel.node import Node
+
+Coroutine_ = types.CoroutineType
+
+
+Route = tuple["Cell", Callable[[Any], Any], Callable[[Any], Any]]
+"""Where messages of one type go, and what decodes one of them, or a run."""
+
+
+class Peer:
+    """One end of a connection, with the asks that wait for the other end."""
+
+    def __init__(self, node: Node) -> None:
+        self.node = node
+        self.connection = cast("Connection", None)
+        self.codec: Codec = node.codec
+        self.pending: dict[int, Ask] = {}
+        self._last_id = 0
+        self._is_monotonic = abs(monotonic() - node.loop.time()) < SAME_CLOCK
+        self.routes: dict[tuple[frames.Name, frames.Name], Route] = {}
+        self.kinds_out: dict[type, int] = {}  # the connection's, once there is one
+        self.record_taker: Callable[[str], frames.TakeRecord] = no_records  # the recovery method's, by address
+        self._record_takers: dict[frames.Name, frames.TakeRecord] = {}
+
+    # -- out --------------------------------------------------------------------------------------------------------
+
+    def send_item(self, cell: Cell, path: str, item: Any, number: int) -> None:
+        """Send what `cell.admit` was given to the actor at `path` on the other side.
+
+        Raises:
+            BadMessage: it cannot be coded.
+        """
+        connection = self.connection
+        source, message = None, item
+        if isinstance(item, Item):
+            if isinstance(item, Ask):
+                self._send_ask(cell, path, item, number)
+                return
+            source, message = item.sender, item.message  # type: ignore[attr-defined]  # an envelope, or as one
+        # Names are numbered by first use: here in the order in which the other side reads them.
+        to = connection.name_out(path)
+        name, body = self._payload(message)
+        sender = None if source is None else connection.name_out(source.path)
+        connection.send(frames.Tell(to, name, body, number, sender), path)
+
+    def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
+        connection = self.connection
+        self._last_id = key = self._last_id + 1
+        until = ask.deadline if self._is_monotonic else monotonic() + ask.deadline - self.node.loop.time()
+        to = connection.name_out(path)
+        name, body = self._payload(ask.message)
+        sender = None if ask.sender is None else connection.name_out(ask.sender.path)
+        frame = frames.Ask(key, to, name, body, until, number, sender, ask.chain)
+        connection.send(frame, path)
+        self.pending[key] = ask
+        ask.started = number or True  # From here on only the page of its process knows, if that counts it.
+        if len(self.pending) > 4096 and key % 1024 == 0:
+            self._forget_done()
+
+    def offer(self, path: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
+        """Send a message to `path`; the future ends when it is accepted there.
+
+        Raises:
+            BadMessage: it cannot be coded.
+        """
+        connection = self.connection
+        to = connection.name_out(path)
+        name, body = self._payload(message)
+        source = None if sender is None else connection.name_out(sender.path)
+        key, accepted = self.acceptance()
+        connection.send(frames.Offer(key, to, name, body, source), path)
+        return accepted
+
+    def acceptance(self) -> tuple[int, asyncio.Future[None]]:
+        """A number for the other side to answer under, and the future of its answer."""
+        accepted: asyncio.Future[None] = self.node.loop.create_future()
+        return self.expect(Ask(_ACCEPTANCE, None, (), math.inf, math.inf, accepted)), accepted
+
+    def expect(self, ask: Ask) -> int:
+        """A number under which the other side shall answer this."""
+        self._last_id = key = self._last_id + 1
+        self.pending[key] = ask
+        return key
+
+    def _payload(self, message: Any) -> tuple[frames.Name, Any]:
+        """Type name and body; a parcel is passed on as it is."""
+        kind = type(message)
+        known = self.kinds_out.get(kind)
+        if known is not None:
+            return known, message
+        if kind is Parcel:
+            return self.connection.name_out(message.name), Raw(message.body)
+        name = self.connection.name_out(message_name(kind))
+        if type(name) is int:  # Text introduces the name with this frame: known from the next one on.
+            self.kinds_out[kind] = name
+        return name, message
+
+    def _forget_done(self) -> None:
+        """Drop asks that expired: their replies, if any come, are late."""
+        self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
+
+    def join(self, connection: Connection) -> None:
+        """Speak over this connection."""
+        self.connection, self.kinds_out = connection, connection.kinds_out
+
+    def on_forget(self, frame: frames.Forget) -> None:
+        """The other side gives all its names anew."""
+        self.connection.forget_in()
+        self.routes.clear()
+        self._record_takers.clear()
+
+    def fail_pending(self, error: HoldfastError) -> None:
+        """The other side is gone."""
+        pending, self.pending = self.pending, {}
+        for ask in pending.values():
+            ask.fail(error)
+
+    # -- in ---------------------------------------------------------------------------------------------------------
+
+    def on_reply(self, frame: frames.Reply) -> None:
+        """The other side answered an ask of ours."""
+        ask = self.pending.pop(frame.id, None)
+        if ask is None:
+            return
+        if isinstance(ask, RelayedAsk):
+            ask.answer_raw(bytes(frame.body))
+            return
+        try:
+            reply = self.codec.reply_decoder(type(ask.message))(frame.body)
+        except Exception as error:  # msgspec's own, or what a hook raised: all say that it does not fit.
+            ask.fail(BadMessage("reply", message_name(type(ask.message)), str(error)))
+        else:
+            ask.answer(reply)
+
+    def on_record(self, frame: frames.Record) -> None:
+        """Something for the recovery method at an address."""
+        take = self._record_takers.get(frame.to)
+        if take is None:
+            take = self.record_taker(self.connection.name_in(frame.to))
+            self._record_takers[self.connection.number_in(frame.to)] = take
+        take(frame)
+
+    def on_failure(self, frame: frames.Failure) -> None:
+        """The other side failed an ask of ours."""
+        ask = self.pending.pop(frame.id, None)
+        if isinstance(ask, RelayedAsk):
+            ask.fail_raw(frame.kind, frame.name, bytes(frame.body))
+        elif ask is not None:
+            ask.fail(self.codec.decode_error(frame.kind, frame.name, frame.body))
+
+    def _message_in(self, cell: Cell, frame: frames.Tell | frames.Ask) -> Any:
+        """The message in a frame. Raises UnknownMessage or BadMessage."""
+        message = self.codec.message_in(cell, self.connection.name_in(frame.name), frame.body)
+        if type(frame.name) is int and cell is self.node.root and not cell.host.takes_parcels:
+            # Our own actor's class stays: so does the way in for this type.
+            kind: Any = type(message)
+            self.routes[frame.to, frame.name] = cell, self.codec.decoder(kind), self.codec.decoder(list[kind])
+        return message
+
+    def _sender(self, name: frames.Name | None) -> Cell | None:
+        return None if name is None else self.node.cell_at(self.connection.name_in(name))
+
+    def on_tell(self, cell: Cell, frame: frames.Tell, page: memoryview | None) -> None:
+        """Take in a message."""
+        try:
+            message = self._message_in(cell, frame)
+        except HoldfastError as error:
+            name = self.connection.name_in(frame.name) if type(frame.name) is int else str(frame.name)
+            self._sender(frame.sender)
+            self.node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error))
+            if page is not None:
+                page[1] = frame.number
+            return
+        sender = self._sender(frame.sender)
+        if page is not None:
+            cell.admit(cell, Arrived(message, sender, frame.number, page))
+        else:
+            try:
+                cell.admit(cell, message if sender is None else Envelope(message, sender))
+            except HoldfastError as error:
+                self.node.dead_letter(cell, message, str(error))
+
+    def on_offer(self, cells: Iterable[Cell], frame: frames.Offer | frames.Publish, topic: str | None = None) -> None:
+        """Take in a message whose sender waits until every one of `cells` has accepted it, or left the topic."""
+        connection = self.connection
+        name = connection.name_in(frame.name)
+        sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
+        parcel = Parcel(name, bytes(frame.body))
+        Offered(self, frame.id, parcel, sender, topic).begin(cells)
+
+    def on_ask(self, cell: Cell, frame: frames.Ask, page: memoryview | None) -> None:
+        """Take in an ask; its outcome goes back over this connection."""
+        ask = RelayedAsk.taken(self, frame, cell, page)
+        try:
+            try:
+                ask.message = self._message_in(cell, frame)
+            finally:
+                if frame.sender is not None:
+                    ask.sender = self._sender(frame.sender)
+            if ask.chain and (ctx := cell.ctx) is not None and ctx.turn_in(ask.chain):
+                raise AskDeadlock(cell.path, tuple(path for path, _ in ask.chain))
+            cell.admit(cell, ask)
+        except HoldfastError as error:
+            if page is not None:
+                page[1] = frame.number
+            ask.fail(error)
+
+
+def no_records(path: str) -> frames.TakeRecord:
+    """Nobody is recovered over this connection."""
+    raise BadFrame(f"a record for {path}, which is not recovered")
+
+
+SAME_CLOCK = 60.0
+"""Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""
+
+
+class Accepted(Message[None]):
+    """Stands for a message whose sender waits for its acceptance only."""
+
+
+_ACCEPTANCE = Accepted()
+
+
+class Arrived(Envelope, eq=False):
+    """A message from the home of this process's actor: the page says which one is being handled."""
+
+    number: int
+    page: Any
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        page = item.page
+        page[0] = item.number
+        result = actor._table[type(item.message)](actor, item.message)
+        if type(result) is Coroutine_:
+            return _until_done(result, item)
+        page[1] = item.number
+        return None
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        """Nothing is lost: the home still has it."""
+
+    def stashed(self) -> None:
+        self.page = [0, 0]  # The real one counts in the order of arrival: a late number would undo later ones.
+
+
+async def _until_done(turn: Any, item: Any) -> None:
+    await turn
+    item.page[1] = item.number
+
+
+class RelayedAsk(Ask, eq=False):
+    """An ask from the other side of a connection: its outcome becomes a frame."""
+
+    peer: Any = None
+    id: int = 0
+    number: int = 0
+    page: Any = None
+    is_over: bool = False
+    until: float = 0.0  # the deadline on the monotonic clock, which both sides read
+
+    @classmethod
+    def taken(cls, peer: Peer, frame: frames.Ask, cell: Cell, page: memoryview | None) -> RelayedAsk:
+        """The ask that a frame carries; its message is decoded behind it."""
+        left = frame.until - monotonic()
+        deadline = peer.node.loop.time() + left
+        number, until = frame.number, frame.until
+        return cls(
+            None, None, frame.chain, left, deadline, None, cell, False, peer, frame.id, number, page, False, until
+        )  # fmt: skip
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        page = item.page
+        if page is None:
+            return Ask.run(actor, item)
+        page[0] = item.number
+        if item.until <= monotonic():  # In this order: if the page did not say so at the deadline, it is not run.
+            item.expire()
+            page[1] = item.number
+            return None
+        result = Ask.run(actor, item)
+        if type(result) is Coroutine_:
+            return _until_done(result, item)
+        page[1] = item.number
+        return result
+
+    @property
+    def is_done(self) -> bool:
+        return self.is_over
+
+    def answer(self, reply: object) -> None:
+        from ...kernel.envelope import ReplyHandle
+
+        if type(reply) is ReplyHandle or self.is_over:
+            return
+        self.is_over = True
+        connection = self.peer.connection
+        try:
+            connection.send(frames.Reply(self.id, cast("Any", reply)))
+        except BadMessage as error:
+            self.is_over = False
+            self.fail(BadMessage("reply", error.message, error.problem))
+
+    def answer_raw(self, body: bytes) -> None:
+        """Pass an encoded reply on."""
+        if not self.is_over:
+            self.is_over = True
+            self.peer.connection.send(frames.Reply(self.id, Raw(body)))
+
+    def fail(self, error: BaseException) -> None:
+        codec = self.peer.codec
+        try:
+            kind, name, body = codec.encode_error(error)
+        except BadMessage as bad:  # A Refusal with a field that cannot be sent is a reply that cannot.
+            kind, name, body = codec.encode_error(BadMessage("reply", type_name(type(error)), bad.problem))
+        self.fail_raw(kind, name, body)
+
+    def fail_raw(self, kind: str, name: str, body: bytes) -> None:
+        """Pass an encoded error on."""
+        if not self.is_over:
+            self.is_over = True
+            self.peer.connection.send(frames.Failure(self.id, kind, name, Raw(body)))
+
+    def undelivered(self, cell: Cell, reason: str) -> None:
+        if self.page is None:
+            super().undelivered(cell, reason)
+
+    def stashed(self) -> None:
+        if self.page is not None:
+            self.page = [0, 0]  # The real one counts in the order of arrival: a late number would undo later ones.
+
+
+class OutsideHost:
+    """The host of stand-ins for actors in other processes: everything goes over the connection."""
+
+    takes_parcels = True
+
+    def __init__(self, peer: Peer) -> None:
+        self.peer = peer
+
+    def start(self, cell: Cell) -> None:
+        raise HoldfastError(f"{cell.path} is in another process")
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.told(cell, "stop", {"reason": pack_exit(reason)})
+
+    def kill(self, cell: Cell) -> None:
+        self.told(cell, "kill", {})
+
+    def retired(self, cell: Cell) -> None:
+        pass
+
+    def progress(self, cell: Cell) -> object:
+        return None
+
+    def recovers(self, reason: ExitReason) -> bool:
+        return False
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
+
+    def push(self, cell: Cell, item: Item) -> None:
+        send_signal(self.peer, cell.path, item)
+
+    def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
+        if isinstance(item, Envelope):
+            return self.peer.offer(cell.path, item.message, item.sender)
+        return self.peer.offer(cell.path, item, None)
+
+    def control(self, cell: Cell, call: Call) -> None:
+        from ...control.orders_lane import send_call
+
+        send_call(self.peer, cell.path, call)
+
+    def is_up(self, cell: Cell) -> bool:
+        return True  # As far as is known on this side.
+
+    def backlog(self, cell: Cell) -> int:
+        return 0
+
+    def load(self, cell: Cell) -> int:
+        return 0
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        connection = self.peer.connection
+        connection.send(frames.Command(connection.name_out(cell.path), verb, data))
+
+    def admit(self, cell: Cell, item: Any) -> None:
+        """Stands in `cell.admit` of the stand-ins."""
+        self.peer.send_item(cell, cell.path, item, 0)
+
+
+def send_signal(peer: Peer, path: str, item: Item) -> None:
+    """Carry an EXIT or DOWN over; other items of the runtime never cross a border."""
+    connection = peer.connection
+    if isinstance(item, links.Exit):
+        data: dict[str, Any] = {"source": item.source.path, "reason": pack_exit(item.reason)}
+        connection.send(frames.Command(connection.name_out(path), "exit", data))
+    elif isinstance(item, links.Down):
+        data = {
+            "source": item.watch.target.path,
+            "reason": pack_exit(item.reason),
+            "recovering": item.recovering,
+            "for_good": item.watch.for_good,
+        }
+        connection.send(frames.Command(connection.name_out(path), "down", data))
+    else:
+        raise HoldfastError(f"{type(item).__name__} cannot be sent to {path}")
+
+
+def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
+    """Do what the other side wants of an actor on this one: stop and kill, and all about links and monitors.
+
+    Raises:
+        BadFrame, DecodeError: it is no such command.
+    """
+    data = frame.data
+    match frame.verb:
+        case "stop":
+            cell.request_stop(unpack_exit(data.get("reason")))
+        case "kill":
+            cell.kill()
+        case "exit":
+            source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
+            if links.sever(cell, source):  # Else it was unlinked while this was on its way.
+                cell.push(links.Exit(source, reason))
+        case "down":
+            source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
+            recovering, for_good = bool(data.get("recovering")), bool(data.get("for_good"))
+            links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good)
+        case "monitor":
+            links.monitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
+        case "demonitor":
+            links.demonitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
+        case "link":
+            links.link(named(node, frame, "peer"), cell)
+        case "unlink":
+            links.sever(named(node, frame, "peer"), cell)
+        case verb:
+            raise BadFrame(f"unknown command {verb!r}")
+
+
+def named(node: Node, frame: frames.Command, key: str) -> Cell:
+    """The cell whose address a command gives."""
+    return node.cell_at(str(frame.data[key]))

@@ -1,0 +1,82 @@
+"""Messages that wait for room at their receivers, on the receivers' side of a process border."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from collections.abc import Awaitable, Iterable
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from ...errors import HoldfastError
+from ...kernel.codec import Parcel, Raw
+from ...kernel.envelope import Envelope
+from . import frames
+
+if TYPE_CHECKING:
+    from ...kernel.cell import Cell
+    from .peer import Peer
+
+NIL = msgspec.msgpack.encode(None)
+
+
+class Offered:
+    """A message from the other side on its way to receivers that may have no room yet, each of which gets it by itself.
+
+    It is answered when all have accepted it. What is published goes to those only who still subscribe when their room
+    has come, and one's trouble is not another's; of any other message it fails the sender.
+    """
+
+    __slots__ = ("_id", "_left", "_parcel", "_peer", "_sender", "_topic")
+
+    def __init__(self, peer: Peer, key: int, parcel: Parcel, sender: Cell | None, topic: str | None) -> None:
+        self._peer, self._id, self._parcel, self._sender, self._topic = peer, key, parcel, sender, topic
+        self._left = 1  # receivers that have not accepted it, and we ourselves while we begin
+
+    def begin(self, cells: Iterable[Cell]) -> None:
+        """Hand it to all that have room."""
+        for cell in tuple(cells):
+            self._left += 1
+            self._hand_to(cell)
+        self._over(None, None)
+
+    def _hand_to(self, cell: Cell, _: object = None) -> None:
+        """Hand it to one receiver, now or when it has room."""
+        peer, parcel = self._peer, self._parcel
+        if not peer.connection.is_open:
+            return  # Not accepted, and lost with its sender.
+        taken: Awaitable[None] | None = None
+        try:
+            if self._topic is None or peer.node.topics.has(self._topic, cell):
+                room = None if cell is self._sender else cell.room()  # Who waits for itself waits for ever.
+                if room is not None:
+                    room.add_done_callback(functools.partial(self._hand_to, cell))
+                    return
+                message = peer.codec.message_in(cell, parcel.name, parcel.body)
+                taken = cell.host.offer(cell, message if self._sender is None else Envelope(message, self._sender))
+        except HoldfastError as error:
+            self._over(cell, error)
+            return
+        if taken is None:
+            self._over(cell, None)
+        else:
+            asyncio.ensure_future(taken).add_done_callback(functools.partial(self._taken, cell))
+
+    def _taken(self, cell: Cell, done: asyncio.Future[None]) -> None:
+        error = None if done.cancelled() else done.exception()
+        self._over(cell, error if isinstance(error, HoldfastError) else None)
+
+    def _over(self, cell: Cell | None, error: HoldfastError | None) -> None:
+        """One receiver has it, or will not."""
+        self._left -= 1
+        connection = self._peer.connection
+        if error is not None and cell is not None:
+            if self._topic is None:
+                kind, name, body = self._peer.codec.encode_error(error)
+                connection.send(frames.Failure(self._id, kind, name, Raw(body)))
+                self._left = -1  # Answered.
+                return
+            self._peer.node.not_taken(cell, self._parcel, error)
+        if self._left == 0 and connection.is_open:
+            connection.send(frames.Reply(self._id, Raw(NIL)))

@@ -1,0 +1,155 @@
+"""Recipes as bytes: a `Start` with its class by name, so that another process can begin the same actor."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+from typing import Any, TypeVar
+
+from ...errors import SpecError, type_name
+from ...kernel.actor import Actor, Start
+from ...kernel.message import message_name
+from ...values import decode_value, encode_value
+
+T = TypeVar("T")
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Packed:
+    """A Start inside saved arguments."""
+
+    kind: str
+    args: tuple[Any, ...]
+    kwargs: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _PackedData:
+    """A dataclass that holds a Start somewhere, such as a child spec."""
+
+    kind: str
+    fields: dict[str, Any]
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Described:
+    """An object that describes itself: what makes it again, and from what."""
+
+    by: str
+    description: Any
+
+
+def pack_recipe(start: Start[Any], where: str) -> bytes:
+    """The recipe as bytes.
+
+    Raises:
+        UnsavableValue: naming the argument that cannot be encoded.
+        SpecError: the class cannot be found by name.
+    """
+    return encode_value(_lower(start, where), where=f"{where}: start({start.kind.__name__}, ...)")
+
+
+def pack_data(value: object, where: str) -> bytes:
+    """A value with recipes somewhere in it, such as a child spec, as bytes.
+
+    Raises:
+        UnsavableValue, SpecError: as `pack_recipe`.
+    """
+    return encode_value(_lower(value, where), where=where)
+
+
+def unpack_data(data: bytes) -> Any:
+    """The value again. Imports the modules that define its classes: only for what the root has sent.
+
+    Raises:
+        SpecError: a class cannot be found. DamagedValue: these are no such bytes.
+    """
+    return _raise_up(decode_value(data))
+
+
+def unpack_recipe(data: bytes, *, imports: bool = True) -> Start[Any]:
+    """The recipe again. Imports the module that defines the class, if `imports`: not for what others name.
+
+    Raises:
+        SpecError: the class cannot be found, or is no actor.
+    """
+    start = _raise_up(decode_value(data, imports=imports), imports=imports)
+    if not isinstance(start, Start):
+        raise SpecError("recipe", "the data is no actor recipe")
+    return start
+
+
+def _lower(value: Any, where: str) -> Any:
+    """`value` with every Start replaced by plain data."""
+    if isinstance(value, Start):
+        kind = value.kind
+        if "<locals>" in kind.__qualname__:
+            raise SpecError(where, f"{type_name(kind)} is defined in a function, so another process cannot import it")
+        return _Packed(message_name(kind), _lower(value.args, where), _lower(value.kwargs, where))
+    if type(value) in (list, tuple):
+        return type(value)(_lower(inner, where) for inner in value)
+    if type(value) is dict:
+        return {key: _lower(inner, where) for key, inner in value.items()}
+    by = getattr(type(value), "revived_by", None)
+    if by is not None:
+        return _Described(by, value.describe())
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(value)}
+        if any(isinstance(inner, Start) for inner in fields.values()):
+            return _PackedData(
+                message_name(type(value)), {name: _lower(inner, where) for name, inner in fields.items()}
+            )
+    return value
+
+
+def _raise_up(value: Any, *, imports: bool = True) -> Any:
+    def up(inner: Any) -> Any:
+        return _raise_up(inner, imports=imports)
+
+    if isinstance(value, _Packed):
+        if not imports and loaded(value.kind, Actor) is None:
+            raise SpecError("recipe", f"{value.kind} is no actor class that is loaded here")
+        return Start(_find(value.kind, Actor), up(value.args), up(value.kwargs))
+    if not imports and isinstance(value, (_PackedData, _Described)):
+        raise SpecError("recipe", "another process names what is to be made of its words: nothing is")
+    if isinstance(value, _PackedData):
+        return _find(value.kind, object)(**up(value.fields))
+    if isinstance(value, _Described):
+        return _named(value.by)(value.description)
+    if type(value) in (list, tuple):
+        return type(value)(up(inner) for inner in value)
+    if type(value) is dict:
+        return {key: up(inner) for key, inner in value.items()}
+    return value
+
+
+def loaded(name: str, base: type[T]) -> type[T] | None:
+    """The class with this name, if it is loaded here; nothing is imported."""
+    module_name, _, path = name.partition(":")
+    found: Any = sys.modules.get(module_name)
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    return found if isinstance(found, type) and issubclass(found, base) else None
+
+
+def _find(name: str, base: type) -> type[Any]:
+    """The class with this name, if it is of the expected kind."""
+    found = _named(name)
+    if not (isinstance(found, type) and issubclass(found, base)):
+        raise SpecError("recipe", f"{name} is no {base.__name__}")
+    if base is object and not dataclasses.is_dataclass(found):
+        raise SpecError("recipe", f"{name} is no dataclass")
+    return found
+
+
+def _named(name: str) -> Any:
+    """What has this name."""
+    module_name, _, path = name.partition(":")
+    try:
+        found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)
+        for part in path.split("."):
+            found = getattr(found, part)
+    except BaseException as error:  # Importing a module runs it: it may raise anything.
+        raise SpecError("recipe", f"{name} cannot be imported: {error}") from error
+    return found

@@ -1,0 +1,363 @@
+"""The gate: what an actor process may say to the root. Each frame passes it before any handler sees it.
+
+An actor process is trusted with its own actors and with nothing else: those at the address it was given, and below it.
+It may send to any address, but only as one of its own; what it claims (lives, state, names, children, links, events) it
+may claim of its own; orders it may give to what it has started, and to what it was granted: the addresses that bindings
+known to the root lead to, and those below them. A breach ends that process and nothing else.
+
+`RULES` has a row for each kind of frame, `COMMANDS` one for each verb.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Final
+
+from ...events import DeadLetter
+from ...exit_reasons import unpack_exit
+from ...kernel.cell import GONE, Cell
+from ...kernel.message import Order
+from ...kernel.node import cell_kind
+from . import frames
+from .connection import MOST_NAMES, BadFrame
+from .start_codec import loaded
+
+if TYPE_CHECKING:
+    from ..worker_pool import Worker
+
+MOST_NAMES_IN: Final = 16 * MOST_NAMES
+"""Names that a process may have given without forgetting any: it forgets long before, unless it lies."""
+MOST_NAME_CHARS: Final = 16 * 1024 * 1024
+"""The characters of all of them."""
+MOST_LIVES: Final = 2**53
+"""No address has had so many lives."""
+
+
+class Gate:
+    """The gate of one actor process."""
+
+    def __init__(self, worker: Worker) -> None:
+        self._worker = worker
+        self._node = worker.node
+        self._own: set[int] = set()  # numbers of names that are its own addresses
+        self._orders: set[int] = set()  # numbers of names of messages that are orders
+        self._cleared: set[tuple[str, str]] = set()  # what a recorded life has sent before: address, message
+        self._targets: dict[int, Cell] = {}
+        self._chars = 0
+
+    def forget(self) -> None:
+        """The process gives all its names anew."""
+        self._own.clear()
+        self._orders.clear()
+        self._targets.clear()
+        self._cleared.clear()
+        self._chars = 0
+
+    def check(self, frame: frames.AnyFrame) -> None:
+        """See whether the process may say this.
+
+        Raises:
+            BadFrame: it may not.
+        """
+        rule = RULES.get(type(frame))
+        if rule is None:
+            raise BadFrame(f"an actor process cannot send a {type(frame).__name__}")
+        rule(self, frame)
+
+    # -- whose it is ------------------------------------------------------------------------------------------------
+
+    @property
+    def home(self) -> str:
+        """The address that the process was given."""
+        cell = self._worker.cell
+        if cell is None:
+            raise BadFrame("a process without an actor says something")
+        return cell.path
+
+    def owns(self, path: str) -> bool:
+        """Whether an address is its own."""
+        return is_at_or_below(path, self.home)
+
+    def require_own(self, path: object, what: str) -> str:
+        """An address that must be its own."""
+        if not isinstance(path, str):
+            raise BadFrame(f"{what} has {path!r} for an address")
+        if not self.owns(path):
+            raise BadFrame(f"{what} of {path}, and the process is that of {self.home}")
+        return path
+
+    def require_granted(self, path: str, what: str) -> None:
+        """An address to which it may give orders."""
+        cell = self._worker.cell
+        if not self.owns(path) and (cell is None or not is_granted(path, (cell, *self._worker.inner.cells()))):
+            raise BadFrame(f"{what} to {path}, which {self.home} has neither started nor is bound to")
+
+    def _introduce(self, text: str) -> int:
+        """A name that the process gives for the first time: its number."""
+        connection = self._worker.connection
+        connection.name_in(text)
+        number = connection.number_in(text)
+        self._chars += len(text)
+        if number >= MOST_NAMES_IN or self._chars > MOST_NAME_CHARS:
+            raise BadFrame("it gives names without end")
+        return number
+
+    def _address(self, frame: Any) -> str:
+        """The address that a frame is of; known by its number from now on."""
+        if type(frame.to) is str:
+            frame.to = self._introduce(frame.to)
+        return self._worker.connection.name_in(frame.to)
+
+    def _message(self, frame: Any) -> None:
+        """What the names of a message say."""
+        if type(frame.name) is str:
+            number = self._introduce(frame.name)
+            if is_order(frame.name):
+                self._orders.add(number)
+            frame.name = number
+        sender = frame.sender
+        if sender is not None and sender not in self._own:
+            if type(sender) is str:
+                sender = frame.sender = self._introduce(sender)
+            self.require_own(self._worker.connection.name_in(sender), "a message")
+            self._own.add(sender)
+
+    def target(self, to: frames.Name) -> Cell:
+        """The cell that a message is for.
+
+        Raises:
+            BadFrame: it is a part of the runtime, and the process has nothing to do with it.
+        """
+        cell = self._targets.get(to)  # type: ignore[arg-type]  # a number: the rules have seen to that
+        if cell is not None and cell.state is not GONE:
+            return cell
+        connection = self._worker.connection
+        path = connection.name_in(to)
+        cell = self._node.cell_at(path)
+        self._check_part(cell)
+        self._targets[connection.number_in(to)] = cell
+        return cell
+
+    def _check_part(self, cell: Cell) -> None:
+        kind = cell_kind(cell)
+        if kind is not None and kind._is_part:
+            self.require_granted(cell.path, "a message")
+
+    # -- the rules --------------------------------------------------------------------------------------------------
+
+    def send(self, frame: frames.Tell | frames.Offer | frames.Ask) -> None:
+        """It sends as itself; orders only to whom it may."""
+        if type(frame.to) is str:
+            frame.to = self._introduce(frame.to)
+        sender = frame.sender
+        if type(frame.name) is str or (sender is not None and sender not in self._own):
+            self._message(frame)
+        if frame.name in self._orders:
+            connection = self._worker.connection
+            self.require_granted(connection.name_in(frame.to), connection.name_in(frame.name))
+
+    def ask(self, frame: frames.Ask) -> None:
+        """As for a message; its deadline is a time."""
+        self.send(frame)
+        if frame.until != frame.until:
+            raise BadFrame("an ask with a deadline that is no time")
+
+    def publish(self, frame: frames.Publish) -> None:
+        """It publishes as itself, and no orders."""
+        self._message(frame)
+        if frame.name in self._orders:
+            raise BadFrame(f"an order is published: {self._worker.connection.name_in(frame.name)}")
+
+    def outcome(self, frame: Any) -> None:
+        """It answers what was asked of it: a number that waits for nobody there is late, or nothing."""
+
+    def ended(self, frame: frames.Ended) -> None:
+        """It tells the end of its own actor."""
+        path = self._address(frame)
+        if path != self.home:
+            raise BadFrame(f"the end of {path}, and the process is that of {self.home}")
+        unpack_exit(frame.reason)
+
+    def note(self, frame: frames.Note) -> None:
+        """Its events are of its own actors; a dead letter says who tells it if it was for another."""
+        address = frame.data.get("address")
+        if isinstance(address, str) and (self.owns(address) or address in self._voices()):
+            return
+        if frame.kind != DeadLetter.__name__ or not isinstance(address, str):
+            self.require_own(address, f"an event ({frame.kind})")
+        frame.data["why"] = f"{frame.data.get('why')} (told by {self.home})"
+
+    def _voices(self) -> tuple[str, ...]:
+        cell = self._worker.cell
+        start = None if cell is None or cell.more is None else cell.more.start
+        return () if start is None else start.kind._speaks_for(start)
+
+    def of_own(self, frame: frames.Record | frames.Piece) -> None:
+        """It is of one of its actors."""
+        to = frame.to
+        if to in self._own:
+            return
+        self.require_own(self._address(frame), f"a {type(frame).__name__}")
+        self._own.add(frame.to)  # type: ignore[arg-type]  # a number now
+
+    def command(self, frame: frames.Command) -> None:
+        """As the verb's row says."""
+        rule = COMMANDS.get(frame.verb)
+        if rule is None:
+            raise BadFrame(f"unknown command {frame.verb!r}")
+        rule(self, self._address(frame), frame)
+
+    # -- what a recorded life lets out ------------------------------------------------------------------------------
+
+    def output(self, path: str, name: str) -> None:
+        """A recorded life of this process sends a message.
+
+        Raises:
+            BadFrame: it is an order, or for a part of the runtime, and not for it to send.
+        """
+        if (path, name) in self._cleared:
+            return
+        if is_order(name):
+            self.require_granted(path, name)
+        if path.startswith("/"):
+            self._check_part(self._node.cell_at(path))
+        if len(self._cleared) >= MOST_NAMES:
+            self._cleared.clear()
+        self._cleared.add((path, name))
+
+
+def is_at_or_below(path: str, above: str) -> bool:
+    """Whether an address is another one, or below it."""
+    return path == above or path.startswith(f"{above}/")
+
+
+def is_granted(path: str, cells: Iterable[Cell]) -> bool:
+    """Whether any of these actors may give orders to an address: a binding leads there, or above it."""
+    for cell in cells:
+        more = cell.more
+        if more is None:
+            continue
+        bound = [target.path for target in more.bindings.values()]
+        if more.start is not None:
+            bound += more.start.kind._may_order(more.start)
+        if any(is_at_or_below(path, one) for one in bound):
+            return True
+    return False
+
+
+def is_order(name: str) -> bool:
+    """Whether a message type, by its name on the wire, is an order."""
+    return loaded(name, Order) is not None
+
+
+def text(frame: frames.Command, key: str) -> str:
+    """A text that a command gives."""
+    value = frame.data.get(key)
+    if not isinstance(value, str):
+        raise BadFrame(f"command {frame.verb!r} has {key} {value!r}")
+    return value
+
+
+def _home(gate: Gate, to: str, frame: frames.Command) -> None:
+    """It speaks of its own actor."""
+    if to != gate.home:
+        raise BadFrame(f"{frame.verb!r} of {to}, and the process is that of {gate.home}")
+
+
+def _own(gate: Gate, to: str, frame: frames.Command) -> None:
+    """It speaks of one of its actors."""
+    gate.require_own(to, repr(frame.verb))
+
+
+def _topic(gate: Gate, to: str, frame: frames.Command) -> None:
+    _own(gate, to, frame)
+    text(frame, "topic")
+
+
+def _below(gate: Gate, to: str, frame: frames.Command) -> None:
+    """It speaks of an address below its own."""
+    _home(gate, to, frame)
+    path = gate.require_own(frame.data.get("path"), repr(frame.verb))
+    if not all(path[len(to) + 1 :].split("/")):
+        raise BadFrame(f"{frame.verb!r} of {path!r}, which is no address below {to}")
+
+
+def _born(gate: Gate, to: str, frame: frames.Command) -> None:
+    _below(gate, to, frame)
+    text(frame, "kind")
+    life = frame.data.get("life")
+    if type(life) is not int or not 0 <= life < MOST_LIVES:
+        raise BadFrame(f"a life with the number {life!r}")
+
+
+def _gone(gate: Gate, to: str, frame: frames.Command) -> None:
+    _below(gate, to, frame)
+    unpack_exit(frame.data.get("reason"))
+
+
+def _keep(gate: Gate, to: str, frame: frames.Command) -> None:
+    _home(gate, to, frame)
+    gate.require_own(frame.data.get("path"), "what is kept")
+    text(frame, "what")
+    period = frame.data.get("period", 0.0)
+    if not isinstance(period, (int, float)) or not math.isfinite(period):
+        raise BadFrame(f"a period of {period!r}")
+
+
+def _order(gate: Gate, to: str, frame: frames.Command) -> None:
+    """An order to a life."""
+    gate.require_granted(to, repr(frame.verb))
+    if frame.verb == "stop":
+        unpack_exit(frame.data.get("reason"))
+
+
+def _tie(key: str, *, both: bool) -> Callable[[Gate, str, frames.Command], None]:
+    """One end of a link or watch is its own; `both`: whichever."""
+
+    def rule(gate: Gate, to: str, frame: frames.Command) -> None:
+        other = text(frame, key)
+        if not (both and gate.owns(to)):
+            gate.require_own(other, repr(frame.verb))
+        if "reason" in frame.data:
+            unpack_exit(frame.data["reason"])
+
+    return rule
+
+
+Rule = Callable[[Gate, Any], None]
+
+RULES: Final[dict[type[frames.Frame], Rule]] = {
+    frames.Tell: Gate.send,
+    frames.Offer: Gate.send,
+    frames.Ask: Gate.ask,
+    frames.Publish: Gate.publish,
+    frames.Reply: Gate.outcome,
+    frames.Failure: Gate.outcome,
+    frames.Launched: Gate.outcome,
+    frames.Beat: Gate.outcome,
+    frames.Moved: Gate.outcome,
+    frames.Ended: Gate.ended,
+    frames.Note: Gate.note,
+    frames.Record: Gate.of_own,
+    frames.Piece: Gate.of_own,
+    frames.Command: Gate.command,
+}
+"""What has no row (`Launch`, `Run`) only the root sends. `Forget` is the connection's own."""
+
+COMMANDS: Final[dict[str, Callable[[Gate, str, frames.Command], None]]] = {
+    "move": _home,
+    "subscribe": _topic,
+    "unsubscribe": _topic,
+    "born": _born,
+    "gone": _gone,
+    "keep": _keep,
+    "stop": _order,
+    "kill": _order,
+    "exit": _tie("source", both=True),
+    "down": _tie("source", both=True),
+    "monitor": _tie("watcher", both=False),
+    "demonitor": _tie("watcher", both=False),
+    "link": _tie("peer", both=True),
+    "unlink": _tie("peer", both=True),
+}

@@ -1,0 +1,440 @@
+"""The guest: what runs inside an actor's OS process. A node with one actor (or one subtree), joined to the root."""
+
+from __future__ import annotations
+
+import asyncio
+import mmap
+import os
+import socket
+import sys
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import msgspec
+
+from .. import exit_reasons
+from ..control.orders_lane import obey_order
+from ..deadline_thread import Overdue
+from ..errors import HoldfastError, NotGranted, StartFailed, StartIgnored
+from ..events import ActorStarted, Event, event_data
+from ..exit_reasons import ExitReason, pack_exit
+from ..fast_loop import new_event_loop
+from ..kernel import lifecycle
+from ..kernel.cell import RUNNING, Cell
+from ..kernel.envelope import AnyTable
+from ..kernel.message import Message, Order, message_name
+from ..kernel.node import Node
+from ..kernel.ref import current
+from ..kernel.topics import Topics
+from ..migration.worker_moves import GuestMoves, word_of
+from .wire import frames
+from .wire.connection import BadFrame, Connection
+from .wire.peer import Arrived, OutsideHost, Peer, RelayedAsk, named, obey
+from .wire.start_codec import unpack_recipe
+from .wire.worker_gate import is_at_or_below, is_granted
+
+ENDED_WITHIN = 1.0
+"""Seconds that an ended process waits for the root to read why it has ended."""
+
+_BODIES = msgspec.msgpack.Decoder(list[frames.Raw])
+
+Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
+"""Begins the life a launch frame asks for; the composition root gives one that knows recovery and supervision."""
+
+
+def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
+    """Serve the root until its socket ends. Returns the exit code."""
+    page = memoryview(mmap.mmap(page_fd, 0)).cast("Q")
+    os.close(page_fd)
+    with asyncio.Runner(loop_factory=new_event_loop) as runner:
+        return runner.run(_serve(sock, page, launcher, prepare))
+
+
+async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
+    guest = Guest(asyncio.get_running_loop(), page, launcher)
+    prepare(guest)
+    guest.join(Connection(guest.on_frame, guest.on_lost, guest.on_batch))
+    guest.connection.takers = guest.takers
+    await guest.connection.open(sock)
+    code = await guest.ended
+    # Handlers may hold threads or swallow cancellation: the process ends here, not when they are ready.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
+
+
+class GuestHost(lifecycle.LocalHost):
+    """The host of the process's own actor: its address is kept at the root, so its end is only reported."""
+
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+
+    def retired(self, cell: Cell) -> None:
+        if cell.queue:
+            cell.queue.clear()  # Its home has these, and sends them to the next life.
+        more = cell.more
+        self._guest.report_end(cell, more.reason if more is not None else None)
+
+
+class InnerHost(lifecycle.LocalHost):
+    """The host of all other actors of the process: the root knows their addresses, so that they can be reached."""
+
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+
+    def retired(self, cell: Cell) -> None:
+        self._guest.tell_gone(cell)
+
+
+class GuestTopics(Topics):
+    """Topics in an actor process: the root knows all subscribers, so it is told of ours."""
+
+    def __init__(self, guest: Guest) -> None:
+        super().__init__()
+        self._guest = guest
+
+    def subscribe(self, topic: str, cell: Cell) -> None:
+        super().subscribe(topic, cell)
+        self._guest.command(cell, "subscribe", {"topic": topic})
+
+    def unsubscribe(self, topic: str, cell: Cell) -> None:
+        super().unsubscribe(topic, cell)
+        self._guest.command(cell, "unsubscribe", {"topic": topic})
+
+
+class OutsideTable(AnyTable):
+    """The table of an actor that is not in this process: whether an order may be given there is looked at each time."""
+
+    def __contains__(self, kind: object) -> bool:
+        return self.knows(kind) and not issubclass(kind, Order)  # type: ignore[arg-type]  # a message's type
+
+    def knows(self, kind: type) -> bool:
+        return issubclass(kind, Message)
+
+
+OUTSIDE = OutsideTable()
+
+
+class GuestOutsideHost(OutsideHost):
+    """The host of stand-ins for actors outside of this process: orders go only to whom it may give some."""
+
+    peer: Guest
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.peer.require_granted(cell.path, "stop")
+        super().stop(cell, reason)
+
+    def kill(self, cell: Cell) -> None:
+        self.peer.require_granted(cell.path, "kill")
+        super().kill(cell)
+
+
+class NudgingPage:
+    """The page of an actor with a bounded mailbox: the home is told, once per loop tick, when it has changed."""
+
+    __slots__ = ("_guest", "_is_told", "_page")
+
+    def __init__(self, guest: Guest, page: memoryview) -> None:
+        self._guest, self._page = guest, page
+        self._is_told = False
+
+    def __setitem__(self, index: int, number: int) -> None:
+        self._page[index] = number
+        if not self._is_told:
+            self._is_told = True
+            self._guest.node.loop.call_soon(self._tell)
+
+    def _tell(self) -> None:
+        self._is_told = False
+        self._guest.connection.send(frames.Moved())
+
+
+class Guest(Peer):
+    """The child's end of the connection, and its node."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, page: memoryview, launcher: Launcher) -> None:
+        super().__init__(Node("guest", loop))
+        self.page: Any = page
+        self.ended: asyncio.Future[int] = loop.create_future()
+        self.moves = GuestMoves(self)
+        self.recovery: Any = None  # the recovery method's side in this process, if it has one
+        self._launcher = launcher
+        self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
+        self._targets: dict[int, Cell] = {}
+        self._outside: dict[str, Cell] = {}
+        self._host = GuestOutsideHost(self)
+        self.node.outside = self.outside
+        self.node.uplink = self
+        self.node.here = InnerHost(self)
+        self.node.topics = GuestTopics(self)
+        self.node.overdue = Overdue(loop)
+        self.node.events.add_sink(self._on_event)
+        self.takers: dict[type[frames.Frame], Callable[[Any], None]] = {
+            frames.Tell: self._tell,
+            frames.Run: self._run,
+            frames.Ask: self._ask,
+            frames.Offer: lambda frame: self.on_offer([self._target(frame.to)], frame),
+            frames.Reply: self.on_reply,
+            frames.Failure: self.on_failure,
+            frames.Launch: self._launch,
+            frames.Command: lambda frame: self._command(self._target(frame.to), frame),
+            frames.Record: self.on_record,
+            frames.Piece: lambda frame: self.moves.obey(self._target(frame.to), word_of(frame)),
+            frames.Forget: self.on_forget,
+        }
+
+    # -- the world outside ------------------------------------------------------------------------------------------
+
+    def outside(self, path: str) -> Cell | None:
+        """The stand-in for an address that is not in this process; None for one that would be."""
+        root = self.node.root
+        if root is not None and (path == root.path or path.startswith(root.path + "/")):
+            return None
+        cell = self._outside.get(path)
+        if cell is None:
+            cell = self._outside[path] = Cell(self.node, None, path, self._host)
+            cell.state = RUNNING
+            cell.admit, cell.table = self._host.admit, OUTSIDE
+        return cell
+
+    def require_granted(self, path: str, order: str) -> None:
+        """See whether an actor here may give this order; the root would end the process for one that may not.
+
+        Raises:
+            NotGranted: it may not.
+        """
+        root = self.node.root
+        if root is None or is_at_or_below(path, root.path):
+            return
+        if not is_granted(path, every_cell(root)):
+            sender = current.get(None)
+            raise NotGranted(path, order, root.path if sender is None else sender.path)
+
+    def publish(self, topic: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
+        """Publish through the root; the future ends when every subscriber has accepted."""
+        connection = self.connection
+        name, body = self._payload(message)
+        source = None if sender is None else connection.name_out(sender.path)
+        key, accepted = self.acceptance()
+        connection.send(frames.Publish(key, topic, name, body, source), topic)
+        return accepted
+
+    def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """Tell the root something about an address."""
+        self.connection.send(frames.Command(self.connection.name_out(cell.path), verb, data))
+
+    def tell_gone(self, cell: Cell) -> None:
+        """An address of this process is free."""
+        root = self.node.root
+        reason = cell.more.reason if cell.more is not None else exit_reasons.SHUTDOWN
+        with_parent = lifecycle.parent_ended(cell)
+        if root is not None:
+            data = {"path": cell.path, "reason": pack_exit(reason), "with_parent": with_parent}
+            self.command(root, "gone", data)
+
+    def _tell_born(self, path: str) -> None:
+        """A life has begun at an address below ours."""
+        root, cell = self.node.root, self.node.find(path)
+        if root is None or cell is None:
+            return
+        start = cell.extra().start
+        kind = type(cell.actor) if cell.actor is not None else None if start is None else start.kind
+        if kind is not None:
+            self.command(root, "born", {"path": path, "kind": message_name(kind), "life": cell.life})
+
+    def _on_event(self, event: Event) -> None:
+        if type(event) is ActorStarted:
+            if self.node.root is not None and event.address == self.node.root.path:
+                return  # The root tells of this one when it is up.
+            self._tell_born(event.address)
+        self.connection.send(frames.Note(type(event).__name__, event_data(event)))
+
+    def on_forget(self, frame: frames.Forget) -> None:
+        """The root gives all its names anew: a good time to forget who was written to and is known to nobody here."""
+        super().on_forget(frame)
+        self._targets.clear()
+        still = weakref.WeakValueDictionary(self._outside)
+        self._outside.clear()
+        self._outside.update(still)
+
+    # -- frames from the root ---------------------------------------------------------------------------------------
+
+    def on_frame(self, frame: frames.AnyFrame) -> None:
+        """A frame that nobody here takes."""
+        raise BadFrame(f"the root sent a {type(frame).__name__}")
+
+    def on_batch(self) -> None:
+        """All frames that have come are taken in: run the turns, and answer, in the same tick."""
+        self.node.run_now()
+        self.connection.flush()
+
+    def _tell(self, frame: frames.Tell) -> None:
+        """The hot path in: a plain message to our own actor, of a type it has had before."""
+        route = self.routes.get((frame.to, frame.name))
+        if route is not None and frame.sender is None:
+            cell, decode, _ = route
+            try:
+                message = decode(frame.body)
+            except Exception:
+                route = None  # Said below, with all names.
+            else:
+                cell.admit(cell, Arrived(message, None, frame.number, self.page))
+                return
+        self.on_tell(self._target(frame.to), frame, self.page if frame.number else None)
+
+    def _run(self, frame: frames.Run) -> None:
+        """Many such messages: decoded in one call."""
+        route = self.routes.get((frame.to, frame.name))
+        number, page = frame.first, self.page
+        if route is not None:
+            cell, _, decode = route
+            try:
+                messages = decode(frame.bodies)
+            except Exception:
+                route = None  # One of them: said below, with all names.
+            else:
+                admit = cell.admit
+                for message in messages:
+                    admit(cell, Arrived(message, None, number, page))
+                    number += 1
+                return
+        for body in _BODIES.decode(frame.bodies):
+            self._tell(frames.Tell(frame.to, frame.name, body, number))
+            number += 1
+
+    def _ask(self, frame: frames.Ask) -> None:
+        """The same for an ask that no turn waits for."""
+        route = self.routes.get((frame.to, frame.name))
+        if route is not None and frame.sender is None and not frame.chain:
+            cell, decode, _ = route
+            try:
+                message = decode(frame.body)
+            except Exception:
+                route = None
+            else:
+                ask = RelayedAsk.taken(self, frame, cell, self.page)
+                ask.message = message
+                cell.admit(cell, ask)
+                return
+        self.on_ask(self._target(frame.to), frame, self.page if frame.number else None)
+
+    def _target(self, to: frames.Name) -> Cell:
+        """The cell at an address of this process."""
+        if type(to) is int and (cell := self._targets.get(to)) is not None:
+            return cell
+        path = self.connection.name_in(to)
+        cell = self.node.cell_at(path)
+        if cell is self.node.root:  # Cells of a subtree come and go; ours stays.
+            self._targets[self.connection.number_in(to)] = cell
+        return cell
+
+    def _launch(self, frame: frames.Launch) -> None:
+        path = self.connection.name_in(frame.to)
+        if frame.options.get("prepare"):
+            self._prepare(frame)
+            return
+        limits = frame.options.get("limits") or {}
+        if frame.options.get("bounded"):
+            self.page = NudgingPage(self, self.page)
+        node = self.node
+        cell = node.root = Cell(node, None, path, GuestHost(self))
+        cell.life = frame.life - 1
+        try:
+            _apply(limits)
+            for port, target in frame.options.get("bindings", {}).items():
+                cell.extra().bindings[port] = node.cell_at(target)
+            cell.extra().start = unpack_recipe(frame.recipe)
+            if limits.get("beat"):
+                self._beat(float(limits["beat"]))
+            if frame.options.get("moved"):
+                up: asyncio.Future[None] | None = self.moves.begin(cell, unpack_recipe(frame.recipe))
+            else:
+                up = self._launcher(self, cell, frame)
+        except (
+            BaseException
+        ) as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
+            self._launched(frame.id, error)
+            return
+        if up is None:
+            self._launched(frame.id, None)
+        else:
+            self._starting = frame.id, up
+            up.add_done_callback(lambda done: self._on_up())
+
+    def _prepare(self, frame: frames.Launch) -> None:
+        """An actor may be moved here."""
+        try:
+            self.moves.prepare(frame.recipe)
+        except BaseException as error:  # Importing a module runs it.
+            self._launched(frame.id, error)
+        else:
+            self._launched(frame.id, None)
+
+    def _on_up(self) -> None:
+        """Tell how the start went, once; it may be over before the loop calls back."""
+        if self._starting is not None and self._starting[1].done():
+            (key, done), self._starting = self._starting, None
+            self._launched(key, done.exception())
+
+    def _launched(self, key: int, error: BaseException | None) -> None:
+        if isinstance(error, StartFailed):
+            self.connection.send(frames.Launched(key, error.reason, isinstance(error, StartIgnored)))
+        else:
+            self.connection.send(frames.Launched(key, "" if error is None else str(exit_reasons.crash(error))))
+
+    def _command(self, cell: Cell, frame: frames.Command) -> None:
+        if frame.verb == "bind":
+            cell.extra().bindings[str(frame.data["port"])] = named(self.node, frame, "target")
+        elif frame.verb == "control":
+            obey_order(self, cell, frame)
+        elif frame.verb == "move":
+            self.moves.obey(cell, frame.data)
+        else:
+            obey(self.node, cell, frame)
+
+    # -- the end ----------------------------------------------------------------------------------------------------
+
+    def report_end(self, cell: Cell, reason: ExitReason | None) -> None:
+        """The process's own actor has ended: tell why, and end with it."""
+        self._on_up()
+        told = pack_exit(reason if reason is not None else exit_reasons.SHUTDOWN)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
+        self.connection.flush()
+        # The root ends us when it has read this. If we closed, and it wrote to us just then, it would read no more.
+        self.node.loop.call_later(ENDED_WITHIN, self.connection.close)
+
+    def on_lost(self, error: Exception | None) -> None:
+        """The root is gone, or we have closed: nothing is left to live for."""
+        if isinstance(error, HoldfastError):
+            print(f"holdfast: {error}", file=sys.stderr)
+        if not self.ended.done():
+            self.ended.set_result(0 if error is None else 70)
+
+    def _beat(self, interval: float) -> None:
+        if self.connection.is_open:
+            self.connection.send(frames.Beat())
+            self.node.loop.call_later(interval, self._beat, interval)
+
+
+def every_cell(top: Cell) -> Iterator[Cell]:
+    """An actor, and all below it."""
+    yield top
+    for cell in (top.children or {}).values():
+        yield from every_cell(cell)
+
+
+def _apply(limits: dict[str, Any]) -> None:
+    """Set the limits that a process sets for itself."""
+    import resource
+
+    if limits.get("address_space_bytes"):
+        most = int(limits["address_space_bytes"])
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    if limits.get("open_files"):
+        most = int(limits["open_files"])
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
+    if limits.get("niceness"):
+        os.nice(int(limits["niceness"]))

@@ -1,0 +1,568 @@
+"""Workers: the OS processes of one root, forked ahead of need, watched, and always reaped."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import os
+import signal
+import time
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ..control.orders import Look
+from ..control.orders_lane import order, send_call
+from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
+from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
+from ..exit_reasons import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, pack_exit, unpack_exit
+from ..kernel.cell import Cell
+from ..kernel.envelope import Ask
+from .fork.fork_server import ForkServer
+from .fork.forked_process import Forked, check_can_watch, has_ended
+from .fork.launch import keep_large_memory, why_not_importable
+from .process_watchdog import LOOKS, Watch, oom_kills
+from .program.stdout import OutputReader
+from .resource_limits import Limits
+from .stand_ins import Inner
+from .wire import frames
+from .wire.connection import BadFrame, Connection
+from .wire.peer import Peer
+from .wire.worker_gate import Gate
+
+if TYPE_CHECKING:
+    from ..kernel.node import Node
+
+REAPED_WITHIN = 2.0
+"""Seconds to wait for the exit status after a process's socket has ended, before it is killed and called lost."""
+AGAIN_AFTER = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
+"""Seconds between attempts to fork a process for an actor that is restarted."""
+ORDER_TIMEOUT = 60.0
+"""Seconds until it does not matter any more whether a new process counts for whoever wanted to know."""
+
+
+class Worker(Peer):
+    """One OS process: its connection, the actor it was given, and how it ends."""
+
+    def __init__(self, workers: Workers, forked: Forked, server: ForkServer) -> None:
+        super().__init__(workers.node)
+        self.forked, self.server = forked, server
+        self.pid = forked.pid
+        self.page = memoryview(forked.page).cast("Q")
+        self.gate = Gate(self)
+        self.inner = Inner(self.node, self)
+        self.cell: Cell | None = None
+        self._workers = workers
+        self._died: Callable[[Cell, ExitReason], None] | None = None
+        self._launches: dict[int, asyncio.Future[None]] = {}
+        self._told: ExitReason | None = None  # the reason the actor itself gave
+        self._killed_for: ExitReason | None = None
+        self._status: int | None = None
+        self._lost = False
+        self._is_orphaned = False
+        self._buried = False
+        self._grave: asyncio.Future[None] = self.node.loop.create_future()
+        self.noticed_at = 0.0  # when the first sign of its end came, on the monotonic clock
+        self._oom_before = oom_kills()
+        self._watch: Watch | None = None
+        self._outputs: list[OutputReader] = []
+        self.movers: dict[int, Callable[[dict[str, Any]], None]] = {}  # who hears of which attempt to move an actor
+
+    # -- its life ---------------------------------------------------------------------------------------------------
+
+    async def connect(self) -> None:
+        """Take over the socket and the output pipes.
+
+        Raises:
+            OSError: the loop cannot watch them.
+        """
+        loop, forked = self.node.loop, self.forked
+        self.join(Connection(self._on_frame, self._on_lost, guarded=True))
+        self.connection.takers = {
+            frames.Reply: self.on_reply,
+            frames.Failure: self.on_failure,
+            frames.Forget: self.on_forget,
+        }
+        check_can_watch(forked.sock.fileno(), forked.stdout_fd, forked.stderr_fd)
+        await self.connection.open(forked.sock)
+        for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
+            self._outputs.append(OutputReader(loop, getattr(forked, name), functools.partial(self._on_line, stream)))
+            setattr(forked, name, -1)
+
+    def is_alive(self) -> bool:
+        """Whether it can be given an actor: a process ends with its fork server, but not in the same instant."""
+        return self.connection.is_open and not self.server.has_ended() and not has_ended(self.forked.pidfd)
+
+    def adopt(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
+        """This process is now that of the actor at `cell`."""
+        self.reserve(cell, limits, died)
+        self._workers.by_cell[cell] = self
+        if self.node.watched:
+            self.node.emit(ProcessStarted(cell.path, self.pid))
+
+    async def launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
+        """Begin the life in it.
+
+        Raises:
+            StartFailed: the actor's `__init__` or `on_start` raised, or the process ended.
+        """
+        limits = self._watch.limits if self._watch is not None else None
+        bindings = {port: target.path for port, target in cell.extra().bindings.items()}
+        await self._ask_launch(cell, recipe, dict(options, limits=_limit_options(limits), bindings=bindings))
+
+    def _check_program(self, cell: Cell, recipe: bytes) -> None:
+        """A class of `__main__` is known in the process only if that could be imported there.
+
+        Raises:
+            StartFailed: it could not, and what to do.
+        """
+        if b"__main__:" not in recipe:
+            return
+        problem = why_not_importable() or self.server.preload_errors.get("__main__")
+        if problem:
+            raise StartFailed(
+                cell.path, f"its class is defined in the program itself, which its process cannot import: {problem}"
+            )
+
+    async def _ask_launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
+        self._check_program(cell, recipe)
+        self._last_id = key = self._last_id + 1
+        if self._buried:
+            raise StartFailed(cell.path, "its process has ended")
+        up = self._launches[key] = self.node.loop.create_future()
+        connection = self.connection
+        connection.send(frames.Launch(key, connection.name_out(cell.path), cell.life, recipe, options), cell.path)
+        if "prepare" not in options:
+            self._order_again(cell)
+        try:
+            await up
+        finally:
+            self._launches.pop(key, None)
+
+    def _order_again(self, cell: Cell) -> None:
+        """What was ordered while there was no process, and what counts and traces the actor over its lives."""
+        more = cell.extra()
+        calls, more.calls = more.calls, []
+        for call in calls:
+            if not call.ask.is_done:
+                send_call(self, cell.path, call)
+        if more.tap is not None and more.tap.is_on:
+            more.tap.attach()
+            wanted = more.tap.wanted
+            seen = order(cell, Look(wanted["counting"], wanted["tracing"]), ORDER_TIMEOUT)
+            seen.add_done_callback(_seen)
+
+    # -- an actor that is moved here, or leaves ---------------------------------------------------------------------
+
+    def reserve(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
+        """The actor at `cell` may be moved into this process, which counts as its own only when it is adopted."""
+        self.cell, self._died = cell, died
+        if limits is not None:
+            self._watch = Watch(self, limits)
+
+    def give_back(self) -> None:
+        """The actor is not moved into this process: it ends, and nobody is told."""
+        self.cell = self._died = None
+        self.take_pending()  # Whoever was to be answered from here still is, where the actor lives.
+        self.gone()
+
+    @property
+    def is_killed(self) -> bool:
+        """Whether we have killed it; it may not have died yet."""
+        return self._killed_for is not None
+
+    def on_death(self, died: Callable[[Cell, ExitReason], None]) -> None:
+        """Who hears of its end from now on."""
+        self._died = died
+
+    async def prepare(self, cell: Cell, recipe: bytes) -> None:
+        """Have the process import what the actor needs.
+
+        Raises:
+            StartFailed: it cannot, or has ended.
+        """
+        await self._ask_launch(cell, recipe, {"prepare": True})
+
+    def leave(self, cell: Cell, reason: ExitReason, seconds: float) -> None:
+        """The actor lives elsewhere now: what is left of it ends in good order, within `seconds`, and tells nobody."""
+        self._died = None
+        if self._workers.by_cell.get(cell) is self:
+            del self._workers.by_cell[cell]
+        if self._watch is not None:
+            self._watch.close()
+            self._watch = None
+        self.movers.clear()
+        self.record_taker, self._record_takers = _no_record, {}
+        if self._buried:
+            return
+        connection = self.connection
+        data = {"step": "leave", "reason": pack_exit(reason)}
+        connection.send(frames.Command(connection.name_out(cell.path), "move", data))
+        connection.flush()
+        late = self.node.loop.call_later(seconds, self.kill, KILLED)
+        self._grave.add_done_callback(lambda _: late.cancel())
+
+    def kill(self, why: ExitReason) -> None:
+        """SIGKILL, by pidfd; its end is then called `why`."""
+        if self._killed_for is None:
+            self._killed_for = why
+        if not self.forked.kill(signal.SIGKILL):
+            self.connection.close()  # It ends when it sees that, unless it hangs.
+
+    def hung(self, seconds: float) -> None:
+        """The watch has seen no beat."""
+        if not has_ended(self.forked.pidfd):  # Else it was something else that ended it, and we shall hear of that.
+            self.kill(Hung(seconds))
+
+    def beat(self) -> None:
+        """Its loop turns."""
+        if self._watch is not None:
+            self._watch.beat()
+
+    def gone(self) -> asyncio.Future[None]:
+        """A future that ends when the process is dead, reaped and told of; it is killed now if it was not."""
+        self.kill(KILLED)
+        return self._grave
+
+    # -- what it says -----------------------------------------------------------------------------------------------
+
+    def _on_frame(self, frame: frames.AnyFrame) -> None:
+        self.gate.check(frame)
+        self._workers.on_frame(self.node, self, frame)
+
+    def on_forget(self, frame: frames.Forget) -> None:
+        """The process gives all its names anew."""
+        super().on_forget(frame)
+        self.gate.forget()
+
+    def number(self, place: int, most: int) -> int:
+        """A number on the page, which the process may have written anything to; `most` can stand there."""
+        number = self.page[place]
+        if number <= most:
+            return number
+        self.breach(f"its page says {number} where {most} is the most that can be")
+        return most
+
+    def breach(self, problem: str) -> None:
+        """It has said what it may not, or what cannot be: it ends, soon, since whoever noticed is at something else."""
+        self.node.loop.call_soon(self.connection.close, BadFrame(problem))
+
+    def on_launched(self, frame: frames.Launched) -> None:
+        """A launch has come to its end."""
+        up = self._launches.get(frame.id)
+        if up is None or up.done():
+            return
+        if frame.ignored or frame.problem:
+            kind = StartIgnored if frame.ignored else StartFailed
+            up.set_exception(kind(self.cell.path if self.cell is not None else "", frame.problem))
+        else:
+            up.set_result(None)
+
+    def on_ended(self, frame: frames.Ended) -> None:
+        """The actor's life has ended by itself; its process has nothing more to do."""
+        self._noticed()
+        self._told = unpack_exit(frame.reason)
+        self.forked.kill(signal.SIGKILL)
+
+    def on_moved(self) -> None:
+        """Its actor, whose mailbox is bounded, has begun or ended turns."""
+        cell = self.cell
+        bound = cell.more.bound if cell is not None and cell.more is not None else None
+        if cell is not None and bound is not None:
+            bound.moved(cell)
+
+    def on_move(self, data: dict[str, Any]) -> None:
+        """A word of an attempt to move an actor; if that one is over, it is void."""
+        heard = self.movers.get(data.get("attempt", 0))
+        if heard is not None:
+            heard(data)
+
+    def on_note(self, frame: frames.Note) -> None:
+        """An event of the process."""
+        self._workers.on_note(self, frame)
+
+    def _on_line(self, stream: str, text: str) -> None:
+        if self.node.watched:
+            path = self.cell.path if self.cell is not None else f"process {self.pid}"
+            self.node.emit(LogLine(path, stream, text))
+
+    # -- its end ----------------------------------------------------------------------------------------------------
+
+    def _noticed(self) -> None:
+        if not self.noticed_at:
+            self.noticed_at = time.monotonic()
+
+    def _on_lost(self, error: Exception | None) -> None:
+        self._lost = True
+        self._noticed()
+        if isinstance(error, BadFrame):
+            self._breached(error)
+        if self._status is not None or self._is_orphaned:
+            self.forked.kill(signal.SIGKILL)
+            self._bury()
+        else:
+            self.forked.kill(signal.SIGKILL)  # Whoever closes its socket has to end.
+            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+
+    def _breached(self, error: BadFrame) -> None:
+        """It spoke nonsense, or of what is not its own."""
+        if self._killed_for is None and self._status is None:
+            path = self.cell.path if self.cell is not None else f"process {self.pid}"
+            self.node.emit(TrustBreached(path, self.pid, error.problem))
+        self.kill(Exited(70))  # EX_SOFTWARE
+
+    def on_exit(self, status: int) -> None:
+        """The fork server has reaped it."""
+        self._status = status
+        self._noticed()
+        if self._lost:
+            self._bury()
+        else:
+            # What it wrote before its end may still be in the socket: the end of the socket comes behind it.
+            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+
+    def on_orphaned(self) -> None:
+        """The fork server has died, and it with it: nobody will tell its exit status."""
+        self._is_orphaned = True
+        if self._lost:
+            self._bury()
+
+    def _bury(self) -> None:
+        if self._buried:
+            return
+        self._buried = True
+        reason = self._reason()
+        self.connection.close()
+        for output in self._outputs:
+            output.close()
+        if self._watch is not None:
+            self._watch.close()
+        cell = self.cell
+        if cell is not None and self.node.watched:
+            self.node.emit(ProcessDied(cell.path, self.pid, reason))
+        for up in self._launches.values():
+            if not up.done():
+                up.set_exception(StartFailed(cell.path if cell is not None else "", str(reason)))
+        self.inner.close(reason)
+        if cell is not None and self._died is not None:
+            self._died(cell, reason)
+            if self._workers.by_cell.get(cell) is self:
+                del self._workers.by_cell[cell]
+        self.fail_pending(AskFailed(cell.path if cell is not None else "", str(reason)))
+        self.page.release()
+        self.forked.close()
+        self._workers.buried(self)
+        if not self._grave.done():
+            self._grave.set_result(None)
+
+    def take_pending(self) -> list[Ask]:
+        """The asks that waited for this process, now the caller's."""
+        pending, self.pending = self.pending, {}
+        return list(pending.values())
+
+    def _reason(self) -> ExitReason:
+        """Why it ended: what it said itself, what we killed it for, or what the system reports."""
+        if self._told is not None:
+            return self._told
+        if self._killed_for is not None:
+            return self._killed_for
+        status = self._status
+        if status is None:
+            return Signal(signal.SIGKILL)  # Ended with its fork server.
+        if os.WIFSIGNALED(status):
+            number = os.WTERMSIG(status)
+            if number == signal.SIGKILL and oom_kills() > self._oom_before:
+                return OutOfMemory("killed by the kernel")
+            return Signal(number)
+        return Exited(os.waitstatus_to_exitcode(status))
+
+
+def _no_record(path: str) -> frames.TakeRecord:
+    """What a life says that has been moved away is not kept."""
+    return lambda frame: None
+
+
+def _seen(done: asyncio.Future[Any]) -> None:
+    """Nobody waits for it: asyncio need not complain of its failure."""
+    if not done.cancelled():
+        done.exception()
+
+
+def _limit_options(limits: Limits | None) -> dict[str, Any]:
+    """What the process sets for itself."""
+    if limits is None:
+        return {}
+    return {
+        "address_space_bytes": limits.address_space_bytes,
+        "open_files": limits.open_files,
+        "niceness": limits.niceness,
+        "beat": None if limits.hung_after is None else limits.hung_after / LOOKS,
+    }
+
+
+class Workers:
+    """The pool: one fork server, its children, and a warm one in reserve."""
+
+    def __init__(
+        self,
+        node: Node,
+        entry: str,
+        preload: Sequence[str],
+        on_frame: Callable[[Node, Worker, frames.AnyFrame], None],
+        *,
+        warm: int = 1,
+    ) -> None:
+        self.node = node
+        self.on_frame = on_frame
+        self.by_cell: dict[Cell, Worker] = {}
+        self._entry, self._preload, self._warm = entry, list(preload), warm
+        self._server: ForkServer | None = None
+        self._servers: list[ForkServer] = []  # all that live, also one that does not answer
+        self._opening = asyncio.Lock()
+        self._alive: dict[int, Worker] = {}
+        self._ready: list[Worker] = []
+        self._refilling: asyncio.Task[None] | None = None
+        self._closed = False
+
+    def of(self, cell: Cell) -> Worker | None:
+        """The process of an actor, if it has one now."""
+        return self.by_cell.get(cell)
+
+    def want(self, module: str) -> None:
+        """Have the fork server import a module before the next fork."""
+        if module in self._preload or module == "__main__":
+            return
+        self._preload.append(module)
+        if self._server is not None:
+            self._server.preload(module)
+
+    async def take(self, *, again: bool = False) -> Worker:
+        """A process that waits for an actor.
+
+        Args:
+            again: for an actor that has lived before: that there is no process, memory or descriptor left may pass, and
+                says nothing of the actor. So it is tried for a while, and not each failure counts as a restart.
+
+        Raises:
+            ProcessUnavailable: none could be forked.
+        """
+        while self._ready:
+            worker = self._ready.pop()
+            if worker.is_alive():
+                self._refill()
+                return worker
+        worker = await self._fork_again() if again else await self._fork()
+        self._refill()
+        return worker
+
+    async def _fork_again(self) -> Worker:
+        for pause in AGAIN_AFTER:
+            try:
+                return await self._fork()
+            except ProcessUnavailable:
+                if self._closed:
+                    raise
+            await asyncio.sleep(pause)
+        return await self._fork()
+
+    async def _fork(self) -> Worker:
+        server = await self._open()
+        try:
+            forked = await server.fork()
+        except ProcessUnavailable:
+            if self._closed or not (server.is_deaf or server.has_ended()):
+                raise  # What it refuses another one could not do either.
+            if self._server is server:
+                self._server = None
+            server = await self._open()
+            forked = await server.fork()
+        worker = Worker(self, forked, server)
+        self._alive[forked.pid] = worker
+        try:
+            await worker.connect()
+        except BaseException as error:  # Or whoever asked for it does not want it any more.
+            worker.kill(KILLED)
+            if isinstance(error, OSError):
+                raise ProcessUnavailable(f"no process can be watched: {error}") from error
+            raise
+        return worker
+
+    async def _open(self) -> ForkServer:
+        async with self._opening:
+            if self._closed:
+                raise ProcessUnavailable("the system is shutting down")
+            if self._server is None:
+                server = ForkServer(
+                    self._entry, self._preload, on_exit=self._on_exit, on_lost=lambda: self._on_lost(server)
+                )
+                await server.start()
+                keep_large_memory()
+                self._server = server
+                self._servers.append(server)
+            return self._server
+
+    def _refill(self) -> None:
+        if self._refilling is None and len(self._ready) < self._warm and not self._closed:
+            self._refilling = self.node.loop.create_task(self._refill_now(), name="warm processes")
+
+    async def _refill_now(self) -> None:
+        try:
+            while len(self._ready) < self._warm and not self._closed:
+                self._ready.append(await self._fork())
+        except ProcessUnavailable:
+            return  # Whoever needs a process asks for it, and is told why there is none.
+        finally:
+            self._refilling = None
+
+    def _on_exit(self, pid: int, status: int) -> None:
+        worker = self._alive.get(pid)
+        if worker is not None:
+            worker.on_exit(status)
+
+    def _on_lost(self, server: ForkServer) -> None:
+        """A fork server died: its children die with it, each is seen by its socket; the next fork starts another."""
+        if server in self._servers:
+            self._servers.remove(server)
+        if self._server is server:
+            self._server = None
+        for worker in list(self._alive.values()):
+            if worker.server is server:
+                worker.on_orphaned()
+
+    def buried(self, worker: Worker) -> None:
+        """A process is gone for good."""
+        if self._alive.get(worker.pid) is worker:
+            del self._alive[worker.pid]
+        with contextlib.suppress(ValueError):
+            self._ready.remove(worker)
+
+    def on_note(self, worker: Worker, frame: frames.Note) -> None:
+        """An event from a process: shown under its actor's address."""
+        from ..events import event_from
+
+        event = event_from(frame.kind, frame.data)
+        if isinstance(event, TRACED):
+            cell = self.node.find(event.address)
+            if cell is not None and cell.more is not None and cell.more.tap is not None:
+                cell.more.tap.hub.emit(event)
+        elif event is not None and self.node.watched:
+            self.node.emit(event)
+
+    def processes(self) -> dict[str, int]:
+        """Address to pid."""
+        return {cell.path: worker.pid for cell, worker in self.by_cell.items()}
+
+    async def close(self) -> None:
+        """End every process and the fork server."""
+        self._closed = True
+        if self._refilling is not None:
+            self._refilling.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._refilling
+        graves = [worker.gone() for worker in list(self._alive.values())]
+        if graves:
+            await asyncio.wait(graves, timeout=REAPED_WITHIN * 2)
+        async with self._opening:  # Whoever is in the middle of starting one has given up, or has it now.
+            servers, self._servers, self._server = self._servers, [], None
+        for server in servers:
+            await server.stop()

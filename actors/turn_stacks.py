@@ -1,0 +1,54 @@
+"""What turns wait for, as text: the stack of each one that is suspended, and of what actors do outside their turns."""
+
+from __future__ import annotations
+
+import linecache
+from collections.abc import Coroutine, Iterator
+from types import CodeType, FrameType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .kernel.cell import Cell
+
+
+def blocked_below(top: Cell) -> str:
+    """The suspended turns of an actor and of those below it in this process, parents first, with their stacks.
+
+    Empty if there are none: then what is waited for is in another process, or is no turn.
+    """
+    return "\n".join(line for cell in _cells(top) for line in _of(cell))
+
+
+def _cells(top: Cell) -> Iterator[Cell]:
+    yield top
+    for child in list((top.children or {}).values()):
+        yield from _cells(child)
+
+
+def _of(cell: Cell) -> Iterator[str]:
+    turn = cell.more.turn if cell.more is not None else None
+    if turn is not None:
+        what = "its end" if turn.item is None else type(getattr(turn.item, "message", turn.item)).__name__
+        seconds = cell.node.loop.time() - turn.since
+        yield f"{cell.path} ({cell.state}) has been in the turn of {what} for {seconds:.1f} s:"
+        yield from stack_of(turn.coroutine)
+    for work in cell.actor._outside() if cell.actor is not None else ():
+        yield f"{cell.path} ({cell.state}) waits outside its turns:"
+        yield from stack_of(work)
+
+
+def stack_of(work: Coroutine[Any, Any, Any]) -> Iterator[str]:
+    """Where a coroutine waits, outermost first, as in a traceback; behind the last one, for what."""
+    at: Any = work
+    while at is not None:
+        frame: FrameType | None = getattr(at, "cr_frame", None) or getattr(at, "gi_frame", None)
+        code: CodeType | None = getattr(at, "cr_code", None) or getattr(at, "gi_code", None)
+        if code is None:
+            yield f"    waits for {at!r}"
+            return
+        if frame is not None:
+            yield f'  File "{code.co_filename}", line {frame.f_lineno}, in {code.co_qualname}'
+            source = linecache.getline(code.co_filename, frame.f_lineno).strip()
+            if source:
+                yield f"    {source}"
+        at = getattr(at, "cr_await", None) or getattr(at, "gi_yieldfrom", None)

@@ -1,0 +1,128 @@
+"""The one place where an engine is called: whatever it raises becomes an error that the journal's callers know."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from typing import TYPE_CHECKING, ParamSpec, TypeVar
+
+from ..actors.errors import HoldfastError
+from .journal import Entry, InHand, Journal, Saved, StoreFailed
+
+if TYPE_CHECKING:
+    from .snapshot.shared_blocks import Segment
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Called:
+    """A `Journal` that calls an engine, which may be a user's own and raise anything.
+
+    An exception of a foreign kind becomes StoreFailed. If `append` or `sync` raised it, nobody knows what was written:
+    from then on everything that writes is refused (T13), until the store is opened again.
+    """
+
+    def __init__(self, engine: Journal) -> None:
+        self._engine = engine
+        self._name = str(getattr(engine, "path", type(engine).__qualname__))
+        self._failure: StoreFailed | None = None
+        self.durable = engine.durable
+        self.epoch = self._call(lambda: engine.epoch)
+        self.in_hand: InHand | None = getattr(engine, "in_hand", None)
+
+    def _call(self, method: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
+        try:
+            return method(*args, **named)
+        except HoldfastError:
+            raise
+        except Exception as error:
+            raise self._failed(error) from error
+
+    def _call_for_good(self, method: Callable[P, T], *args: P.args, **named: P.kwargs) -> T:
+        self._refuse_failed()
+        try:
+            return method(*args, **named)
+        except HoldfastError:
+            raise
+        except Exception as error:
+            self._failure = self._failed(error)
+            raise self._failure from error
+
+    def _failed(self, error: Exception) -> StoreFailed:
+        return StoreFailed(self._name, f"the engine raised {type(error).__name__}: {error}")
+
+    def _refuse_failed(self) -> None:
+        if self._failure is not None:
+            raise StoreFailed(*self._failure.args)
+
+    def has_failed(self) -> bool:
+        """Whether everything is refused from now on."""
+        failed: Callable[[], bool] | None = getattr(self._engine, "has_failed", None)
+        return self._failure is not None or (failed is not None and self._call(failed))
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
+        """See `Journal`."""
+        if self._failure is not None:
+            raise StoreFailed(*self._failure.args)
+        try:
+            return self._engine.append(entries)  # not through `_call_for_good`: this is done for every message
+        except HoldfastError:
+            raise
+        except Exception as error:
+            self._failure = self._failed(error)
+            raise self._failure from error
+
+    def sync(self) -> None:
+        """See `Journal`."""
+        self._call_for_good(self._engine.sync)
+
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
+        """See `Journal`."""
+        self._refuse_failed()
+        self._call(self._engine.cut, address, snapshot, drop, turn=turn, keep=keep)
+
+    def load(self, address: str, *, older: int = False) -> Saved:
+        """See `Journal`."""
+        return self._call(self._engine.load, address, older=older)
+
+    def erase(self, address: str) -> None:
+        """See `Journal`."""
+        self._refuse_failed()
+        self._call(self._engine.erase, address)
+
+    def keep_blocks(
+        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
+    ) -> None:
+        """See `Journal`."""
+        self._refuse_failed()
+        self._call(self._engine.keep_blocks, address, number, blocks, compress)
+
+    def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """See `Journal`."""
+        return self._call(self._engine.read_blocks, address, number, places)
+
+    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+        """See `Journal`."""
+        self._refuse_failed()
+        self._call(self._engine.forget_blocks, address, needed)
+
+    def addresses(self) -> list[str]:
+        """See `Journal`."""
+        return self._call(self._engine.addresses)
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """See `Journal`."""
+        self._refuse_failed()
+        self._call(self._engine.note, key, value)
+
+    def noted(self, key: str) -> bytes | None:
+        """See `Journal`."""
+        return self._call(self._engine.noted, key)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """See `Journal`."""
+        return self._call(self._engine.notes, prefix)
+
+    def close(self) -> None:
+        """See `Journal`."""
+        self._call(self._engine.close)

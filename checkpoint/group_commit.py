@@ -1,0 +1,444 @@
+"""Group commit: what homes submit becomes one append per tick, and takes effect when it is as safe as it has to be.
+
+Two lanes, each in order. What is only to outlive this process (`durability="os"`) takes effect when it is written; what
+is to outlive the machine (`"fsync"`) when it is synced too, which a thread does for all that has gathered meanwhile.
+Whoever has something in the slow lane stays there with all that follows, so that nobody's outputs change their order.
+
+What is submitted lives here, not in the message handler that has it written: that one may be killed at any moment.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import functools
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Protocol
+
+from ..actors.errors import HoldfastError
+from ..actors.events import Event, JournalBlocked, JournalGoesOn, JournalStopped
+from .journal import Entry, InHand, Journal, MemoryJournal, Saved, StoreFailed
+from .method import Durability
+
+if TYPE_CHECKING:
+    from .snapshot.shared_blocks import Segment
+
+RETRY_SECONDS = 0.05
+"""Until the first attempt after a store had no room; each further one comes twice as late, up to the next figure."""
+MOST_RETRY_SECONDS = 1.0
+MOST = 250
+"""Submissions written and let out in one go: about 2 ms of the loop's time."""
+PATIENCE_SECONDS = 0.05
+"""How long the message handler may take to come, before the homes do its work themselves."""
+
+
+class Submission(Protocol):
+    """What is to be written, and what follows."""
+
+    @property
+    def entries(self) -> Sequence[tuple[str, Entry]]:
+        """What is written, by address."""
+        ...
+
+    def written(self, positions: Sequence[int]) -> None:
+        """It stands there in the journal."""
+        ...
+
+    def safe(self) -> None:
+        """It may take effect."""
+        ...
+
+    def refused(self, error: HoldfastError) -> bool:
+        """It was not written. False: it has happened, and must be written when that is possible again."""
+        ...
+
+    def abandoned(self, error: HoldfastError) -> None:
+        """It has happened, and will never be written: who waits for it is told."""
+        ...
+
+
+class Commits:
+    """The journal of a root's homes: an engine, and what waits for it.
+
+    Args:
+        engine: writes.
+        loop: on which everything but a sync happens.
+        durability: of homes whose method says nothing.
+        emit: told when the engine refuses, and when it goes on.
+        where: the address that those events have.
+    """
+
+    def __init__(
+        self,
+        engine: Journal,
+        loop: asyncio.AbstractEventLoop,
+        *,
+        durability: Durability = "os",
+        emit: Callable[[Event], None] = lambda event: None,
+        where: str = "/",
+    ) -> None:
+        self.engine, self.durable, self.epoch = engine, engine.durable, engine.epoch
+        self.in_hand: InHand | None = getattr(engine, "in_hand", None)
+        self.commits = self
+        self.durability: Durability = durability if engine.durable else "memory"
+        self.wake_handler: Callable[[], None] | None = None  # has the message handler come, if there is one
+        self._loop, self._emit, self._where = loop, emit, where
+        self._synced_paths: set[str] = set()  # of homes that want fsync
+        self._quick_paths: set[str] = set()  # of homes that want less than the store's fsync
+        self._slow: dict[str, int] = {}  # the last submission in the slow lane, by home
+        self._pending: list[tuple[Submission, int]] = []  # not written; their number in the slow lane, 0: in the quick
+        self._is_urgent = False  # whether something among it need not be synced
+        self._unsynced: deque[tuple[int, Submission]] = deque()
+        self._ready: deque[Submission] = deque()
+        self._written = self._synced = self._count = 0  # submissions in the slow lane so far
+        self._context = contextvars.copy_context()
+        self._is_awake = self._is_running = False
+        self._overdue: asyncio.TimerHandle | None = None
+        self._thread: ThreadPoolExecutor | None = None
+        self._syncing: asyncio.Future[None] | None = None
+        self._delay = RETRY_SECONDS
+        self.blocked: HoldfastError | None = None  # why nothing is written at the moment
+        self.stopped: HoldfastError | None = None  # why nothing is written any more
+        self.submitted = 0
+        self.last: Submission | None = None
+
+    # -- who wants what ---------------------------------------------------------------------------------------------
+
+    def want(self, path: str, durability: Durability | None) -> None:
+        """How safe what this home submits has to be."""
+        wanted = durability or self.durability
+        self._synced_paths.discard(path)
+        self._quick_paths.discard(path)
+        if wanted == "fsync":
+            self._synced_paths.add(path)
+        else:
+            self._quick_paths.add(path)
+
+    def _is_slow(self, entries: Iterable[tuple[str, Entry]]) -> bool:
+        if not self._quick_paths:
+            return True
+        return any(path in self._synced_paths or self._slow.get(path, 0) > self._synced for path, _ in entries)
+
+    # -- submitting -------------------------------------------------------------------------------------------------
+
+    def admit(self, submission: Submission) -> None:
+        """Take in what may still be refused.
+
+        Raises:
+            HoldfastError: the store does not take anything now.
+        """
+        error = self.stopped or self.blocked
+        if error is not None:
+            raise type(error)(*error.args)
+        self.submit(submission)
+
+    def submit(self, submission: Submission) -> None:
+        """Take in what has happened: it is written at the end of this tick, or when the store has room again."""
+        if self.stopped is not None:  # It never leaves: what is open now is taken up again when the store is.
+            submission.abandoned(self.stopped)
+            return
+        number = 0
+        if self._synced_paths and self._is_slow(submission.entries):
+            self._count = number = self._count + 1
+            if self._quick_paths:
+                for path, _ in submission.entries:
+                    self._slow[path] = number
+        else:
+            self._is_urgent = True
+        self._pending.append((submission, number))
+        self.submitted += 1
+        self.last = submission
+        if not self._is_awake:
+            self._wake()
+
+    def _wake(self) -> None:
+        self._is_awake = True
+        if self.wake_handler is None:
+            self._loop.call_soon(self.flush, context=self._context)
+            return
+        if self._overdue is None:
+            self._overdue = self._loop.call_later(PATIENCE_SECONDS, self._help, context=self._context)
+        try:
+            self.wake_handler()
+        except HoldfastError:  # It has ended for good.
+            self.wake_handler = None
+            self._loop.call_soon(self.flush, context=self._context)
+
+    def come(self) -> None:
+        """What the message handler does when it was woken, in nobody's name."""
+        self._context.run(self.flush)
+
+    def _help(self) -> None:
+        """The message handler has not come: it may be between two lives."""
+        self._overdue = None
+        if self._is_awake:
+            self.flush()
+
+    # -- writing ----------------------------------------------------------------------------------------------------
+
+    def flush(self) -> None:
+        """Write what was submitted, and let what is safe now take effect. (The message handler's work.)"""
+        self._is_awake = False
+        if self.blocked is None and (self._is_urgent or self._syncing is None):
+            self._write(MOST)
+        self._run()
+        if self._pending and not self._is_awake and self.blocked is None and (self._is_urgent or self._syncing is None):
+            self._wake()  # The rest in its turn: others want the loop, too.
+
+    def barrier(self) -> None:
+        """Have everything that was submitted written, now.
+
+        Raises:
+            HoldfastError: the store refuses.
+        """
+        if self._pending:
+            self._write()
+            if self._ready and not self._is_running and not self._is_awake:
+                self._wake()
+        error = self.stopped or self.blocked
+        if error is not None:
+            raise type(error)(*error.args)
+
+    def _write(self, most: int | None = None) -> None:
+        """Write what was submitted, the first `most` of it if that is given."""
+        pending = self._pending[:most]
+        if not pending or self.stopped is not None:
+            return
+        entries = [entry for submission, _ in pending for entry in submission.entries]
+        try:
+            positions = self.engine.append(entries) if entries else []
+        except StoreFailed as error:
+            if self._has_failed():
+                self._stop(error)
+            else:
+                self._block(error)
+            return
+        except HoldfastError as error:
+            self._stop(error)
+            return
+        del self._pending[: len(pending)]
+        self._is_urgent = any(not number for _, number in self._pending)
+        begin = 0
+        for submission, number in pending:
+            end = begin + len(submission.entries)
+            submission.written(positions[begin:end])
+            begin = end
+            if number:
+                self._written = number
+                self._unsynced.append((number, submission))
+            else:
+                self._ready.append(submission)
+        if self._unsynced and self._syncing is None:
+            self._sync()
+        if self.blocked is not None:
+            self.blocked, self._delay = None, RETRY_SECONDS
+            self._emit(JournalGoesOn(self._where))
+
+    def _run(self) -> None:
+        """Let what is safe take effect, one after the other."""
+        if self._is_running:
+            return
+        self._is_running = True
+        ready = self._ready
+        try:
+            while ready:
+                submission = ready.popleft()
+                try:
+                    submission.safe()
+                except Exception as error:  # One's trouble is not another's.
+                    self._loop.call_exception_handler(
+                        {"message": "an effect of a committed turn failed", "exception": error}
+                    )
+        finally:
+            self._is_running = False
+
+    def _has_failed(self) -> bool:
+        """Whether the engine refuses for good."""
+        failed: Callable[[], bool] | None = getattr(self.engine, "has_failed", None)
+        return failed is not None and failed()
+
+    def _block(self, error: HoldfastError) -> None:
+        """Nothing was written: refuse what can be refused, and try again with the rest."""
+        first = self.blocked is None
+        self.blocked = error
+        pending, self._pending = self._pending, []
+        kept = [(submission, number) for submission, number in pending if not submission.refused(error)]
+        self._pending = [*kept, *self._pending]
+        if first:
+            self._emit(JournalBlocked(self._where, str(error)))
+        self._loop.call_later(self._delay, self._try_again, context=self._context)
+        self._delay = min(2 * self._delay, MOST_RETRY_SECONDS)
+
+    def _try_again(self) -> None:
+        if self.blocked is None or self.stopped is not None:
+            return
+        if self._pending:
+            self._write()
+            self._run()
+        else:  # Nothing is left that could show whether there is room: the next admission does.
+            self.blocked, self._delay = None, RETRY_SECONDS
+            self._emit(JournalGoesOn(self._where))
+
+    def _stop(self, error: HoldfastError) -> None:
+        """From here on nothing is written, and nothing takes effect that was not safe (T13)."""
+        if self.stopped is not None:
+            return
+        self.stopped = error
+        waiting = [*(submission for _, submission in self._unsynced), *(submission for submission, _ in self._pending)]
+        self._unsynced.clear()
+        self._pending = []
+        for submission in waiting:
+            if not submission.refused(error):
+                submission.abandoned(error)
+        self._emit(JournalStopped(self._where, str(error)))
+
+    # -- syncing ----------------------------------------------------------------------------------------------------
+
+    def _sync(self) -> None:
+        """Have a thread sync all that is written so far."""
+        if self._thread is None:
+            self._thread = ThreadPoolExecutor(1, "holdfast-sync")
+        written = self._written
+        try:
+            self._syncing = self._loop.run_in_executor(self._thread, self.engine.sync)
+        except RuntimeError:  # No thread can be started now: everybody waits for the disk, this once.
+            self._syncing = self._loop.create_future()
+            try:
+                self.engine.sync()
+            except Exception as error:
+                self._syncing.set_exception(error)
+            else:
+                self._syncing.set_result(None)
+        self._syncing.add_done_callback(functools.partial(self._synced_to, written), context=self._context)
+
+    def _synced_to(self, number: int, done: asyncio.Future[None]) -> None:
+        self._syncing = None
+        error = None if done.cancelled() else done.exception()
+        if self.stopped is not None:
+            return
+        if error is not None:
+            failure = error if isinstance(error, HoldfastError) else StoreFailed(self._where, str(error))
+            self._stop(failure)
+            return
+        self._synced = number
+        while self._unsynced and self._unsynced[0][0] <= number:
+            self._ready.append(self._unsynced.popleft()[1])
+        if self._slow and not self._unsynced and not self._pending:
+            self._slow.clear()
+        if self.blocked is None:
+            self._write()  # What has gathered meanwhile.
+        if self._unsynced and self._syncing is None:
+            self._sync()
+        self._run()
+
+    # -- what else a journal does -----------------------------------------------------------------------------------
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
+        """Append at once, behind everything that was submitted."""
+        self.barrier()
+        return self.engine.append(entries)
+
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
+        """Keep a snapshot, behind everything that was submitted; see `Journal`."""
+        self.barrier()
+        self.engine.cut(address, snapshot, drop, turn=turn, keep=keep)
+
+    def load(self, address: str, *, older: int = False) -> Saved:
+        """Read an address back; see `Journal`."""
+        self.barrier()
+        return self.engine.load(address, older=older)
+
+    def erase(self, address: str) -> None:
+        """Forget an address; see `Journal`."""
+        self.barrier()
+        self.engine.erase(address)
+
+    # Blocks count only when a `cut` refers to them: nothing that was submitted has to stand before them, and threads
+    # may write them.
+
+    def keep_blocks(
+        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
+    ) -> None:
+        """Keep blocks of a large snapshot; see `Journal`."""
+        self.engine.keep_blocks(address, number, blocks, compress)
+
+    def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """Blocks of a pack; see `Journal`."""
+        return self.engine.read_blocks(address, number, places)
+
+    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+        """Remove the packs that are not needed; see `Journal`."""
+        self.engine.forget_blocks(address, needed)
+
+    def addresses(self) -> list[str]:
+        """Every address that has something stored, sorted."""
+        return self.engine.addresses()
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Keep a small fact; see `Journal`."""
+        if self._pending:
+            self.barrier()
+        self.engine.note(key, value)
+
+    def noted(self, key: str) -> bytes | None:
+        """The fact of that name, or `None`."""
+        return self.engine.noted(key)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """All facts whose keys begin so."""
+        return self.engine.notes(prefix)
+
+    def sync(self) -> None:
+        """Have everything that was submitted outlive the machine; it waits for the disk."""
+        self.barrier()
+        self.engine.sync()
+
+    async def settled(self) -> None:
+        """Wait until everything that was submitted has taken effect, or never will."""
+        while (self._pending or self._unsynced or self._ready) and self.stopped is None and self.blocked is None:
+            if self._syncing is not None:
+                await asyncio.wait([self._syncing])
+            else:
+                await asyncio.sleep(0)
+
+    def close(self) -> None:
+        """Write what is left, and close the engine."""
+        try:
+            if self._pending and self.blocked is None:
+                self._write()
+        finally:
+            if self._thread is not None:
+                self._thread.shutdown()  # It may be syncing.
+            self._run()
+            if self._overdue is not None:
+                self._overdue.cancel()
+                self._overdue = None
+            try:
+                self.engine.close()
+            except HoldfastError as error:  # Only now it has turned out that it is not there any more.
+                self._stop(error)
+                raise
+
+
+class Unkept(MemoryJournal):
+    """The journal of a home that keeps nothing beyond this process: what its turns give to others may be kept."""
+
+    __slots__ = ("commits",)
+
+    def __init__(self, commits: Commits) -> None:
+        super().__init__()
+        self.commits = commits
+        self.epoch = commits.epoch
+
+    def submit(self, submission: Submission) -> None:
+        """Take in what concerns other homes."""
+        self.commits.submit(submission)
+
+    def admit(self, submission: Submission) -> None:
+        """Take in what may still be refused."""
+        self.commits.admit(submission)
+
+    def barrier(self) -> None:
+        """Nothing of it is written."""

@@ -1,0 +1,108 @@
+"""Asks between recorded actors that were under way when the root ended: asker and receiver find each other again.
+
+The receiver's journal says of such an input whose turn asks, (turn, k). So the receiver, whose home may be open first,
+answers to whoever that is: to the asker's home if that is open, else into the asker's journal, where it finds it.
+What the receiver never had (its mailbox was full, say) ends at its deadline: it may have been forwarded, so it is not
+asked again.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from ...actors.kernel.codec import Parcel
+from ..protocol import MESSAGE, Answer, Out
+from .inputs import Batch, Input
+from .pending_asks import MARK, OVER, SwitchAsk
+
+if TYPE_CHECKING:
+    from ...actors.kernel.codec import Codec
+    from .homes import Homes
+    from .switch import Switch
+
+
+class RejoinedAsk(SwitchAsk, eq=False):
+    """An ask from before the root's restart. Its asker's home may not be open yet."""
+
+    homes: Any = None
+
+    @property
+    def codec(self) -> Codec:
+        codec: Codec = self.homes.node.codec
+        return codec
+
+    def give(self, answer: Answer, batch: Batch | None = None) -> None:
+        """The outcome, once."""
+        homes: Homes = self.homes
+        switch = homes.at(self.asker)
+        homes.rejoin.forget(self)
+        if switch is not None:
+            self.switch = switch
+            if self.turn <= switch.turn or (self.turn, self.k) in switch.calls.outcomes:
+                self.is_over, self.future = True, OVER  # That turn has had another outcome, and does not wait.
+            else:
+                super().give(answer, batch)
+        elif not self.is_over:
+            self.is_over, self.future = True, OVER
+            own = batch if batch is not None else Batch()
+            own.add(self.asker, ("got", self.turn, self.k, answer.kind, answer.name, answer.body), [])
+            if batch is None:
+                own.commit(homes.journal)
+
+
+class Rejoin:
+    """All asks of a root that were under way when the one before it ended."""
+
+    def __init__(self, homes: Homes) -> None:
+        self._homes = homes
+        self._asks: dict[tuple[str, int, int], RejoinedAsk] = {}
+
+    def loaded(self, home: Switch) -> None:
+        """A home was taken up from what is stored: what it owes an answer."""
+        for source in home.open.values():
+            if source.kind == MESSAGE and source.origin.startswith(MARK) and source.sender is not None:
+                self._owed(home, source)
+        for key, (asker, origin) in home.owed.items():
+            home.later[key] = self._of(asker, *_numbers(origin))
+        home.owed.clear()
+
+    def _owed(self, home: Switch, source: Input) -> None:
+        assert source.sender is not None
+        ask = self._of(source.sender, *_numbers(source.origin))
+        if not ask.is_over:
+            source.ask, source.chain = ask, ask.chain
+            ask.to, ask.started = home.cell, True
+
+    def _of(self, asker: str, turn: int, k: int) -> RejoinedAsk:
+        ask = self._asks.get((asker, turn, k))
+        if ask is None or ask.is_over:
+            cell = self._homes.node.cell_at(asker)
+            ask = RejoinedAsk(Parcel("", b""), cell, (), 0.0, math.inf, None)
+            ask.started = True  # It may have been: only its outcome will tell.
+            ask.future, ask.homes, ask.asker, ask.turn, ask.k = ask, self._homes, asker, turn, k
+            self._asks[asker, turn, k] = ask
+        return ask
+
+    def forget(self, ask: RejoinedAsk) -> None:
+        """It has its outcome."""
+        self._asks.pop((ask.asker, ask.turn, ask.k), None)
+
+    def joins(self, home: Switch, turn: int, key: int, out: Out) -> bool:
+        """A turn of `home` asks again what it asked before the restart: whether the answer may still come."""
+        ask = self._asks.get((home.path, turn, out.k))
+        if ask is None and not self._homes.knows(out.to):
+            return False  # Whoever was asked keeps no journal.
+        ask = ask or self._of(home.path, turn, out.k)  # Its receiver's home is not open yet.
+        source = home.open.get(key)
+        ask.chain = ((home.path, key), *(source.chain if source is not None else ()))
+        ask.to = ask.to or home.node.cell_at(out.to)
+        ask.timeout, ask.deadline = out.seconds, home.node.loop.time() + out.seconds
+        home.calls.asks[turn, out.k] = ask
+        home.node.deadlines.add(ask)
+        return True
+
+
+def _numbers(origin: str) -> tuple[int, int]:
+    turn, _, k = origin.removeprefix(MARK).partition(".")
+    return int(turn), int(k)

@@ -1,0 +1,171 @@
+"""The capacity of a recorded actor's mailbox: what is admitted and not begun counts.
+
+Everything admitted is journaled, so the home cannot take back what it has fed. A policy that drops queued messages
+therefore feeds one input at a time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import TYPE_CHECKING
+
+from ...actors.errors import MailboxFull
+from ...actors.kernel.mailbox import Bound, Senders
+from ..protocol import MESSAGE, START, Answer
+from .inputs import Batch, Input
+
+if TYPE_CHECKING:
+    from ...actors.kernel.envelope import Ask
+    from .switch import Switch
+
+
+class HomeBound:
+    """Capacity, overflow policy, and who waits for room."""
+
+    def __init__(self, home: Switch, chosen: Bound) -> None:
+        self._home = home
+        self.capacity, self.overflow = chosen.capacity, chosen.overflow
+        self.one_at_a_time = chosen.overflow in ("drop_oldest", "latest")
+        stashed = home.stashed()
+        self._counted = {  # by id, in admission order
+            key: source for key, source in home.open.items() if source.kind == MESSAGE and key not in stashed
+        }
+        self.waiting: deque[tuple[Ask, str, bytes, str | None]] = deque()  # asks that wait for room
+        self.senders = Senders()
+        self._fed = -1  # one at a time: the input in hand
+        self._behind: dict[int, Input] = {}  # and those that wait for it
+
+    @property
+    def count(self) -> int:
+        """Messages that wait for their turn."""
+        if self.one_at_a_time:
+            in_hand = self._fed in self._counted
+        else:
+            in_hand = self._home.is_released and bool(self._counted)
+        return len(self._counted) - in_hand
+
+    @property
+    def is_full(self) -> bool:
+        """Whether one more would be too many."""
+        return self.count >= self.capacity or bool(self.waiting)
+
+    # -- admission --------------------------------------------------------------------------------------------------
+
+    def makes_room(self, ask: Ask | None, name: str, body: bytes, sender: str | None) -> bool:
+        """Whether a message can be admitted now; the policy has seen to it otherwise.
+
+        Raises:
+            MailboxFull: it is a tell, and the policy refuses it.
+        """
+        if not self.is_full:
+            return True
+        match self.overflow:
+            case "block" if ask is not None:
+                self.waiting.append((ask, name, body, sender))
+                return False
+            case "block" | "fail":
+                error = MailboxFull(self._home.path, self.capacity)
+                if ask is None:
+                    raise error
+                ask.fail(error)
+                return False
+            case "drop_newest":
+                if ask is not None:
+                    ask.fail(MailboxFull(self._home.path, self.capacity))
+                self._home.ends.lost(name, body, self._why())
+                return False
+            case "drop_oldest":
+                self._drop(keep=self.capacity - 1)
+            case _:  # the latest only
+                self._drop(keep=0)
+        return True
+
+    def _why(self) -> str:
+        return f"mailbox full ({self.capacity}, {self.overflow})"
+
+    def _drop(self, keep: int) -> None:
+        """End queued messages, oldest first, until `keep` are left."""
+        home = self._home
+        batch = Batch()
+        error = Answer(*home.node.codec.encode_error(MailboxFull(home.path, self.capacity)))
+        for source in list(self._counted.values()):
+            if self.count <= keep:
+                break
+            if source.id not in (self._fed, home.partial_id):
+                self._behind.pop(source.id, None)
+                home.ends.lost(source.name, source.body, self._why())
+                home.ends.without_turn(source, error, batch)
+        batch.commit(home.journal)
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now (or lost: only the policy "block" has a sender wait)."""
+        return self.overflow != "block" or not self.is_full
+
+    def room(self) -> asyncio.Future[None] | None:
+        """For `send`: None if there is room."""
+        return None if self.has_room else self.senders.wait(self._home.node.loop)
+
+    # -- what the home tells of its inputs --------------------------------------------------------------------------
+
+    def added(self, source: Input) -> None:
+        """An input was admitted."""
+        if source.kind == MESSAGE:
+            self._counted[source.id] = source
+
+    def ended(self, source: Input) -> None:
+        """An input has left the queue: handled, dropped, or stashed."""
+        counted = self._counted.pop(source.id, None)
+        if source.id == self._fed:
+            self._fed = -1
+            self._feed_next()
+        if counted is not None:
+            self.refill()
+
+    def refill(self) -> None:
+        """Let in who waits, as far as there is room."""
+        home = self._home
+        while self.waiting and self.count < self.capacity:
+            ask, name, body, sender = self.waiting.popleft()
+            if not ask.is_done:  # Expired or given up while it waited: never admitted.
+                home.take(ask, name, body, sender)
+        self.senders.wake(lambda: not self.is_full)
+
+    def release(self, error: MailboxFull | Exception) -> None:
+        """The address is given up: whoever waits shall see it."""
+        waiting, self.waiting = self.waiting, deque()
+        for ask, *_ in waiting:
+            ask.fail(error)
+        self.senders.release()
+
+    def in_hand(self) -> tuple[int, dict[int, Input]]:
+        """What the life has been fed, and what waits for that."""
+        return self._fed, dict(self._behind)
+
+    def take_up(self, in_hand: tuple[int, dict[int, Input]]) -> None:
+        """The life that was fed this goes on."""
+        self._fed, self._behind = in_hand
+
+    # -- one at a time ----------------------------------------------------------------------------------------------
+
+    def restart(self) -> None:
+        """The life is over: nothing is in hand."""
+        self._fed = -1
+        self._behind.clear()
+
+    def may_feed(self, source: Input) -> bool:
+        """Whether an input goes to the life now, or waits until the one in hand has ended."""
+        if not self.one_at_a_time or source.kind == START:
+            return True
+        if self._fed >= 0:
+            self._behind[source.id] = source
+            return False
+        self._fed = source.id
+        return True
+
+    def _feed_next(self) -> None:
+        while self._behind and self._fed < 0:
+            source = self._behind.pop(next(iter(self._behind)))
+            if source.id in self._home.open:
+                self._home.forward(source)

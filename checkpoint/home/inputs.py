@@ -1,0 +1,129 @@
+"""What a home keeps of one actor: its inputs, its ended turns, its timers, and the batch that becomes one append."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, TypeAlias
+
+import msgspec
+
+from ...actors.errors import HoldfastError
+from ...actors.kernel.envelope import Ask
+from ..journal import Entry
+from ..protocol import TICK, Feed
+
+if TYPE_CHECKING:
+    from ..group_commit import Commits, Unkept
+
+HomeJournal: TypeAlias = "Commits | Unkept"
+"""What a home writes to."""
+OVERHEAD = 200
+"""Bytes an input is counted with besides its payload."""
+EXPIRED = 1e-9
+"""A deadline that has passed. (Asks forget theirs when they expire.)"""
+
+
+NO_POSITIONS: list[int] = []
+"""Of an input that is nowhere in a journal. Never added to: those that are get a list of their own."""
+
+
+class Input(msgspec.Struct, gc=False, eq=False):
+    """One journaled input. (Not seen by the garbage collector: there can be many, and nothing here refers back.)"""
+
+    id: int
+    kind: str
+    name: str
+    body: bytes
+    time: float
+    sender: str | None
+    ask: Ask | None = None
+    chain: tuple[tuple[str, int], ...] = ()
+    turn: int = 0  # the turn that ended it
+    deliveries: int = 0  # deaths of the process in this very turn
+    origin: str = ""  # the timer or pipe it comes from
+    positions: list[int] = NO_POSITIONS
+    held: bool = False  # not as safe yet as it has to be: it must not be fed
+    was_cut: bool = False  # a life has ended in its turn
+
+    def feed(
+        self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False, was_asked: bool = False
+    ) -> Feed:
+        """As the life gets it; what has begun is finished whatever its deadline.
+
+        `was_asked`: it was an ask when it was handled first, and is replayed as one.
+        """
+        ask = self.ask
+        deadline = 0.0 if ask is None or has_begun else ask.deadline or EXPIRED
+        origin = self.origin if self.kind == TICK else ""
+        return Feed(
+            self.id, turn, self.kind, self.name, self.body, self.time, self.sender,
+            was_asked or ask is not None, self.chain, pipes, deadline, origin,
+        )  # fmt: skip
+
+
+class Turn(msgspec.Struct, gc=False, eq=False):
+    """One ended turn since the last snapshot."""
+
+    input: Input
+    status: str
+    digests: list[int]
+    state: int = 0  # digest of the state it has left, if that is checked
+    reply: int = 0  # digest of its reply, if it was asked for one
+
+    def digests_of_end(self) -> tuple[int, ...]:
+        """What its end record says of the state and the reply, as far as there is something to say."""
+        return (self.state, self.reply) if self.reply else (self.state,) if self.state else ()
+
+
+class TimerState:
+    """A timer of the actor; its clock runs here, whoever lives."""
+
+    __slots__ = ("body", "due", "handle", "interval", "name")
+
+    def __init__(self, name: str, body: bytes, due: float, interval: float) -> None:
+        self.name, self.body, self.due, self.interval = name, body, due, interval
+        self.handle: asyncio.TimerHandle | None = None
+
+
+class Batch:
+    """What becomes one append, and what happens when it is safe."""
+
+    __slots__ = ("after", "asks", "entries", "sinks")
+
+    def __init__(self) -> None:
+        self.asks: list[Ask] = []  # what it answers when it is safe
+        self.entries: list[tuple[str, Entry]] = []
+        self.sinks: list[list[int]] = []
+        self.after: list[Callable[[], None]] = []
+
+    def add(self, path: str, entry: Entry, sink: list[int]) -> None:
+        """One more entry, of a home that keeps a journal; `sink` gets its position."""
+        self.entries.append((path, entry))
+        self.sinks.append(sink)
+
+    def commit(self, journal: HomeJournal) -> None:
+        """Have all of it appended; then it takes effect."""
+        if self.entries:
+            journal.submit(self)
+        else:
+            self.safe()
+
+    def written(self, positions: Sequence[int]) -> None:
+        """It stands there in the journal."""
+        for sink, position in zip(self.sinks, positions, strict=True):
+            sink.append(position)
+
+    def safe(self) -> None:
+        """Let it take effect."""
+        for effect in self.after:
+            effect()
+
+    def refused(self, error: HoldfastError) -> bool:
+        """It has happened: it waits."""
+        return False
+
+    def abandoned(self, error: HoldfastError) -> None:
+        """What it was to answer is answered with the error: whether it has happened is seen when the store is back."""
+        for ask in self.asks:
+            ask.fail(error)

@@ -1,0 +1,343 @@
+"""The outputs of a recorded actor: how each takes effect, when the append that numbers it is safe."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+from collections import deque
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
+from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.codec import Parcel
+from ...actors.kernel.envelope import Envelope
+from ..life.recorded_inbox import STARTED
+from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
+from ..recovery.held_messages import Inlet, inlet
+from .durable_links import UNDONE_BY, connect
+from .inputs import Batch
+from .pending_asks import SwitchAsk, answer_ask, origin_of
+
+if TYPE_CHECKING:
+    from .switch import Switch
+
+
+OPPOSITES = (("subscribe", "unsubscribe"), *((one, other) for other, one in UNDONE_BY.items()))
+"""What a turn can do to a topic or to another actor, and how it is undone."""
+
+
+class Outputs:
+    """Lets outputs out of one home."""
+
+    def __init__(self, home: Switch) -> None:
+        self._home = home
+        self.kept: list[Out] = []  # what outlives the life, and has not taken effect yet
+        self._lines: dict[Cell, deque[Callable[[], bool]]] = {}  # what waits for room at who keeps no journal
+
+    def execute(self, turn: int, key: int, out: Out, batch: Batch) -> None:
+        """Let one output take effect, when the append is safe."""
+        home = self._home
+        node, cell = home.node, home.cell
+        assert cell is not None
+        match out.verb:
+            case "tell":
+                self._deliver(node.cell_at(out.to), out, batch)
+            case "send":
+                home.calls.sends.add((turn, out.k))
+                self._send(node.cell_at(out.to), out, batch, functools.partial(home.calls.sent, turn, out.k))
+            case "ask":
+                self._ask(turn, key, out, batch)
+            case "publish":
+                self._publish(turn, out, batch)
+            case "reply":
+                ask = home.later.pop(int(out.to), None)
+                source = home.open.get(int(out.to))
+                if source is not None:  # Answered before its own turn has ended.
+                    ask, source.ask = source.ask, None
+                kind, _, name = out.name.partition("|")
+                if isinstance(ask, SwitchAsk):
+                    if home.journal.durable:
+                        batch.add(home.path, ("replied", turn, int(out.to)), home.positions_of(turn))
+                    ask.give(Answer(kind, name, out.body), batch)
+                elif ask is not None:
+                    batch.after.append(lambda: answer_ask(home, ask, Answer(kind, name, out.body)))
+            case "forward":
+                self._forward(key, out, batch)
+            case "timer" | "cancel":
+                out = home.timers.known_as(out)
+                self._keep(turn, out, batch)
+                if out.verb == "cancel":
+                    home.timers.drop_ticks(out.to, key, batch)
+                batch.after.append(lambda: self._operate(out))
+            case "subscribe" | "unsubscribe":
+                self._keep(turn, out, batch)
+                batch.after.append(lambda: self._subscribe(out))
+            case "monitor" | "watch" | "demonitor" | "unwatch" | "link" | "unlink":
+                home.ties.turn(out.verb, out.to)
+                if home.journal.durable:
+                    batch.add(home.path, ("tie", turn, out.verb, out.to), home.positions_of(turn))
+                batch.after.append(lambda: connect(cell, node.cell_at(out.to), out.verb))
+            case "pipe":
+                pass
+            case verb:
+                raise HoldfastError(f"{home.path}: unknown output {verb!r}")
+
+    def hooked(self, record: Hooked) -> None:
+        """What a hook does that outlives it; it is done once, though a hook runs at each life."""
+        home, out = self._home, record.out
+        if record.hook == STARTED and self._is_touched_since(out):
+            return  # The turns behind the snapshot have had the last word, and are handled again.
+        if out.verb == "timer" and not home.timers.is_new(out):
+            return
+        if out.verb in ("monitor", "watch", "link") and home.ties.has(out.verb, out.to):
+            return
+        batch = Batch()
+        self.execute(home.turn, -1, out, batch)
+        batch.commit(home.journal)
+
+    def _is_touched_since(self, out: Out) -> bool:
+        """Whether a turn behind the snapshot has tied or untied the same."""
+        verbs = next((pair for pair in OPPOSITES if out.verb in pair), ())
+        digests = {Out(0, verb, out.to).digest() for verb in verbs}
+        home = self._home
+        turns = (turn.digests for number, turn in home.turns.items() if number > home.state_turn)
+        return bool(digests) and not all(digests.isdisjoint(known) for known in (*turns, home.partial))
+
+    def work_done(self, record: PipeDone) -> None:
+        """Background work has an outcome: an input, once."""
+        home = self._home
+        if not record.k:
+            home.forward(home.record(PIPE, record.name, record.body, home.path))
+            return
+        done = home.pipes_done.setdefault(record.turn, set())
+        if record.k not in done:
+            done.add(record.k)
+            origin = f"{record.turn}.{record.k}"
+            home.forward(home.record(PIPE, record.name, record.body, home.path, origin=origin))
+
+    def _operate(self, out: Out) -> None:
+        if self._stands(out):
+            self._home.timers.operate(out)
+
+    def _stands(self, out: Out) -> bool:
+        """Whether what outlives the life takes effect now; else its turn was undone meanwhile."""
+        if out in self.kept:
+            self.kept.remove(out)
+            return True
+        return not self._home.journal.durable
+
+    def _keep(self, turn: int, out: Out, batch: Batch) -> None:
+        """What outlives the life is journaled."""
+        if not self._home.journal.durable:
+            return
+        self.kept.append(out)
+        if out.verb == "timer" and not self._home.shapes.knows(out.name):
+            self._home.note_shape(out.name, batch)
+        entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, self._home.node.wall())
+        batch.add(self._home.path, entry, self._home.positions_of(turn))
+
+    def _deliver(self, target: Cell, out: Out, batch: Batch, sender: str | None = None) -> None:
+        """A message to another actor; to a recorded one it is journaled in the same append."""
+        home = self._home
+        switch = switch_of(target)
+        cell = home.cell if sender is None else home.node.cell_at(sender)
+        assert cell is not None
+        if switch is not None:
+            if isinstance(target, Inlet):
+                target.mark()
+            try:
+                if switch.bound is None or switch.bound.makes_room(None, out.name, out.body, cell.path):
+                    source = switch.record(MESSAGE, out.name, out.body, cell.path, batch)
+                    batch.after.append(lambda: switch.admitted(source))
+            except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
+                home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
+            return
+
+        def send() -> None:
+            try:
+                target.admit(target, Envelope(home.node.codec.message_in(target, out.name, out.body), cell))
+            except HoldfastError as error:
+                home.node.dead_letter(target, Parcel(out.name, out.body), str(error))
+
+        batch.after.append(send)
+
+    def _publish(self, turn: int, out: Out, batch: Batch) -> None:
+        """A message to each subscriber, when it has room; the publisher waits until the last one has accepted it."""
+        home, topic = self._home, out.to
+        home.calls.sends.add((turn, out.k))
+        subscribers = home.node.topics.subscribers(topic)
+        left = dict.fromkeys(subscribers)
+
+        def over(target: Cell, error: HoldfastError | None) -> None:
+            if error is not None:
+                home.node.not_taken(target, Parcel(out.name, out.body), error)
+            left.pop(target, None)
+            if not left:
+                home.calls.sent(turn, out.k, None)
+
+        for target in subscribers:
+            if isinstance(target, Inlet):
+                target.mark()
+            wanted = functools.partial(home.node.topics.has, topic, target)
+            self._send(target, out, batch, functools.partial(over, target), wanted)
+        if not subscribers:
+            batch.after.append(lambda: home.calls.sent(turn, out.k, None))
+
+    def _send(
+        self,
+        target: Cell,
+        out: Out,
+        batch: Batch,
+        over: Callable[[HoldfastError | None], None],
+        wanted: Callable[[], bool] = lambda: True,
+    ) -> None:
+        """A message whose sender waits until it is accepted; then, or if it will not be, `over` is called."""
+        home = self._home
+        switch = switch_of(target)
+        if switch is None:
+            batch.after.append(lambda: self._line_up(target, lambda: self._offer(target, out, over, wanted)))
+            return
+        bound = switch.bound
+        try:
+            if bound is None or not target.has_room or bound.makes_room(None, out.name, out.body, home.path):
+                # Even if there is no room: what is journaled in this append cannot be lost, and the sender waits.
+                source = switch.record(MESSAGE, out.name, out.body, home.path, batch)
+                batch.after.append(lambda: switch.admitted(source))
+        except MailboxFull as full:
+            error = full
+            batch.after.append(lambda: over(error))
+            return
+        batch.after.append(lambda: self._wait(target, switch, over))
+
+    def _wait(self, target: Cell, switch: Switch, over: Callable[[HoldfastError | None], None]) -> None:
+        """Let the sender go on when its receiver, which has the message, has room; nobody waits for itself."""
+        room = None
+        if switch is not self._home and switch.cell is not None and switch.cell.state is not GONE:
+            room = target.room() if isinstance(target, Inlet) else switch.room()
+        if room is None:
+            over(None)
+        else:
+            room.add_done_callback(lambda _: self._wait(target, switch, over))
+
+    def _line_up(self, target: Cell, offer: Callable[[], bool]) -> None:
+        """Offer a message when all that was offered to its receiver before has been taken."""
+        line = self._lines.get(target)
+        if line is not None:
+            line.append(offer)
+        elif not offer():
+            self._lines[target] = deque((offer,))
+
+    def _room_came(self, target: Cell) -> None:
+        line = self._lines[target]
+        while line and line[0]():
+            line.popleft()
+        if not line:
+            del self._lines[target]
+
+    def _offer(
+        self, target: Cell, out: Out, over: Callable[[HoldfastError | None], None], wanted: Callable[[], bool]
+    ) -> bool:
+        """Hand a message over if its receiver, which keeps no journal, has room. False: it has to wait for it."""
+        home = self._home
+        taken: Awaitable[None] | None = None
+        try:
+            if wanted():
+                room = target.room()
+                if room is not None:
+                    room.add_done_callback(lambda _: self._room_came(target))
+                    return False
+                message = home.node.codec.message_in(target, out.name, out.body)
+                taken = target.host.offer(target, Envelope(message, home.cell))
+        except HoldfastError as error:
+            over(error)
+            return True
+        if taken is None:
+            over(None)
+        else:  # It is in another process, which answers.
+            asyncio.ensure_future(taken).add_done_callback(lambda done: over(_failure(done)))
+        return True
+
+    def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
+        home = self._home
+        target = home.node.cell_at(out.to)
+        source = home.open.get(key)
+        chain = ((home.path, key), *(source.chain if source is not None else ()))
+        ask = SwitchAsk.made(home, turn, out, chain, target)
+        home.calls.asks[turn, out.k] = ask
+        home.node.deadlines.add(ask)
+        switch = switch_of(target)
+        if switch is None:
+            batch.after.append(lambda: self._send_ask(target, ask))
+        elif switch.waits(ask):
+            ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, tuple(p for p, _ in chain)))), batch)
+        elif switch.bound is None or switch.bound.makes_room(ask, out.name, out.body, home.path):
+            asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
+            asked.ask, asked.chain = ask, chain
+            batch.after.append(lambda: switch.admitted(asked))
+
+    def _send_ask(self, target: Cell, ask: SwitchAsk) -> None:
+        home = self._home
+        parcel: Any = ask.message
+        try:
+            ctx = target.ctx
+            if ctx is not None and ctx.turn_in(ask.chain):
+                raise AskDeadlock(target.path, tuple(path for path, _ in ask.chain))
+            ask.message = home.node.codec.message_in(target, parcel.name, parcel.body)
+            target.admit(target, ask)
+        except HoldfastError as error:
+            ask.fail(error)
+
+    def _forward(self, key: int, out: Out, batch: Batch) -> None:
+        home = self._home
+        source = home.open.get(key)
+        ask = source.ask if source is not None else None
+        target = home.node.cell_at(out.to)
+        if source is None or ask is None:
+            self._deliver(target, out, batch, None if source is None else source.sender)
+            return
+        source.ask = None  # From now on it is the receiver's to answer.
+
+        def send() -> None:
+            try:
+                message: Any = ask.message
+                if type(message) is Parcel:
+                    ask.message = home.node.codec.message_in(target, out.name, out.body)
+                target.admit(target, ask)
+            except HoldfastError as error:
+                ask.fail(error)
+
+        batch.after.append(send)
+
+    def _subscribe(self, out: Out) -> None:
+        """Subscriptions belong to the address and outlive its lives."""
+        home = self._home
+        if not self._stands(out):
+            return
+        if out.verb == "subscribe":
+            home.topics[out.to] = None
+            if home.cell is not None and home.cell.state is not GONE:  # Else its next life will be subscribed.
+                home.node.topics.subscribe(out.to, inlet(home, out.to))
+        else:
+            home.topics.pop(out.to, None)
+            if home.cell is not None:
+                home.node.topics.unsubscribe(out.to, inlet(home, out.to))
+
+
+def _failure(done: asyncio.Future[None]) -> HoldfastError | None:
+    """Why something was not accepted."""
+    error = None if done.cancelled() else done.exception()
+    return error if isinstance(error, HoldfastError) else None
+
+
+def switch_of(cell: Cell) -> Switch | None:
+    """The switch of a recorded actor's cell."""
+    return getattr(cell.host, "switch", None)
+
+
+def went_elsewhere(home: Switch, out: Out, digest: int) -> bool:
+    """Whether a replayed output is the same but for its receiver, for its binding was changed since."""
+    others = home.node.led.get(home.path, {}).get(out.to, ())
+    return any(msgspec.structs.replace(out, to=path).digest() == digest for path in others)

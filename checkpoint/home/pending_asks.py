@@ -1,0 +1,181 @@
+"""Asks from inside recorded turns: their outcomes are inputs, and are journaled like one."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ...actors.errors import AskTimeout, BadMessage, HoldfastError
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.codec import Parcel
+from ...actors.kernel.envelope import Ask, ReplyHandle
+from ...actors.process.wire.peer import RelayedAsk
+from ..protocol import REPLY, Answer, Out, Outcome
+from .inputs import Batch
+
+if TYPE_CHECKING:
+    from ...actors.kernel.codec import Codec
+    from .switch import Switch
+
+
+ACCEPTED = Answer(REPLY, "", msgspec.msgpack.encode(None))
+
+
+MARK = "ask "
+"""How the origin of an input begins that somebody's recorded turn has asked; the asker is its sender."""
+
+
+class Over:
+    """Stands for the future of an ask that is over."""
+
+    def done(self) -> bool:
+        """It is."""
+        return True
+
+
+OVER = Over()
+
+
+class SwitchAsk(RelayedAsk, eq=False):
+    """An ask from inside a recorded turn: its outcome is journaled before the turn hears of it.
+
+    To others it is an ask that was relayed: whoever has an encoded outcome hands that over.
+    """
+
+    switch: Any = None
+    asker: str = ""
+    turn: int = 0
+    k: int = 0
+
+    @classmethod
+    def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell) -> SwitchAsk:
+        """The ask that was output (turn, k)."""
+        deadline = switch.node.loop.time() + out.seconds
+        ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, deadline, None, to)
+        ask.future, ask.switch, ask.asker, ask.turn, ask.k = ask, switch, switch.path, turn, out.k
+        return ask
+
+    @property
+    def codec(self) -> Codec:
+        """What encodes its outcome."""
+        codec: Codec = self.switch.node.codec
+        return codec
+
+    def done(self) -> bool:
+        """As a future has it."""
+        return self.is_over
+
+    def answer(self, reply: object) -> None:
+        if isinstance(reply, ReplyHandle):
+            return
+        try:
+            body = self.codec.encode(reply, self.asker)
+        except BadMessage as error:
+            self.fail(BadMessage("reply", error.message, error.problem))
+        else:
+            self.give(Answer(REPLY, "", body))
+
+    def answer_raw(self, body: bytes) -> None:
+        """An encoded reply."""
+        self.give(Answer(REPLY, "", body))
+
+    def fail(self, error: BaseException) -> None:
+        self.give(Answer(*self.codec.encode_error(error)))
+
+    def fail_raw(self, kind: str, name: str, body: bytes) -> None:
+        """An encoded error."""
+        self.give(Answer(kind, name, body))
+
+    def give(self, answer: Answer, batch: Batch | None = None) -> None:
+        """The outcome, once."""
+        if not self.is_over:
+            self.is_over = True
+            self.future = OVER  # Not itself any more: a cycle would keep the message until the next collection.
+            self.switch.calls.outcome(self.turn, self.k, answer, batch)
+
+
+def origin_of(ask: SwitchAsk) -> str:
+    """How the journal of its receiver names an ask."""
+    return f"{MARK}{ask.turn}.{ask.k}"
+
+
+def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:
+    """Hand an encoded outcome to whoever asks from outside recorded turns."""
+    if isinstance(ask, RelayedAsk):
+        if answer.kind == REPLY:
+            ask.answer_raw(answer.body)
+        else:
+            ask.fail_raw(answer.kind, answer.name, answer.body)
+        return
+    codec = home.node.codec
+    if answer.kind != REPLY:
+        ask.fail(codec.decode_error(answer.kind, answer.name, answer.body))
+        return
+    try:
+        reply = codec.decode_reply(type(ask.message), answer.body)
+    except msgspec.DecodeError as error:
+        ask.fail(HoldfastError(f"the reply of {home.path} does not fit its type: {error}"))
+    else:
+        ask.answer(reply)
+
+
+class Calls:
+    """What the turns of one home have asked and sent, and wait for."""
+
+    def __init__(self, home: Switch) -> None:
+        self._home = home
+        self.asks: dict[tuple[int, int], SwitchAsk] = {}
+        self.sends: set[tuple[int, int]] = set()  # whose receivers have no room yet
+        self.outcomes: dict[tuple[int, int], Answer] = {}  # since the last snapshot
+
+    def join(self, turn: int, key: int, out: Out) -> None:
+        """An ask or send that was made before the crash: answered from the journal, or when its pending call is."""
+        k, rejoin = out.k, self._home.rejoin
+        answer = self.outcomes.get((turn, k))
+        if answer is None and out.verb in ("send", "publish"):
+            answer = None if (turn, k) in self.sends else ACCEPTED
+        elif (
+            answer is None
+            and (turn, k) not in self.asks
+            and not (rejoin is not None and rejoin.joins(self._home, turn, key, out))
+        ):
+            # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
+            answer = Answer(*self._home.node.codec.encode_error(AskTimeout("(unknown since the restart)", 0.0, None)))
+        if answer is not None and self._home.port is not None:
+            self._home.port.to_life(Outcome(turn, k, answer))
+
+    def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
+        """An ask of ours has its outcome: journal it, then tell the turn that waits."""
+        own = batch if batch is not None else Batch()
+        self.asks.pop((turn, k), None)
+        if turn > self._home.state_turn:  # Else it will not be replayed.
+            self.outcomes[turn, k] = answer
+            if self._home.journal.durable:
+                entry = ("got", turn, k, answer.kind, answer.name, answer.body)
+                own.add(self._home.path, entry, self._home.positions_of(turn))
+        own.after.append(lambda: self._tell(turn, k, answer))
+        if batch is None:
+            own.commit(self._home.journal)
+
+    def abandon(self) -> None:
+        """What is still out concerns nobody any more."""
+        for ask in self.asks.values():
+            ask.is_over, ask.future = True, OVER
+        self.asks.clear()
+        self.sends.clear()
+
+    def sent(self, turn: int, k: int, error: HoldfastError | None) -> None:
+        """A `send` or `publish` of ours was accepted, or not.
+
+        (The former is not journaled: under replay it is accepted unless it still waits.)
+        """
+        self.sends.discard((turn, k))
+        if error is None:
+            self._tell(turn, k, ACCEPTED)
+        else:
+            self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), None)
+
+    def _tell(self, turn: int, k: int, answer: Answer) -> None:
+        if self._home.port is not None:
+            self._home.port.to_life(Outcome(turn, k, answer))

@@ -1,0 +1,343 @@
+"""`self.ctx` of a recorded actor: what it does becomes an output of the turn in hand."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import random
+from collections.abc import Awaitable, Callable
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from ...actors.errors import ControlFailed, HoldfastError, remote_crash
+from ...actors.exit_reasons import NORMAL, ExitReason
+from ...actors.kernel import mailbox
+from ...actors.kernel.actor import Actor
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.context import ActorContext, StashError
+from ...actors.kernel.envelope import Ask, Item, ReplyHandle
+from ...actors.kernel.links import Monitor
+from ...actors.kernel.message import Message, message_name, require_message
+from ...actors.kernel.ref import ActorRef, current
+from ..protocol import Feed, PipeDone
+from .recorded_inbox import INIT, STARTED, Fed
+
+if TYPE_CHECKING:
+    from .recorded_life import Life
+
+T = TypeVar("T")
+R = TypeVar("R")
+A = TypeVar("A", bound=Actor)
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedReplyHandle(ReplyHandle[R]):
+    """The right to answer one ask of a recorded actor later; it may be kept in a key variable."""
+
+    id: int
+
+    def reply(self, value: R) -> None:
+        """Answer, from a turn of the same actor."""
+        life = _own_life("answers later")
+        answer = life.answer_value(value, set)  # What was declared is not known here: sets are looked for.
+        life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
+
+    def fail(self, error: HoldfastError) -> None:
+        """Answer with a Refusal or another typed error, from a turn of the same actor."""
+        life = _own_life("answers later")
+        answer = life.answer_error(error)
+        life.put("reply", str(self.id), f"{answer.kind}|{answer.name}", answer.body)
+
+
+def _own_life(what: str) -> Life:
+    """The life whose turn or hook this is."""
+    ctx = current.get(None)
+    if not isinstance(ctx, RecordedContext):
+        raise HoldfastError(f"a recorded actor {what} from one of its own turns")
+    return ctx.acting()
+
+
+@dataclasses.dataclass(frozen=True)
+class RecordedTimer:
+    """A handle on a timer of a recorded actor, whose clock runs at its home; it may be kept in a key variable."""
+
+    id: str
+
+    def cancel(self) -> None:
+        """The message does not come any more, not even one that is queued already."""
+        _own_life("cancels its timers").cancel_timer(self.id)
+
+
+class RecordedContext(ActorContext):
+    """`self.ctx` of a recorded actor: what it does becomes an output of the turn in hand."""
+
+    __slots__ = ("_drawn", "recorded")
+
+    may_fail_fast = False
+
+    recorded: Life
+    _drawn: int  # the turn that `_random` belongs to
+
+    def in_turn(self) -> bool:
+        """Whether this code runs in the turn in hand, not in a background task."""
+        return self.recorded.feed is not None and not _in_background()
+
+    def acting(self) -> Life:
+        """The life, whose turn or hook it must be that runs.
+
+        Raises:
+            HoldfastError: this is `__init__`, or a background task.
+        """
+        if not self.in_turn():
+            self._outside()
+        return self.recorded
+
+    def _outside(self) -> None:
+        """Hooks may act (at once, unrecorded); background tasks may not, and neither may `__init__`."""
+        self._alive()
+        life = self.recorded
+        if life.hook == INIT:
+            why = "__init__ runs at each life, before the state is back"
+            raise HoldfastError(f"{self.path}: {why}; act in on_start, or in on_recovered")
+        if not life.hook or _in_background():
+            raise HoldfastError(
+                f"{self.path}: background tasks of a recorded actor may not send; report with ctx.pipe_to_self()"
+            )
+
+    def now(self) -> float:
+        feed = self.recorded.feed
+        return self.cell.node.wall() if feed is None else feed.time
+
+    @property
+    def random(self) -> random.Random:
+        life = self.recorded
+        if self._random is None or self._drawn != life.turn:
+            self._drawn = life.turn
+            when = 0.0 if life.feed is None else life.feed.time
+            self._random = random.Random(f"{self.path}|{life.turn}|{when}")
+        return self._random
+
+    def draw_anew(self) -> None:
+        """A turn is about to be run again: it draws the same numbers as the first time."""
+        self._random = None
+
+    def find(self, path: str, kind: type[A]) -> ActorRef[A]:
+        """A ref to the address, whoever lives there: under replay somebody else, or nobody yet (T21)."""
+        if not self.in_turn() and not self.recorded.hook:
+            return super().find(path, kind)
+        node = self.cell.node
+        cell = node.cell_at(path)
+        return ActorRef(cell) if cell.is_dead else node.find_ref(path, kind)
+
+    # -- sending ----------------------------------------------------------------------------------------------------
+
+    def tell(self, cell: Cell, message: Message[Any]) -> None:
+        if not self.in_turn():
+            self._outside()
+            super().tell(cell, message)
+            return
+        self._put("tell", cell, message)
+
+    async def send(self, cell: Cell, message: Message[Any]) -> None:
+        if not self.in_turn():
+            self._outside()
+            await super().send(cell, message)
+            return
+        await self._accepted(self._put("send", cell, message))
+
+    async def _accepted(self, k: int) -> None:
+        """Have output `k` leave, and wait until it is accepted."""
+        life = self.recorded
+        accepted: asyncio.Future[None] = self.cell.node.loop.create_future()
+        life.asks[life.turn, k] = accepted, None
+        life.release()
+        await accepted
+
+    def _put(self, verb: str, cell: Cell, message: Message[Any], *, seconds: float = 0.0) -> int:
+        if type(message) not in cell.table:
+            cell.require(message)
+        body = self.cell.node.codec.encode_alike(message, cell.path)
+        return self.recorded.put(verb, cell.path, message_name(type(message)), body, seconds=seconds)
+
+    def ask(self, cell: Cell, message: Message[R], timeout: float) -> asyncio.Future[R]:
+        if not self.in_turn():
+            self._outside()
+            return super().ask(cell, message, timeout)
+        life = self.recorded
+        k = self._put("ask", cell, message, seconds=timeout)
+        future: asyncio.Future[R] = self.cell.node.loop.create_future()
+        life.asks[life.turn, k] = future, type(message)
+        life.release()
+        return future
+
+    def forward(self, to: ActorRef[Any]) -> None:
+        fed = self.item
+        if not self.in_turn() or not isinstance(fed, Fed):
+            raise HoldfastError(f"{self.path}: only a message in hand can be forwarded")
+        feed = fed.feed
+        self.recorded.put("forward", to.path, feed.name, feed.body)
+
+    def reply_handle(self) -> ReplyHandle[Any]:
+        feed = self.recorded.feed  # Its id even if nobody waits (any more): a replay must make the same handle.
+        return RecordedReplyHandle(feed.id if feed is not None else -1)
+
+    async def publish(self, topic: str, message: Message[Any]) -> None:
+        if not self.in_turn():
+            self._outside()
+            await super().publish(topic, message)
+            return
+        require_message(topic, message)
+        body = self.cell.node.codec.encode_alike(message, topic)
+        k = self.recorded.put("publish", topic, message_name(type(message)), body)
+        if self.waits_for_room(topic):
+            await self._accepted(k)
+
+    def waits_for_room(self, topic: str) -> bool:
+        """Whether to wait, in the middle of the turn, until all subscribers have accepted what is published."""
+        return True
+
+    async def flush(self) -> None:
+        self.recorded.release()
+
+    # -- later ------------------------------------------------------------------------------------------------------
+
+    def _timer(self, message: Message[Any], delay: float, interval: float) -> Any:
+        self.cell.require(message)
+        life = self.acting()
+        name, body = message_name(type(message)), self.cell.node.codec.encode_alike(message, self.path)
+        in_turn = life.feed is not None
+        key = f"{life.turn}.{life.last_k + 1}" if in_turn else life.timer_of_hook(name, body, interval)
+        life.put("timer", key, name, body, seconds=delay, interval=interval)
+        return RecordedTimer(key)
+
+    def tell_after(self, delay: float, message: Message[Any]) -> Any:
+        return self._timer(message, delay, 0.0)
+
+    def every(self, interval: float, message: Message[Any]) -> Any:
+        return self._timer(message, interval, interval)
+
+    def pipe_to_self(
+        self,
+        work: Awaitable[T],
+        then: Callable[[T], Message[Any]],
+        failed: Callable[[BaseException], Message[Any]] | None = None,
+    ) -> None:
+        life, feed = self.acting(), self.recorded.feed
+        k = 0  # What a hook begins is begun again by the next life's: no turn has to stay in the journal for it.
+        if feed is not None:
+            k = life.put("pipe", "")
+            if k in feed.pipes:  # Its result was journaled before the crash: it will be fed.
+                if asyncio.iscoroutine(work):
+                    work.close()
+                return
+            life.pipes += 1
+        task = self._beside(self._piped(life.turn, k, work, then, failed), "pipe")
+        if asyncio.iscoroutine(work):  # Cancelled before its first step, the task would leave it unawaited.
+            task.add_done_callback(lambda _: work.close())
+
+    async def _piped(self, turn: int, k: int, work: Any, then: Any, failed: Any) -> None:
+        codec = self.cell.node.codec
+        try:
+            message = await self._outcome(work, then, failed)
+            record = PipeDone(turn, k, message_name(type(message)), codec.encode(message, self.path))
+        except BaseException as error:  # Nobody takes it: the actor crashes, once.
+            record = PipeDone(turn, k, "", codec.encode_error(remote_crash(self._uncaught(error)))[2])
+        if not self.closed:
+            self.recorded.port.to_home(record)
+            if k:
+                self.recorded.pipe_back()
+
+    # -- stash, links, subscriptions --------------------------------------------------------------------------------
+
+    def stash(self) -> None:
+        fed, life = self.item, self.recorded
+        if not isinstance(fed, Fed) or life.feed is None:
+            raise StashError(f"{self.path}: only a message can be stashed")
+        if fed.is_stashed:
+            raise StashError(f"{self.path}: this message is stashed already")
+        fed.is_stashed = True
+        life.stash.append(fed)
+
+    def unstash(self) -> None:
+        life = self.acting()
+        if life.hook == STARTED:  # In a process, what was put aside may not be here yet.
+            life.unstashes = True
+        stash, life.stash = life.stash, []
+        again = [Fed(life, once_more(fed.feed), fed.message, fed.sender) for fed in stash]
+        if life.is_live:
+            mailbox.queue_of(self.cell).extendleft(reversed(again))
+            self.cell.schedule()
+        else:
+            life.returned = {fed.feed.id: fed for fed in again} | life.returned  # in front of those put back before
+
+    def monitor(self, other: ActorRef[Any]) -> Monitor:
+        self.acting().put("monitor", other.path)
+        return RecordedMonitor(self.cell, other._cell, for_good=False)
+
+    def watch(self, other: ActorRef[Any]) -> Monitor:
+        self.acting().put("watch", other.path)
+        return RecordedMonitor(self.cell, other._cell, for_good=True)
+
+    def link(self, other: ActorRef[Any]) -> None:
+        self.acting().put("link", other.path)
+
+    def unlink(self, other: ActorRef[Any]) -> None:
+        self.acting().put("unlink", other.path)
+
+    def subscribe(self, topic: str) -> None:
+        self.acting().put("subscribe", topic)
+
+    def unsubscribe(self, topic: str) -> None:
+        self.acting().put("unsubscribe", topic)
+
+    def depart(self, owe: Callable[[Ask], int]) -> bytes:
+        self.recorded.last_snapshot()
+        return b""
+
+    def postpones(self, call: Item) -> bool:
+        if self.recorded.is_live:
+            return False
+        self.recorded.postponed.append(call)
+        return True
+
+    def may_replace(self) -> None:
+        problem = self.recorded.may_replace()
+        if problem:
+            raise ControlFailed(self.path, "replace_state", problem)
+
+    def replaced(self) -> None:
+        self.recorded.replaced()
+
+    def stop(self, reason: ExitReason = NORMAL) -> None:
+        if self.recorded.is_live:
+            super().stop(reason)
+        else:  # A replayed turn: the life ends when it has caught up.
+            self.recorded.stop_wanted = reason
+
+    def close(self) -> None:
+        super().close()
+        self.recorded.close()
+
+
+def _in_background() -> bool:
+    """Whether this code runs in a task of its own."""
+    try:
+        task = asyncio.current_task()
+    except RuntimeError:
+        return False
+    return task is not None and task.get_name() != "holdfast runner"
+
+
+class RecordedMonitor(Monitor):
+    """A handle on a watch that the home keeps."""
+
+    __slots__ = ()
+
+    def cancel(self) -> None:
+        """No further DOWN is admitted after the turn in hand."""
+        self.active = False
+        _own_life("stops watching").put("unwatch" if self.for_good else "demonitor", self.target.path)
+
+
+def once_more(feed: Feed) -> Feed:
+    """The same input, to be handled in a turn of its own."""
+    return Feed(feed.id, -1, feed.kind, feed.name, feed.body, feed.time, feed.sender, feed.is_ask, feed.chain)

@@ -1,0 +1,245 @@
+"""What stands in the mailbox of a recorded life: its inputs, and the commands of its home."""
+
+from __future__ import annotations
+
+import types
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import HoldfastError, RemoteCrash, StartFailed
+from ...actors.exit_reasons import NORMAL, ExitReason, unpack_exit
+from ...actors.kernel import lifecycle
+from ...actors.kernel.actor import Actor
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.envelope import LEAVE, Item, ReplyHandle
+from ...actors.kernel.message import Message, Refusal, reply_type
+from ..protocol import CRASH, DROPPED, LATER, OK, START, STASHED, Answer, Feed, Go
+from ..snapshot.key_variables import check_saved
+
+if TYPE_CHECKING:
+    from ...actors.kernel.node import Node
+    from .recorded_life import Life
+
+Coroutine_ = types.CoroutineType
+INIT, STARTED, RECOVERED, STOP = "init", "start", "recovered", "stop"
+"""The hooks that are no turns: `__init__`, `on_start(True)`, `on_recovered`, `on_stop`."""
+
+
+class Fed(Item):
+    """An input in the mailbox of its life."""
+
+    __slots__ = ("feed", "is_stashed", "life", "message", "sender")
+
+    def __init__(self, life: Life, feed: Feed, message: Any, sender: Cell | None) -> None:
+        self.life, self.feed, self.message, self.sender = life, feed, message, sender
+        self.is_stashed = False
+
+    @property
+    def chain(self) -> tuple[tuple[str, int], ...]:
+        """Who waits for this turn."""
+        return self.feed.chain
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        life: Life = item.life
+        feed: Feed = item.feed
+        life.open_turn(feed)
+        if feed.deadline and feed.deadline <= life.cell.node.loop.time() and feed.turn < 0:
+            life.close_turn(DROPPED, Answer())  # Nobody waits any more.
+            return None
+        if item.message is None and feed.name:
+            try:
+                item.message = life.cell.node.codec.message_in(life.cell, feed.name, feed.body)
+            except HoldfastError as error:  # It came encoded, and is none of ours.
+                life.close_turn(DROPPED, life.answer_error(error))
+                return None
+        try:
+            result = item.call(actor) if life.guard is None else life.guard.call(item.call, actor)
+        except Refusal as no:
+            item.refuse(no)
+            return None
+        if type(result) is Coroutine_:
+            return item.finish(result if life.guard is None else life.guard.drive(result))
+        item.end_with(result)
+        return None
+
+    def hook(self) -> str:
+        return f"on_{self.feed.kind}" if self.feed.kind in ("start", "exit", "down") else self.feed.kind
+
+    def call(self, actor: Any) -> Any:
+        """Call the handler or hook that this input is for."""
+        feed = self.feed
+        node: Node = self.life.cell.node
+        match feed.kind:
+            case "start":
+                return actor.on_start(False)
+            case "exit":
+                data = node.codec.decode(dict[str, Any], feed.body)
+                reason, more = unpack_exit(data["reason"]), self.life.cell.more
+                if more is not None and more.trap_exits:
+                    return actor.on_exit(node.cell_at(data["source"]).ref, reason)
+                if reason != NORMAL:
+                    self.life.is_cut_off = True
+                    actor.ctx.stop(reason)
+                return None
+            case "down":
+                data = node.codec.decode(dict[str, Any], feed.body)
+                return actor.on_down(
+                    node.cell_at(data["source"]).ref, unpack_exit(data["reason"]), bool(data["recovering"])
+                )
+            case "pipe" if not feed.name:
+                error = node.codec.decode_error(CRASH, "", feed.body)
+                assert isinstance(error, RemoteCrash)
+                raise error
+            case _:
+                return actor._table[type(self.message)](actor, self.message)
+
+    async def finish(self, handler: Any) -> None:
+        """The turn of an async handler."""
+        try:
+            result = await handler
+        except Refusal as no:
+            self.refuse(no)
+        else:
+            self.end_with(result)
+
+    def refuse(self, no: Refusal) -> None:
+        """The handler said no, which is an answer; nobody has asked an actor to start."""
+        if self.feed.kind == START:
+            raise StartFailed(self.life.cell.path, str(no)) from no
+        self.end(self.life.answer_error(no) if self.feed.is_ask else Answer())
+
+    def end_with(self, result: object) -> None:
+        """The handler returned."""
+        if not self.feed.is_ask:
+            self.end(Answer())
+        elif isinstance(result, ReplyHandle):
+            self.end(Answer(LATER))
+        else:
+            kind: type[Message[Any]] = type(self.message)
+            self.end(self.life.answer_value(result, reply_type(kind)))
+
+    def end(self, answer: Answer) -> None:
+        """The turn is over; a stashed message stays open."""
+        life = self.life
+        if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None and life.saves:
+            check_saved(life.cell.actor, life.method)  # What cannot be saved is refused now, not when it is needed.
+        if self.is_stashed:
+            life.close_turn(STASHED, Answer())
+        else:
+            life.close_turn(OK, answer if self.feed.is_ask else Answer())
+
+    def is_start(self) -> bool:
+        return self.feed.kind == START
+
+    def ignored(self, cell: Cell, why: str) -> bool:
+        """Called when the turn raised `Ignore`: only `on_start` may mean it."""
+        if self.feed.kind == START:
+            self.life.ignore(why)
+        return self.feed.kind == START
+
+    def fail(self, error: BaseException) -> None:
+        """Called when the turn crashed the actor."""
+        self.life.fail_turn(error.__cause__ or error)
+
+
+class Hook(Item):
+    """A hook that is no turn: called at each life, what it does takes effect at once and is not replayed."""
+
+    __slots__ = ("life", "name")
+
+    def __init__(self, life: Life, name: str) -> None:
+        self.life, self.name = life, name
+
+    def hook(self) -> str:
+        return self.name
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        life: Life = item.life
+        life.enter(STARTED if item.name == "on_start" else RECOVERED)
+        try:
+            result = actor.on_start(True) if item.name == "on_start" else actor.on_recovered()
+        except Refusal as no:  # Nobody asked: an actor that refuses to start has failed to.
+            raise StartFailed(life.cell.path, str(no)) from no
+        if type(result) is Coroutine_:
+            return item.finish(result)
+        item.over()
+        return None
+
+    async def finish(self, hook: Any) -> None:
+        try:
+            await hook
+        except Refusal as no:
+            raise StartFailed(self.life.cell.path, str(no)) from no
+        self.over()
+
+    def is_start(self) -> bool:
+        return True
+
+    def ignored(self, cell: Cell, why: str) -> bool:
+        """Called when the hook raised `Ignore`."""
+        if self.name == "on_start":
+            self.life.ignore(why)
+        return self.name == "on_start"
+
+    def over(self) -> None:
+        """The hook has returned."""
+        self.life.hook = ""
+
+
+class GoLive(Hook):
+    """Everything that was handled before has been handled again."""
+
+    __slots__ = ("go",)
+
+    def __init__(self, life: Life, go: Go) -> None:
+        super().__init__(life, "on_recovered")
+        self.go = go
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        # Turns that failed are not replayed, but their numbers are used.
+        item.life.turn = max(item.life.turn, item.go.turn)
+        item.life.gone, item.life.timers = item.go.gone, dict(item.go.timers)
+        if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
+            return Hook.run(actor, item)
+        item.over()
+        return None
+
+    def over(self) -> None:
+        super().over()
+        self.life.go_live()
+
+
+class TakeSnapshot(Item):
+    """A command: save the state now, between two turns."""
+
+    __slots__ = ("life",)
+
+    def __init__(self, life: Life) -> None:
+        self.life = life
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        item.life.take_snapshot()
+        return None
+
+
+class StopRecorded(Item):
+    """A command: end in good order, with a final snapshot."""
+
+    __slots__ = ("life", "reason")
+
+    def __init__(self, life: Life, reason: ExitReason) -> None:
+        self.life, self.reason = life, reason
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        life: Life = item.life
+        life.take_snapshot(is_last=True)
+        life.enter(STOP)
+        if life.is_cut_off:
+            lifecycle.finish(life.cell, item.reason, is_orderly=False)
+        else:
+            lifecycle.stop(life.cell, item.reason, item)
+        return LEAVE

@@ -1,0 +1,486 @@
+"""The life of a recorded actor, wherever it is lived: one turn per input that its home feeds, each reported.
+
+Replay is not a mode here: the home feeds what was handled before in the same order, and drops what it has released
+already. Only time and randomness come from the input instead of the world.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+from ...actors.errors import ActorStopped, BadMessage, ControlFailed, HoldfastError, StartFailed, remote_crash
+from ...actors.exit_reasons import ExitReason
+from ...actors.kernel import lifecycle, mailbox
+from ...actors.kernel.actor import Actor, Start
+from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.envelope import Item
+from ...actors.kernel.message import Message, message_name
+from ..home.durable_timers import said_by
+from ..method import Method
+from ..protocol import (
+    FAILED,
+    OK,
+    REPLY,
+    START,
+    STASHED,
+    Answer,
+    Clock,
+    Feed,
+    Go,
+    Hooked,
+    Ignored,
+    Kept,
+    Live,
+    Out,
+    Outcome,
+    Released,
+    Restore,
+    Snapshot,
+    SnapshotNow,
+    ToHome,
+    ToLife,
+    TurnEnd,
+    Unsaved,
+    pieces,
+)
+from ..snapshot.image_writer import Imaging
+from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
+from .determinism_guard import Guard
+from .readonly_guard import check_readonly
+from .recorded_context import RecordedContext
+from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, TakeSnapshot
+from .replay_guard import digest_of
+
+
+class HomePort(Protocol):
+    """The way home."""
+
+    def to_home(self, record: ToHome) -> None:
+        """Hand a record to the home; it is handled in order."""
+        ...
+
+    def when_told(self, then: Callable[[], None]) -> None:
+        """Call this when all that was handed over is on its way."""
+        ...
+
+    def closed(self) -> None:
+        """The life is over."""
+        ...
+
+
+class Life:
+    """One recorded life: the turn in hand, its outputs, and when the next snapshot is due."""
+
+    def __init__(
+        self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False
+    ) -> None:
+        self.cell, self.port, self.method, self.page = cell, port, method, page
+        self.interval = method.interval if method.snapshots else 0.0  # 0: no snapshot is ever taken
+        self.turn = 0
+        self.feed: Feed | None = None
+        self.outs: list[Out] = []
+        self.last_k = 0
+        self.asks: dict[tuple[int, int], tuple[asyncio.Future[Any], type[Message[Any]] | None]] = {}
+        self.pipes = 0
+        self.stash: list[Fed] = []
+        self.returned: dict[int, Fed] = {}
+        self.gone: tuple[int, ...] = ()
+        self.cancelled: set[str] = set()  # timers whose ticks may still be on their way
+        self.stop_wanted: ExitReason | None = None
+        self.is_cut_off = False  # it ends by an EXIT that it does not trap
+        self.postponed: list[Item] = []  # orders from outside that wait until it is live
+        self.is_live = self.is_over = False
+        self.has_replayed = False
+        self.begins_suspended = False
+        self.hook = ""  # the hook that runs, if it is one that is no turn
+        self.timers: dict[str, Clock] = {}  # those that run, as far as a hook has not said so
+        self.unstashes = False  # what was put aside before the snapshot is to come again
+        self.guard = Guard() if method.strict else None
+        self.is_checked = method.check_replay  # whether the state is compared under replay
+        self.ignored_why: str | None = None
+        self.saves = True  # whether its state must be one that can be saved
+        self._snapshot_turn = -1
+        self._state: list[bytes] = []
+        self._saved_variables: list[str] = []
+        self.variables: list[str] = []  # of the actor, when `__init__` had run; none if it says itself what is saved
+        self._has_state = self._traps = False
+        self._named: dict[str, int] = {}  # how many timers of hooks say this, by its checksum
+        self._restore_seconds = 0.0
+        self._snapshot_wanted = self._snapshot_postponed = False
+        self.images = Imaging(self, may_fork=may_fork)
+
+    # -- beginning --------------------------------------------------------------------------------------------------
+
+    def begin(self, start: Start[Any], turn: int, stash: list[int]) -> None:
+        """Construct the actor and put its state back, if there is any; inputs may be fed from now on.
+
+        Raises:
+            StartFailed: `__init__` or the restoring raised.
+        """
+        cell = self.cell
+        cell.life += 1
+        self.hook = INIT
+        lifecycle.build(cell, start, self._context)
+        self.hook = ""
+        actor = cell.actor
+        assert actor is not None
+        self.turn = turn
+        if self._traps:
+            cell.extra().trap_exits = True
+        try:
+            check_keys(actor, self.method, first=not self._has_state)
+        except HoldfastError as error:
+            self._context_made.close()
+            cell.actor = cell.ctx = None
+            raise StartFailed(cell.path, str(error)) from error
+        self.variables = [] if hasattr(actor, "get_state") else variables(actor)
+        if self.method.check_readonly:
+            check_readonly(actor, self)
+        if self._has_state:
+            begin = time.perf_counter()
+            try:
+                data = b"".join(self._state)
+                self.images.last_bytes = len(data)
+                restore_state(actor, data, (self._saved_variables, self.variables))
+            except BaseException as error:
+                self._context_made.close()
+                cell.actor = cell.ctx = None
+                raise StartFailed(cell.path, f"its state could not be restored: {error}") from error
+            self._restore_seconds = time.perf_counter() - begin
+            self._snapshot_turn = turn
+        self._state.clear()
+        self._stashed_ids = frozenset(stash)
+        cell.state = RUNNING
+        if self._has_state and start.kind.on_start is not Actor.on_start:
+            mailbox.queue_of(cell).append(Hook(self, "on_start"))
+        lifecycle.up(cell)
+
+    def _context(self, cell: Cell) -> RecordedContext:
+        """Made before `__init__` runs: that may use `ctx` already."""
+        self._context_made = RecordedContext(cell)
+        self._context_made.recorded = self
+        return self._context_made
+
+    # -- records from home ------------------------------------------------------------------------------------------
+
+    def from_home(self, record: ToLife) -> None:
+        """Take what the home says, in order."""
+        match record:
+            case Feed():
+                self._take(record)
+            case Outcome():
+                self._outcome(record)
+            case Go():
+                self._queue(GoLive(self, record))
+            case SnapshotNow(urgent=True):
+                self.want_snapshot()
+            case SnapshotNow(at_once=True):
+                self._snapshot_wanted = True
+                self._queue(TakeSnapshot(self))
+            case Kept():
+                self.images.kept(record)
+            case SnapshotNow():
+                self._snapshot_turn = -2  # no turn: the next one that is due is taken
+            case Restore():
+                self._has_state = True
+                self._traps = self._traps or record.traps
+                self.timers.update(record.timers)
+                self._state.append(record.data)
+                self._saved_variables += record.variables
+            case _:
+                pass  # for whoever begins lives
+
+    def _take(self, feed: Feed) -> None:
+        cell = self.cell
+        returned = self.returned.pop(feed.id, None)
+        if returned is not None:
+            fed = Fed(self, feed, returned.message, returned.sender)
+        else:
+            sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
+            fed = Fed(self, feed, None, sender)
+        if feed.origin and feed.origin in self.cancelled and feed.turn < 0:
+            return  # Its timer was cancelled while it was on its way; the home drops it too.
+        if feed.id in self._stashed_ids and feed.turn < 0 and not self.is_live:
+            if self.unstashes:
+                self.returned[feed.id] = fed
+            else:
+                self.stash.append(fed)
+            return
+        self._queue(fed)
+
+    def _queue(self, item: Item) -> None:
+        mailbox.queue_of(self.cell).append(item)
+        self.cell.schedule()
+
+    def _outcome(self, record: Outcome) -> None:
+        waiting = self.asks.pop((record.turn, record.k), None)
+        if waiting is None:
+            return
+        future, kind = waiting
+        if future.done():
+            return
+        answer, codec = record.answer, self.cell.node.codec
+        try:
+            if kind is None and answer.kind == REPLY:
+                future.set_result(None)  # a `send` that was accepted
+            elif answer.kind == REPLY:
+                assert kind is not None
+                future.set_result(codec.decode_reply(kind, answer.body))
+            else:
+                future.set_exception(codec.decode_error(answer.kind, answer.name, answer.body))
+        except Exception as error:
+            future.set_exception(BadMessage("reply", "send" if kind is None else message_name(kind), str(error)))
+
+    # -- turns ------------------------------------------------------------------------------------------------------
+
+    def open_turn(self, feed: Feed) -> None:
+        """A turn begins; a replayed one gets the number it had."""
+        if feed.turn >= 0:
+            self.turn, self.has_replayed = feed.turn, True
+        else:
+            self.turn += 1
+        self.feed, self.outs, self.last_k = feed, [], 0
+        if self.page is not None:
+            self.page[0] = feed.id + 1
+
+    def close_turn(self, status: str, answer: Answer) -> None:
+        """A turn has ended: report it, with what it sent."""
+        feed = self.feed
+        if feed is None:
+            return  # The life was abandoned in this very turn: what it says does not count.
+        state = digest_of(self.cell.actor) if self.is_checked and self.cell.actor and status in (OK, STASHED) else 0
+        self.feed = None
+        self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state))
+        self.outs = []
+        if self.page is not None:
+            self.page[0] = 0
+
+    def ignore(self, why: str) -> None:
+        """The actor does not want to be started: turn 0 stays open for the next start."""
+        self.feed, self.outs, self.ignored_why = None, [], why
+        self.enter(STOP)  # That is what is left.
+        if self.page is not None:
+            self.page[0] = 0
+        self.port.to_home(Ignored(why))
+
+    def fail_turn(self, error: BaseException) -> None:
+        """The turn raised: what it has not released is dropped, its asker gets the error."""
+        feed = self.feed
+        if feed is None:
+            return
+        self.outs = []
+        self.enter(STOP)  # That is what is left.
+        # The start of a protected actor tells it, and under replay it must not happen at all.
+        is_heard = feed.is_ask or feed.kind == START or feed.turn >= 0
+        self.close_turn(FAILED, self.answer_error(remote_crash(error)) if is_heard else Answer())
+
+    def answer_error(self, error: BaseException) -> Answer:
+        """An error as the asker will get it."""
+        return Answer(*self.cell.node.codec.encode_error(error))
+
+    def answer_value(self, value: object, declared: Any) -> Answer:
+        """A reply as the asker will get it; one that cannot be coded becomes the asker's error."""
+        try:
+            return Answer(REPLY, "", self.cell.node.codec.encode_alike(value, self.cell.path, declared))
+        except BadMessage as error:
+            return self.answer_error(BadMessage("reply", error.message, error.problem))
+
+    def put(
+        self, verb: str, to: str, name: str = "", body: bytes = b"", *, seconds: float = 0.0, interval: float = 0.0
+    ) -> int:
+        """One more output of the turn in hand, or of the hook that runs; returns its number.
+
+        What a hook does takes effect at once: a hook runs at each life, and is not replayed.
+        """
+        self.last_k = k = self.last_k + 1
+        out = Out(k, verb, to, name, body, seconds, interval)
+        if self.feed is None:
+            self.port.to_home(Hooked(self.hook, out))
+        else:
+            self.outs.append(out)
+        return k
+
+    def enter(self, hook: str) -> None:
+        """A hook begins that is no turn."""
+        self.hook, self.last_k = hook, 0
+
+    def timer_of_hook(self, name: str, body: bytes, interval: float) -> str:
+        """The key of a timer that a hook wants. If one that runs says the same, it is that one.
+
+        So `on_start` may set its timers at each life. Another one is named by what it says: the next life that begins
+        at the same state gives it the same name, whatever else its hook does.
+        """
+        clock = (name, body, interval)
+        known = next((key for key, other in self.timers.items() if other == clock), None)
+        if known is not None:
+            del self.timers[known]
+            return known
+        said = said_by(*clock)
+        self._named[said] = number = self._named.get(said, 0) + 1
+        return f"{self.turn}{self.hook}{said}.{number}"
+
+    def cancel_timer(self, key: str) -> None:
+        """Ticks that are queued here, or on their way, are dropped here and at home."""
+        self.put("cancel", key)
+        self.cancelled.add(key)
+        queue = mailbox.queue_of(self.cell)
+        for index, item in enumerate(queue):  # Not removed: the run loop has counted them.
+            if type(item) is Fed and item.feed.origin == key and item.feed.turn < 0:
+                queue[index] = mailbox.NOTHING
+
+    def release(self) -> None:
+        """What this turn has sent so far leaves now.
+
+        Raises:
+            ActorStopped: the life was killed in this turn, which will be handled again: what it says while it is
+                cancelled, the next life will not say.
+        """
+        more = self.cell.more
+        if more is not None and more.turn is not None and more.turn.killed:
+            raise ActorStopped(self.cell.path, "this life was killed; it may not send any more")
+        feed = self.feed
+        if feed is not None and self.outs:
+            self.port.to_home(Released(self.turn, feed.id, self.outs))
+            self.outs = []
+
+    # -- snapshots --------------------------------------------------------------------------------------------------
+
+    def go_live(self) -> None:
+        """Replay is over."""
+        self.is_live = True
+        if self.begins_suspended:
+            self.cell.extra().suspended = True
+            mailbox.hold(self.cell)
+        self.stash = [fed for fed in self.stash if fed.feed.id not in self.gone]
+        for key in self.gone:
+            self.returned.pop(key, None)
+        if self.returned:  # Unstashed under replay, and not handled before the crash: they come first.
+            queue = mailbox.queue_of(self.cell)
+            queue.extendleft(reversed(self.returned.values()))
+            self.returned.clear()
+        self.port.to_home(Live(self._restore_seconds))
+        if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
+            self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.
+        postponed, self.postponed = self.postponed, []
+        for call in postponed:
+            self.cell.urge(call)
+        if self.stop_wanted is not None:
+            self.cell.request_stop(self.stop_wanted)
+
+    def _snapshot_of_replay(self) -> None:
+        if self.cell.actor is not None and not self.is_over:
+            self.want_snapshot()
+
+    def want_snapshot(self) -> None:
+        """Save the state before anything else is handled."""
+        self.cell.urge(TakeSnapshot(self))
+
+    def take_snapshot(self, *, is_last: bool = False) -> None:
+        """Save the state after the last turn; while background work is out, its turn must stay in the journal."""
+        if not self.method.snapshots:
+            return
+        if self.pipes:
+            self._snapshot_postponed = True
+            return
+        if not self.is_live or (self.turn == self._snapshot_turn and not (is_last and self.images.is_busy)):
+            return
+        actor = self.cell.actor
+        assert actor is not None
+        assert self.feed is None, "a state is saved between two turns, never in the middle of one"
+        begin = time.perf_counter()
+        try:
+            if not is_last and self.images.suits():
+                self.images.take()
+                return
+            data = save_state(actor)
+        except BaseException as error:  # What the user's own `get_state` raises is no reason to lose what it has.
+            self.port.to_home(Unsaved(str(error)))
+            return
+        self._send_snapshot(data, begin)
+
+    def pipe_back(self) -> None:
+        """Background work has ended: a snapshot that had to wait for it can be taken."""
+        self.pipes -= 1
+        if self._snapshot_postponed and not self.pipes:
+            self._snapshot_postponed = False
+            self.want_snapshot()
+
+    @property
+    def traps(self) -> bool:
+        """Whether EXIT signals come to `on_exit`."""
+        more = self.cell.more
+        return more is not None and more.trap_exits
+
+    def image_taken(self, turn: int) -> None:
+        """An image of the state after this turn is on its way."""
+        self._snapshot_turn = turn
+        self._snapshot_wanted = False
+
+    def image_lost(self) -> None:
+        """Its home could not keep the last one."""
+        self._snapshot_turn = -2
+
+    def last_snapshot(self) -> None:
+        """Save the state for a life somewhere else.
+
+        Raises:
+            UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
+        """
+        actor = self.cell.actor
+        assert actor is not None
+        begin = time.perf_counter()
+        if self.method.snapshots and (self.turn != self._snapshot_turn or self.images.is_busy):  # Else all is replayed.
+            self._send_snapshot(save_state(actor), begin)
+
+    def may_replace(self) -> str:
+        """Why the state cannot be replaced from outside now; "" if it can: a snapshot has to follow at once."""
+        if not self.method.snapshots:
+            return f"{self.method.name} takes no snapshots, and no replay leads to a state that was put in place"
+        return "background work (pipe_to_self) is out; try again when it is back" if self.pipes else ""
+
+    def replaced(self) -> None:
+        """The state was replaced from outside, in no turn: only a snapshot can bring it back.
+
+        Raises:
+            UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
+        """
+        actor = self.cell.actor
+        assert actor is not None
+        begin = time.perf_counter()
+        self._send_snapshot(save_state(actor), begin, is_replaced=True)
+        if self._snapshot_turn != self.turn:  # A home in another process says so later, and ends this life.
+            raise ControlFailed(self.cell.path, "replace_state", "the new state could not be saved")
+
+    def _send_snapshot(self, data: bytes, begin: float, *, is_replaced: bool = False) -> None:
+        self.images.stop()
+        self.images.restart()
+        self.images.last_bytes = len(data)
+        stash = [fed.feed.id for fed in self.stash]
+        pause = time.perf_counter() - begin
+        parts = pieces(data)
+        self._snapshot_turn = self.turn  # Before it is sent: a home in this process says at once if it cannot keep it.
+        self._snapshot_wanted = False
+        for index, part in enumerate(parts, 1):
+            is_last = index == len(parts)
+            said = self.traps, *self.made_by()
+            self.port.to_home(Snapshot(self.turn, part, is_last, stash, pause, is_replaced, None, *said))
+
+    def made_by(self) -> tuple[str, list[str]]:
+        """The class whose state is saved, and the variables that it had when `__init__` had run."""
+        actor = self.cell.actor
+        return ("", []) if actor is None else (message_name(type(actor)), self.variables)
+
+    def close(self) -> None:
+        """The life is over."""
+        self.is_over = True
+        self.images.close()
+        for future, _ in self.asks.values():
+            future.cancel()
+        self.asks.clear()
+        for call in self.postponed:  # The next life's.
+            self.cell.urge(call)
+        self.port.closed()
+        self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.

@@ -1,0 +1,371 @@
+"""What a home and a recorded life say to each other, in one process or across the border of one.
+
+The home (`home/switch.py`) numbers and journals inputs and feeds them; the life (`life/recorded_life.py`) runs one turn
+per input and reports each turn's outputs and outcome. Payloads stay encoded in between.
+
+What there is many of is not seen by the garbage collector (`gc=False`): nothing in it refers back.
+"""
+
+from __future__ import annotations
+
+import zlib
+from typing import Any, Protocol
+
+import msgspec
+
+from ..actors.kernel.mailbox import Bounded
+from .method import Method
+
+# Kinds of inputs: every call into user code that may change state.
+MESSAGE, START, TICK, EXIT, DOWN, PIPE = "message", "start", "tick", "exit", "down", "pipe"
+# Outputs whose turn waits for what becomes of them.
+AWAITED = ("ask", "send", "publish")
+# How a turn can end.
+OK, FAILED, DROPPED, STASHED = "ok", "failed", "dropped", "stashed"
+# How an ask can be answered; LATER keeps it open, NOTHING means that nobody asked.
+REPLY, REFUSAL, ERROR, CRASH, LATER, NOTHING = "reply", "refusal", "error", "crash", "later", ""
+
+
+class Out(msgspec.Struct, array_like=True, gc=False):
+    """One output of a turn; `k` counts them in program order from 1."""
+
+    k: int
+    verb: str
+    to: str
+    name: str = ""
+    body: bytes = b""
+    seconds: float = 0.0
+    interval: float = 0.0
+
+    def digest(self) -> int:
+        """A checksum by which a replayed output is compared with the one released before."""
+        head = f"{self.verb}|{self.to}|{self.name}|{self.seconds}|{self.interval}".encode()
+        return zlib.crc32(self.body, zlib.crc32(head))
+
+
+class Answer(msgspec.Struct, array_like=True, gc=False):
+    """The outcome of an ask: a reply or an error, encoded."""
+
+    kind: str = NOTHING
+    name: str = ""
+    body: bytes = b""
+
+
+def answer_digest(answer: Answer) -> int:
+    """A checksum by which the reply of a replayed turn is compared; 0 if there is none."""
+    if answer.kind == NOTHING:
+        return 0
+    return zlib.crc32(answer.body, zlib.crc32(f"{answer.kind}|{answer.name}".encode())) or 1
+
+
+Clock = tuple[str, bytes, float]
+"""What a timer says: type name and body of its message, and its interval (0: it comes once)."""
+
+
+# -- home to life ----------------------------------------------------------------------------------------------------
+
+
+class Feed(msgspec.Struct, array_like=True, tag=1, gc=False):
+    """An input.
+
+    `turn` is the number it had before the crash, -1 if it never ended; `pipes` have their result already; from
+    `deadline` on (on the loop's clock, 0: never) it is not begun any more; `origin` is the timer it comes from.
+    """
+
+    id: int
+    turn: int
+    kind: str
+    name: str
+    body: bytes
+    time: float
+    sender: str | None = None
+    is_ask: bool = False
+    chain: tuple[tuple[str, int], ...] = ()
+    pipes: tuple[int, ...] = ()
+    deadline: float = 0.0
+    origin: str = ""
+
+
+class Outcome(msgspec.Struct, array_like=True, tag=2):
+    """The outcome of the ask that was output (turn, k)."""
+
+    turn: int
+    k: int
+    answer: Answer
+
+
+class Go(msgspec.Struct, array_like=True, tag=3):
+    """Replay is over: call `on_recovered` (if anything was recovered), report, then go on after turn `turn`.
+
+    Inputs in `gone` were stashed under replay and have ended since, in turns that are not replayed. `timers` run now.
+    """
+
+    recovered: bool
+    turn: int
+    gone: tuple[int, ...] = ()
+    timers: dict[str, Clock] = {}
+
+
+class SnapshotNow(msgspec.Struct, array_like=True, tag=4):
+    """Take a snapshot after the inputs that have been fed, or (`urgent`) in front of them.
+
+    Not `at_once`: the last one could not be kept, and the next that is asked for is not superfluous.
+    """
+
+    at_once: bool = True
+    urgent: bool = False
+
+
+class Restore(msgspec.Struct, array_like=True, tag=5):
+    """A piece of the state to begin with; the launch comes behind the last one.
+
+    The first one also says which timers ran when that state was saved, whether the actor trapped exits, and which
+    `variables` its class had.
+    """
+
+    data: bytes
+    timers: dict[str, Clock] = {}
+    traps: bool = False
+    variables: list[str] = []
+
+
+class Begin(msgspec.Struct, array_like=True, tag=6):
+    """The life that was wanted as `number` begins now, as the `life`th at its address, with the state that came before.
+
+    `slot` is its place on the page that outlives the process.
+    """
+
+    number: int
+    life: int
+    turn: int
+    stash: list[int]
+    slot: int
+
+
+class Started(msgspec.Struct, array_like=True, tag=7):
+    """The start that was wanted as `number` has come to its end: a good one, or (`problem`) not.
+
+    `is_ignored`: it does not want to be started.
+    """
+
+    number: int
+    problem: str = ""
+    is_ignored: bool = False
+
+
+class Kept(msgspec.Struct, array_like=True, tag=8):
+    """The home has the image that was written into this segment: what follows may refer to it. Or (not `is_safe`) not.
+
+    `is_full`: the next image should be written anew.
+    """
+
+    segment: int
+    is_safe: bool
+    is_full: bool = False
+
+
+class Over(msgspec.Struct, array_like=True, tag=9):
+    """The life that was wanted as `number`, which replicas have lived at the root, is over. `Closed` is the answer."""
+
+    number: int
+    reason: dict[str, Any]
+
+
+class Respec(msgspec.Struct, array_like=True, tag=10):
+    """The child has other mechanisms from now on, also in its next lives: layers as data, none if there are none."""
+
+    layers: list[Any]
+
+
+class Attached(msgspec.Struct, array_like=True, tag=31):
+    """The life, which is at rest, is lived by replicas at the root from now on, as the one wanted as `number`."""
+
+    number: int
+    layers: list[Any]
+
+
+class Returning(msgspec.Struct, array_like=True, tag=32):
+    """The life that replicas have lived comes back here, with the state that came before: begin it beside the address.
+
+    `turn`, `stash`, `slot`: as of `Begin`.
+    """
+
+    number: int
+    turn: int
+    stash: list[int]
+    slot: int
+    is_suspended: bool
+
+
+class Returned(msgspec.Struct, array_like=True, tag=33):
+    """The life that was begun beside the address is the one, or (not `is_kept`) is not to be."""
+
+    is_kept: bool
+
+
+class Carried(msgspec.Struct, array_like=True, tag=34):
+    """A step of handing over a life that is not recorded, and a piece of what is told with it. In both directions.
+
+    `attempt`: at which handing over; what an earlier one has left on its way counts for nothing.
+    """
+
+    attempt: int
+    step: str
+    data: bytes
+    is_last: bool
+
+
+Handover = Attached | Returning | Returned
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Handover | Carried
+
+
+# -- life to home ----------------------------------------------------------------------------------------------------
+
+
+class Released(msgspec.Struct, array_like=True, tag=11):
+    """Outputs that leave before their turn ends: an ask, a send or a flush wants them out."""
+
+    turn: int
+    id: int
+    outs: list[Out]
+
+
+class TurnEnd(msgspec.Struct, array_like=True, tag=12, gc=False):
+    """A turn has ended; `outs` are those not released yet."""
+
+    turn: int
+    id: int
+    status: str
+    outs: list[Out]
+    answer: Answer
+    state: int = 0  # digest of the state it has left, if that is checked
+
+
+class Hooked(msgspec.Struct, array_like=True, tag=21):
+    """What a hook does that outlives it; it takes effect at once. `hook` is "start", "recovered" or "stop"."""
+
+    hook: str
+    out: Out
+
+
+class Live(msgspec.Struct, array_like=True, tag=13):
+    """`Go` was reached: the actor takes new inputs. `restore_seconds` is what putting the state back took."""
+
+    restore_seconds: float
+
+
+class Shared(msgspec.Struct, array_like=True):
+    """An image in memory that its home can open: segment `number` is descriptor `file` of process `pid`.
+
+    `places`: where its blocks are, in this segment and earlier ones (segment, offset, length).
+    """
+
+    number: int
+    pid: int
+    file: int
+    inode: int
+    size: int
+    places: list[tuple[int, int, int]]
+
+
+class Snapshot(msgspec.Struct, array_like=True, tag=14):
+    """A piece of the state after `turn`; `is_last` completes it.
+
+    `is_replaced`: it was put in place from outside, so no replay leads to it. `image`: where it is, if not in `data`.
+    `kind`: the actor's class, and `variables` those that it had when `__init__` had run.
+    """
+
+    turn: int
+    data: bytes
+    is_last: bool
+    stash: list[int]
+    pause: float
+    is_replaced: bool = False
+    image: Shared | None = None
+    traps: bool = False  # `ctx.trap_exits`
+    kind: str = ""
+    variables: list[str] = []
+
+
+class Marked(msgspec.Struct, array_like=True, tag=20):
+    """An image of the state after `turn` is being written, while the actor goes on."""
+
+    turn: int
+
+
+class PipeDone(msgspec.Struct, array_like=True, tag=15):
+    """Background work that was output (turn, k) has its result: a message to the actor itself; no name: an error.
+
+    `k` is 0 for what a hook has begun: no turn is replayed to begin it again.
+    """
+
+    turn: int
+    k: int
+    name: str
+    body: bytes
+
+
+class Unsaved(msgspec.Struct, array_like=True, tag=16):
+    """The state could not be saved: no snapshot came of it."""
+
+    problem: str
+
+
+class Protected(msgspec.Struct, array_like=True):
+    """What a wanted child that a mechanism protects is made of: its recipe, the layers as data, and its bindings."""
+
+    recipe: bytes
+    layers: list[Any]
+    bindings: dict[str, str]
+
+
+class Wanted(msgspec.Struct, array_like=True, tag=17):
+    """A supervisor in another process wants to start a recorded or protected child, whose home is at the root."""
+
+    number: int
+    kind: str
+    topics: list[str]
+    method: Method
+    bound: Bounded | None
+    protected: Protected | None = None
+
+
+class Closed(msgspec.Struct, array_like=True, tag=18):
+    """The life that was wanted as `number` is over, or its start is given up."""
+
+    number: int
+    reason: dict[str, Any]
+    recovers: bool = False
+
+
+class Ignored(msgspec.Struct, array_like=True, tag=19):
+    """The actor does not want to be started."""
+
+    why: str
+
+
+ToHome = (
+    Ignored | Released | TurnEnd | Hooked | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked | Carried
+)
+
+
+class LifePort(Protocol):
+    """The way to the present life."""
+
+    @property
+    def begins(self) -> bool:
+        """Whether what is handed to it may be begun at any time from then on. If not, it says itself when."""
+        ...
+
+    def to_life(self, record: ToLife) -> None:
+        """Hand a record to the life; it is handled in order."""
+        ...
+
+
+PIECE = 4 * 1024 * 1024
+"""Bytes of state per record, so that a large state does not hold up everything else."""
+
+
+def pieces(data: bytes) -> list[bytes]:
+    """`data` in pieces, at least one."""
+    return [data[at : at + PIECE] for at in range(0, len(data), PIECE)] or [b""]

@@ -1,0 +1,281 @@
+"""Messages that come while an actor is recovered: how many are held, and what becomes of more (T15).
+
+Stands in the place of the home's bound during isolation, so that nothing is tested for a message at any other time.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import MailboxFull
+from ...actors.events import HeldMessages
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.mailbox import Senders
+from ..home.inputs import Batch, Input
+from ..protocol import MESSAGE, Answer
+from .settings import Held
+
+if TYPE_CHECKING:
+    from ...actors.kernel.cell import Host
+    from ...actors.kernel.envelope import Ask
+    from ..home.capacity import HomeBound
+    from ..home.switch import Switch
+
+
+class Holding:
+    """What is held for one home, by topic ("": all that comes by no topic with a rule of its own)."""
+
+    def __init__(self, home: Switch, inner: HomeBound | None) -> None:
+        self._home, self.inner = home, inner
+        self._rules: dict[str, Held | None] = {"": home.method.held, **dict(home.method.held_topics)}
+        self._counted: dict[int, tuple[Input, str]] = {}  # by id, in admission order
+        self._waiting: deque[tuple[Ask, str, bytes, str | None, str]] = deque()  # asks that wait
+        self._senders = Senders()
+        self.topic = ""  # by which the message comes that is admitted next
+        self._added = ""
+        self.dropped = self.refused = 0
+
+    @property
+    def capacity(self) -> int:
+        """Of the mailbox itself."""
+        return self.inner.capacity if self.inner is not None else 0
+
+    @property
+    def overflow(self) -> str:
+        """Whether a send from a recorded turn is let in and waits then."""
+        rule = self._rules.get("")
+        return rule.overflow if rule is not None else self.inner.overflow if self.inner is not None else ""
+
+    def again(self, running: int) -> None:
+        """The actor has ended again: what it had not begun is still held."""
+        home = self._home
+        begun = (running, home.partial_id)
+        self._counted = {k: one for k, one in self._counted.items() if k in home.open and k not in begun}
+
+    # -- admission --------------------------------------------------------------------------------------------------
+
+    def makes_room(self, ask: Ask | None, name: str, body: bytes, sender: str | None) -> bool:
+        """Whether a message can be admitted now; the policy has seen to it otherwise.
+
+        Raises:
+            MailboxFull: it is a tell, and the policy refuses it.
+        """
+        topic = self._added = self._take_topic()
+        rule = self._rules[topic]
+        if rule is not None and self._count(topic) >= rule.capacity:
+            match rule.overflow:
+                case "block" if ask is not None:
+                    self._waiting.append((ask, name, body, sender, topic))
+                    return False
+                case "block" | "reject":
+                    self.refused += 1
+                    error = MailboxFull(self._home.path, rule.capacity)
+                    if ask is None:
+                        raise error
+                    ask.fail(error)
+                    return False
+                case _:
+                    self._drop(topic, rule, 0 if rule.overflow == "latest" else rule.capacity - 1)
+        return self.inner is None or self.inner.makes_room(ask, name, body, sender)
+
+    def _take_topic(self) -> str:
+        """By which topic that has a rule of its own the message in hand comes."""
+        topic, self.topic = self.topic, ""
+        return topic if topic in self._rules else ""
+
+    def _count(self, topic: str) -> int:
+        return sum(by == topic for _, by in self._counted.values())
+
+    def _drop(self, topic: str, rule: Held, keep: int) -> None:
+        """End held messages, oldest first, until `keep` are left: in the journal too."""
+        home, batch = self._home, Batch()
+        answer = Answer(*home.node.codec.encode_error(MailboxFull(home.path, rule.capacity)))
+        mine = [source for source, by in self._counted.values() if by == topic]
+        for source in mine[: len(mine) - keep]:
+            self.dropped += 1
+            home.ends.lost(source.name, source.body, f"held for too long ({rule.capacity}, {rule.overflow})")
+            home.ends.without_turn(source, answer, batch)
+        batch.commit(home.journal)
+
+    def blocks(self, topic: str) -> bool:
+        """Whether the rule of a topic has a sender wait now."""
+        rule = self._rules.get(topic if topic in self._rules else "")
+        return rule is not None and rule.overflow == "block" and self._count(topic) >= rule.capacity
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now, or lost."""
+        return not self.blocks("") and (self.inner is None or self.inner.has_room)
+
+    def room(self, topic: str = "") -> asyncio.Future[None] | None:
+        """For `send`: None if a message would be taken now, or the policy never waits."""
+        if self.blocks(topic):
+            return self._senders.wait(self._home.node.loop)
+        return None if self.inner is None else self.inner.room()
+
+    # -- the end of the isolation -----------------------------------------------------------------------------------
+
+    def report(self) -> None:
+        """Put what was held where the message switch finds it."""
+        if self._counted or self.dropped or self.refused:
+            recoveries = self._home.recoveries
+            if recoveries is not None:
+                recoveries.held.append(HeldMessages(self._home.path, len(self._counted), self.dropped, self.refused))
+                if recoveries.on_held is not None:
+                    recoveries.on_held()
+
+    def let_in(self) -> None:
+        """What was held has been fed: now come those who have waited, in order."""
+        home = self._home
+        while self._waiting:
+            ask, name, body, sender, _ = self._waiting.popleft()
+            if not ask.is_done and (home.bound is None or home.bound.makes_room(ask, name, body, sender)):
+                home.take(ask, name, body, sender)
+        self._senders.release()
+
+    # -- as the bound whose place this takes ------------------------------------------------------------------------
+
+    def added(self, source: Input) -> None:
+        """An input was admitted."""
+        if source.kind == MESSAGE:
+            self._counted[source.id] = (source, self._added or self._take_topic())
+            self._added = ""
+        if self.inner is not None:
+            self.inner.added(source)
+
+    def ended(self, source: Input) -> None:
+        """An input has left the queue."""
+        self._counted.pop(source.id, None)
+        if self.inner is not None:
+            self.inner.ended(source)
+
+    def refill(self) -> None:
+        """Nothing is let in while it is held."""
+
+    def release(self, error: MailboxFull | Exception) -> None:
+        """The address is given up: whoever waits shall see it."""
+        waiting, self._waiting = self._waiting, deque()
+        for ask, *_ in waiting:
+            ask.fail(error)
+        self._senders.release()
+        if self.inner is not None:
+            self.inner.release(error)
+
+    def restart(self) -> None:
+        """The life is over: nothing is in hand."""
+        if self.inner is not None:
+            self.inner.restart()
+
+    def may_feed(self, source: Input) -> bool:
+        """Whether an input goes to the life now."""
+        return self.inner is None or self.inner.may_feed(source)
+
+    def in_hand(self) -> tuple[int, dict[int, Input]] | None:
+        """What the life has been fed, and what waits for that."""
+        return None if self.inner is None else self.inner.in_hand()
+
+    def take_up(self, in_hand: tuple[int, dict[int, Input]]) -> None:
+        """The life that was fed this goes on."""
+        if self.inner is not None:
+            self.inner.take_up(in_hand)
+
+
+class Inlet(Cell):
+    """Where a topic with a rule of its own comes in: the subscriber in the place of the actor's cell."""
+
+    __slots__ = ("home", "topic")
+
+    def __init__(self, home: Switch, topic: str) -> None:
+        assert home.cell is not None
+        self.home, self.topic = home, topic
+        super().__init__(home.node, None, home.path, home.cell.host)
+        self.admit = admit_inlet
+        self.extra().outlet = self
+        self.renew()
+
+    def renew(self) -> None:
+        """The actor's next life begins: perhaps as another class, elsewhere."""
+        cell = self.home.cell
+        assert cell is not None
+        self.table, self.host, self.state = cell.table, InletHost(cell), cell.state
+
+    @property
+    def has_room(self) -> bool:
+        """Whether a message would be taken now, or lost."""
+        home = self.home
+        return home.cell is None or (home.has_room and (home.holding is None or not home.holding.blocks(self.topic)))
+
+    def room(self) -> asyncio.Future[None] | None:
+        """For `send`: None while there is room."""
+        home = self.home
+        if home.holding is not None and (wait := home.holding.room(self.topic)) is not None:
+            return wait
+        return home.room() if home.cell is not None else None
+
+    def mark(self) -> None:
+        """What is admitted next comes by this topic."""
+        if self.home.holding is not None:
+            self.home.holding.topic = self.topic
+
+
+class InletHost:
+    """The actor's host, as its inlets see it."""
+
+    def progress(self, cell: Cell) -> object:
+        return None
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell = cell
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        return self._cell.host.offer(cell, item)
+
+    def __getattr__(self, name: str) -> Any:
+        host: Host = self._cell.host
+        return getattr(host, name)
+
+
+def admit_inlet(cell: Cell, item: Any) -> None:
+    """Admit what was published, as the topic's."""
+    assert isinstance(cell, Inlet)
+    home = cell.home
+    if home.cell is None:
+        return
+    cell.mark()
+    try:
+        home.cell.admit(home.cell, item)
+    finally:
+        if home.holding is not None:
+            home.holding.topic = ""
+
+
+def hold(home: Switch, running: int = -1) -> None:
+    """The actor is recovered: what comes now is held by its method's rules."""
+    if home.holding is not None:
+        home.holding.again(running)
+    elif home.method.held is not None or home.method.held_topics:
+        assert not isinstance(home.bound, Holding)
+        home.bound = home.holding = Holding(home, home.bound)
+
+
+def let_go(home: Switch) -> Holding | None:
+    """Nothing is held any more."""
+    holding, home.holding = home.holding, None
+    if holding is not None:
+        home.bound = holding.inner
+    return holding
+
+
+def inlet(home: Switch, topic: str) -> Cell:
+    """Where the messages of a topic come in: the actor's cell, unless they are held by a rule of their own."""
+    cell = home.cell
+    assert cell is not None
+    if topic not in home.inlets:
+        if all(topic != one for one, _ in home.method.held_topics):
+            return cell
+        home.inlets[topic] = Inlet(home, topic)
+    home.inlets[topic].renew()
+    return home.inlets[topic]

@@ -1,0 +1,34 @@
+"""The message handler as an actor: it has written what the homes submit, once for all that a tick has brought.
+
+What waits to be written stands in `homes.journal`, not here: a handler that is killed loses nothing, its next life goes
+on with what it finds. If it does not come in time, the journal does its work itself.
+"""
+
+from __future__ import annotations
+
+from ...actors.kernel.actor import on
+from ...actors.kernel.message import Message
+from .part import Part
+
+
+class Flush(Message):
+    """Something was submitted since the last one."""
+
+
+FLUSH = Flush()
+
+
+class MessageHandler(Part):
+    """Writes what was submitted, and lets what is safe take effect."""
+
+    def on_start(self, restored: bool) -> None:
+        """Take up what waits, and be woken from now on."""
+        cell = self.ctx.cell
+        # Not `ref.tell`: that would speak in the name of whoever has submitted something.
+        self._homes.journal.wake_handler = lambda: cell.admit(cell, FLUSH)
+        self._homes.journal.come()
+
+    @on(Flush)
+    def flush(self, message: Flush) -> None:
+        """Write."""
+        self._homes.journal.come()

@@ -1,0 +1,241 @@
+"""Key variables: which part of an actor is its state, and how it is saved and put back."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
+
+from ...actors.control.live_state import attributes
+from ...actors.errors import HoldfastError, type_name
+from ...actors.kernel.actor import Actor
+from ...actors.values import UnsavableValue, decode_value, encode_value
+from ..method import Method
+from .state_image import is_image, read_image
+
+
+class StateMismatch(HoldfastError, text="the state of {actor} does not fit: {problem}"):
+    """A saved state does not fit the class that shall take it back."""
+
+    actor: str
+    problem: str
+
+
+class State(NamedTuple):
+    """An actor's state, still made of its own objects."""
+
+    version: int
+    form: str  # "state": from `get_state`; "keys": key variables
+    value: Any
+
+
+def state_of(actor: Actor) -> State:
+    """What is to be saved: the variables a recovery file names, else `get_state()` or the class's key variables.
+
+    Raises:
+        StateMismatch: a declared key variable is not there. What `get_state` raises.
+    """
+    get_state = getattr(actor, "get_state", None)
+    if get_state is not None and key_names(actor) is None:
+        return State(actor.schema_version, "state", get_state())
+    where, root = actor.ctx.path, actor._state_root()
+    return State(actor.schema_version, "keys", {name: read_path(where, root, name) for name in variables(actor)})
+
+
+def variables(actor: Actor) -> list[str]:
+    """The names of an actor's key variables, dotted paths among them."""
+    names = key_names(actor)
+    if names is not None:
+        return list(names)
+    return [name for name, _ in attributes(actor._state_root()) if not name.startswith("_") and name != "ctx"]
+
+
+def save_state(actor: Actor) -> bytes:
+    """The actor's state as bytes: `get_state()` if the class has it, else its key variables.
+
+    Raises:
+        UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there.
+    """
+    state, where = state_of(actor), actor.ctx.path
+    try:
+        return encode_value(tuple(state), where=where)
+    except UnsavableValue:
+        for name, value in _parts(actor, state):  # Once more, one by one: the error shall name the one it is about.
+            encode_value(value, where=name)
+        raise
+
+
+def _parts(actor: Actor, state: State) -> list[tuple[str, object]]:
+    where = f"{actor.ctx.path}: {type_name(type(actor._state_root()))}"
+    if state.form == "state":
+        return [(f"{where}.get_state()", state.value)]
+    return [(f"{where}.{name}", value) for name, value in state.value.items()]
+
+
+def restore_state(actor: Actor, data: bytes, variables: tuple[list[str], list[str]] = ([], [])) -> None:
+    """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
+
+    Args:
+        actor: constructed, and nothing more.
+        data: the state.
+        variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
+
+    Raises:
+        DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
+    """
+    saved = read_image(data) if is_image(data) else decode_value(data)
+    refuse_renamed(actor, saved, *variables)
+    put_back(actor, saved)
+
+
+def refuse_renamed(actor: Actor, saved: Any, before: list[str], now: list[str]) -> None:
+    """Refuse a state with a variable that the class has no more: it was renamed, or what it holds would be lost.
+
+    Variables that are only made later than in `__init__` are nobody's concern here.
+
+    Raises:
+        StateMismatch: with the difference in words.
+    """
+    version, form, state = saved if isinstance(saved, tuple) and len(saved) == 3 else (None, "", None)
+    if form != "keys" or version != actor.schema_version or not isinstance(state, dict) or not now:
+        return
+    gone = [name for name in before if name in state and name not in now]
+    if gone:
+        kind = type_name(type(actor._state_root()))
+        raise StateMismatch(
+            actor.ctx.path,
+            f"it was saved with the variables ({', '.join(before)}), {kind} has ({', '.join(now)}): "
+            f"{', '.join(gone)} would be lost; raise its schema_version, and say in "
+            "migrate(state, from_version) what becomes of it",
+        )
+
+
+def put_back(actor: Actor, saved: Any) -> None:
+    """As `restore_state`, of what was read already; it becomes the actor's own.
+
+    Raises:
+        StateMismatch: it is of another class or schema version.
+    """
+    where = actor.ctx.path
+    if not (isinstance(saved, tuple) and len(saved) == 3):
+        raise StateMismatch(where, "it was not written by save_state")
+    version, form, state = saved
+    if version != actor.schema_version:
+        state = migrated(type(actor), state, version, where)
+    if form == "state":
+        setter_of(actor)(state)
+        return
+    if not isinstance(state, dict):
+        raise StateMismatch(where, f"its key variables came as {type_name(type(state))}, not as a dict")
+    root = actor._state_root()
+    for name, value in state.items():
+        write_path(where, root, name, value)
+
+
+def key_names(actor: Actor) -> tuple[str, ...] | None:
+    """The key variables that the recovery file names, or the class; None for all attributes."""
+    life = getattr(actor.ctx, "recorded", None)
+    named: tuple[str, ...] | None = None if life is None else life.method.key_variables
+    if named is not None:
+        return named
+    # A class with get_state means that, whatever else it says.
+    return None if getattr(actor, "get_state", None) is not None else actor.key_variables
+
+
+def read_path(where: str, root: object, path: str) -> Any:
+    """The variable at a dotted path, `robot.pose.x`, from an object down.
+
+    Raises:
+        StateMismatch: there is none.
+    """
+    value = root
+    for name in path.split("."):
+        try:
+            value = getattr(value, name)
+        except AttributeError:
+            inside = "" if value is root else f": a {type_name(type(value))} has no attribute {name!r}"
+            raise StateMismatch(where, f"{type_name(type(root))} has no key variable {path!r}{inside}") from None
+    return value
+
+
+def write_path(where: str, root: object, path: str, value: object) -> None:
+    """Set the variable at a dotted path.
+
+    Raises:
+        StateMismatch: there is nothing to set it on, or it cannot be set.
+    """
+    above, _, name = path.rpartition(".")
+    holder = read_path(where, root, above) if above else root
+    try:
+        setattr(holder, name, value)
+    except (AttributeError, TypeError) as error:
+        raise StateMismatch(where, f"{type_name(type(root))}.{path} cannot be set: {error}") from error
+
+
+def check_keys(actor: Actor, method: Method, *, first: bool) -> None:
+    """Check the variables that a recovery file names, when `__init__` has run; `first`: nothing is put back now.
+
+    Raises:
+        StateMismatch: naming file, class and variable, and its type if it cannot be saved.
+    """
+    root, where = actor._state_root(), actor.ctx.path
+    for name in method.key_variables or ():
+        try:
+            value = read_path(where, root, name)
+            write_path(where, root, name, value)  # Now, not when it is needed.
+            if first:
+                encode_value(value, where=f"{type_name(type(root))}.{name}")
+        except UnsavableValue as error:
+            raise StateMismatch(where, f"{method.origin}: key variable {name!r}: {error}") from error
+        except StateMismatch as error:
+            raise StateMismatch(where, f"{method.origin}: {error.problem}") from error
+
+
+def check_saved(actor: Actor, method: Method) -> None:
+    """Check, when an actor has been started for the first time, that its state can be saved and put back.
+
+    Raises:
+        UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there or cannot
+            be set, or the class lacks what puts its state back.
+    """
+    if method.snapshots and key_names(actor) is None and hasattr(actor, "get_state"):
+        setter_of(actor)
+    save_state(actor)
+    where, root = actor.ctx.path, actor._state_root()
+    for name in key_names(actor) or ():
+        write_path(where, root, name, read_path(where, root, name))
+
+
+def setter_of(actor: Actor) -> Callable[[Any], object]:
+    """What puts back a state that `get_state` has given.
+
+    Raises:
+        StateMismatch: there is none, or it is a coroutine function, which would only do it later.
+    """
+    set_state = getattr(actor, "set_state", None)
+    if set_state is None:
+        raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))} has no set_state, which goes with get_state")
+    if inspect.iscoroutinefunction(set_state):
+        raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))}.set_state is `async def`: it must be plain")
+    return cast("Callable[[Any], object]", set_state)
+
+
+def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
+    """A state that an older version of the class has saved, as this one wants it.
+
+    Raises:
+        StateMismatch: the class does not know that version, or says that it cannot. Nothing is lost: what was saved
+            stays as it is.
+    """
+    known = f"it has schema version {version}, {type_name(kind)} {kind.schema_version}"
+    if not isinstance(version, int) or version > kind.schema_version:
+        raise StateMismatch(where, f"{known}: an older class cannot read what a newer one has saved")
+    migrate = getattr(kind, "migrate", None)
+    if migrate is None:
+        raise StateMismatch(where, f"{known}, which has no classmethod migrate(state, from_version)")
+    if inspect.iscoroutinefunction(migrate):
+        raise StateMismatch(where, f"{known}, whose migrate is `async def`: it must be plain")
+    try:
+        return migrate(state, version)
+    except BaseException as error:
+        raise StateMismatch(where, f"{known}, and its migrate failed: {type(error).__name__}: {error}") from error

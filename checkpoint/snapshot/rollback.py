@@ -1,0 +1,59 @@
+"""Going back: an actor whose supervisor has ended because of it comes back with an older state, or with none.
+
+The older snapshot is put in the place of all that came after it, under the number of the last turn: so numbers of turns
+and outputs go on, nothing that has left is sent again, and the journal is cut just as behind any other snapshot.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from ...actors.events import RolledBack
+from ..method import OnEscalate
+from .snapshot_record import FORMAT, Meta, decode_meta, go_back, put
+
+if TYPE_CHECKING:
+    from ..home.switch import Switch
+
+UNDONE = "its turn was undone: the actor went back to an older state"
+
+
+def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
+    """Between two lives: drop what the turns after the older snapshot (or all turns) did to the state.
+
+    What was not handled stays queued; but an input whose turn has let something out already ends with that turn.
+
+    Raises:
+        HoldfastError: the store refused, and the actor comes back as it was.
+    """
+    if to == "restore" or home.is_new:
+        return
+    older = older_snapshot(home) if to == "older_snapshot" else None
+    if to == "older_snapshot" and older is None:
+        why = f"{why}; there is no older snapshot"
+    if older is not None:
+        home.images.fetch(older)
+    home.ends.undo_begun(UNDONE)
+    first = home.turn
+    if older is None:
+        older = Meta(FORMAT, first, 0, [], {}, [], 0, b"")
+    meta = msgspec.structs.replace(older, turn=first, next_id=home.next_id, epoch=home.journal.epoch)
+    put(home, meta, 1)  # Nothing else stays: what was undone must not be what the next step back leads to.
+    home.older = None
+    home.images.tidy()
+    go_back(home, meta)
+    home.node.emit(RolledBack(home.path, first, meta.base, why))
+
+
+def older_snapshot(home: Switch) -> Meta | None:
+    """The snapshot before the newest, if one is kept and it is really an older state."""
+    if not home.journal.durable:
+        return home.older
+    saved = home.journal.load(home.path, older=True)
+    newest = home.newest
+    if saved.snapshot is None or newest is None:
+        return None
+    meta = decode_meta(saved.snapshot)
+    return meta if 0 <= meta.base < newest.base else None

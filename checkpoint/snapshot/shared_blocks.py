@@ -1,0 +1,201 @@
+"""Blocks of images in memory that a life and its home share: what has changed is written once, what has not stays.
+
+Each snapshot writes its changed blocks into a segment of its own (a memfd, which has no name and goes with the last who
+holds it). A life compares its state with the blocks of its last snapshot by memcmp; its home, perhaps in another
+process, opens the same memory by /proc, so that nothing is sent.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import mmap
+import os
+import sys
+from collections.abc import Iterable
+from typing import Any, Final
+
+from ...actors.errors import HoldfastError
+from ...actors.shared_memory import keep_size, unnamed
+from .state_image import Key
+
+BLOCK: Final = 256 * 1024
+PAGE: Final = mmap.PAGESIZE
+_BATCH: Final = 256  # buffers per write: the system takes at most 1024
+_ZEROS: Final = bytes(PAGE)
+_memcmp: Any = ctypes.CDLL(None).memcmp
+_memcmp.argtypes = (ctypes.c_void_p, ctypes.c_void_p, ctypes.c_size_t)
+_memcmp.restype = ctypes.c_int
+
+Place = tuple[int, int, int]
+"""Where a block is: segment, offset, length."""
+Layout = dict[Key, list[Place]]
+"""Where the pieces of an image are, in its order."""
+
+
+def can_share() -> bool:
+    """Whether this system has memory without a name."""
+    return hasattr(os, "memfd_create") and os.path.isdir("/proc/self/fd")
+
+
+class Segment:
+    """Some blocks, mapped; whoever holds `file` could write them, but nobody does.
+
+    Nobody can make it shorter: whoever reads a mapping behind the end of its file dies of it (SIGBUS).
+
+    Raises:
+        OSError: the file is no memory that can be sealed.
+    """
+
+    def __init__(self, number: int, file: int) -> None:
+        keep_size(file)  # Before it is measured.
+        self.number, self.file = number, file
+        self.size = os.fstat(file).st_size
+        self.inode = os.fstat(file).st_ino
+        self.map = mmap.mmap(file, self.size, mmap.MAP_SHARED) if self.size else None
+        self._freed: dict[int, int] = {}  # what has been given back, by offset
+
+    @classmethod
+    def of(cls, number: int, blocks: Iterable[tuple[int, bytes]]) -> Segment:
+        """Blocks in memory of their own, each at its offset: for engines that have read them."""
+        file, end = memory_file(number), 0
+        try:
+            for offset, block in blocks:
+                os.pwrite(file, block, offset)
+                end = max(end, offset + len(block))
+            os.ftruncate(file, -(-end // PAGE) * PAGE)
+            return cls(number, file)
+        except BaseException:
+            os.close(file)
+            raise
+
+    def block(self, offset: int, length: int) -> memoryview:
+        """One block, where it lies."""
+        if self.map is None or not 0 <= offset <= offset + length <= self.size:
+            raise HoldfastError(f"segment {self.number:x} has no bytes {offset} to {offset + length}")
+        return memoryview(self.map)[offset : offset + length]
+
+    def keep(self, places: set[tuple[int, int]]) -> None:
+        """Give back the memory of all blocks that are not among these (offset, length)."""
+        if self.map is None:
+            return
+        end = 0
+        for offset, length in (*sorted(places), (self.size, 0)):
+            if offset - end > self._freed.get(end, 0):
+                self._freed[end] = offset - end
+                with contextlib.suppress(OSError):  # It is only memory that could be free.
+                    self.map.madvise(mmap.MADV_REMOVE, end, offset - end)
+            end = offset + -(-length // PAGE) * PAGE
+
+    def close(self) -> None:
+        """Let go of it; views of its blocks stay valid."""
+        os.close(self.file)
+        with contextlib.suppress(BufferError):  # Then it goes with the last view.
+            if self.map is not None:
+                self.map.close()
+
+
+def memory_file(number: int) -> int:
+    """A new file without a name, in memory."""
+    return unnamed(f"holdfast {number:x}")
+
+
+def new_number() -> int:
+    """A number that no other segment has."""
+    return int.from_bytes(os.urandom(7))
+
+
+def write_changed(
+    file: int, number: int, image: list[tuple[Key, Any]], known: Layout, segments: dict[int, Segment]
+) -> Layout:
+    """Write into `file` the blocks that differ from the known ones; returns where all blocks of the image are.
+
+    Raises:
+        OSError: there is no memory for it.
+    """
+    layout: Layout = {}
+    out: list[Any] = []
+    end = 0
+    for key, piece in image:
+        view = memoryview(piece).cast("B")
+        before = known.get(key, [])
+        address = _address(view)
+        places = layout[key] = []
+        for index, begin in enumerate(range(0, len(view), BLOCK)):
+            block = view[begin : begin + BLOCK]
+            if index < len(before) and _is_same(block, address + begin if address else 0, before[index], segments):
+                places.append(before[index])
+                continue
+            places.append((number, end, len(block)))
+            out.append(block)
+            end += len(block)
+            if len(block) % PAGE:
+                pad = PAGE - len(block) % PAGE
+                out.append(_ZEROS[:pad])
+                end += pad
+    _write(file, out)
+    return layout
+
+
+def _write(file: int, buffers: list[Any]) -> None:
+    at = 0
+    for first in range(0, len(buffers), _BATCH):
+        batch = buffers[first : first + _BATCH]
+        while batch:
+            done = os.pwritev(file, batch, at)
+            at += done
+            while batch and done >= len(batch[0]):
+                done -= len(batch.pop(0))
+            if batch and done:
+                batch[0] = memoryview(batch[0])[done:]
+
+
+def _address(view: memoryview) -> int:
+    """Where a buffer lies in memory; 0 if nobody knows."""
+    numpy: Any = sys.modules.get("numpy")
+    return int(numpy.frombuffer(view, numpy.uint8).ctypes.data) if numpy is not None and len(view) else 0
+
+
+def _is_same(block: memoryview, address: int, place: Place, segments: dict[int, Segment]) -> bool:
+    segment, offset, length = place
+    other = segments.get(segment)
+    if other is None or length != len(block):
+        return False
+    kept = other.block(offset, length)
+    if address:
+        return bool(_memcmp(address, _address(kept), length) == 0)
+    return bytes(block) == bytes(kept)
+
+
+def open_segment(number: int, pid: int, file: int, inode: int) -> Segment:
+    """A segment that a life has written.
+
+    Raises:
+        HoldfastError: it is not there any more.
+    """
+    try:
+        own = os.open(f"/proc/{pid}/fd/{file}", os.O_RDWR | os.O_CLOEXEC)
+        try:
+            segment = Segment(number, own)
+        except OSError:
+            os.close(own)
+            raise
+    except OSError as error:
+        raise HoldfastError(f"the blocks of a snapshot are gone: {error}") from error
+    if segment.inode != inode:
+        segment.close()
+        raise HoldfastError("the blocks of a snapshot are gone: its process has closed them")
+    return segment
+
+
+def places_of(layout: Layout) -> list[Place]:
+    """All blocks of an image, in order."""
+    return [place for places in layout.values() for place in places]
+
+
+def by_segment(places: Iterable[Place]) -> dict[int, set[tuple[int, int]]]:
+    """Offsets and lengths, by segment."""
+    found: dict[int, set[tuple[int, int]]] = {}
+    for segment, offset, length in places:
+        found.setdefault(segment, set()).add((offset, length))
+    return found

@@ -1,0 +1,199 @@
+"""Snapshots of several actors as one: a cut that could have been, and the way back to it (R78).
+
+Chandy and Lamport send a marker along each channel, so that each process saves its state and what was under way to it.
+Here all channels end in homes of one process, and a turn's outputs are at the homes of their receivers in the very step
+that ends it: one marker for all homes, taken between two steps of the root's loop, is such a cut. What each home has
+then (snapshot, turns since, messages that wait) is the actor's state and its channels; asks under way are kept too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ...actors.errors import HoldfastError
+from ..home.inputs import Input
+from ..journal import Entry, Saved
+from .snapshot_record import FORMAT, Meta, outlasting, owed
+
+if TYPE_CHECKING:
+    from ..home.homes import Homes
+    from ..home.switch import Switch
+
+RESTORING = "restoring group"
+"""The fact that names the group whose homes are being replaced."""
+
+
+class NoSuchGroup(HoldfastError, text="there is no group snapshot {name!r}; checkpoint_group() makes one"):
+    """No snapshot of a group has this name."""
+
+    name: str
+
+
+class Image(msgspec.Struct, array_like=True, frozen=True):
+    """One home at the cut."""
+
+    path: str
+    meta: bytes
+    entries: list[list[Any]]
+
+
+class Group(msgspec.Struct, array_like=True, frozen=True):
+    """All of them."""
+
+    format: int
+    time: float
+    images: list[Image]
+
+
+class Groups:
+    """The group snapshots of a root."""
+
+    def __init__(self, homes: Homes) -> None:
+        self._homes = homes
+        self._waiting: set[str] = set()  # who waits for the others of a group that is restored
+        unfinished = homes.journal.noted(RESTORING)
+        if unfinished is not None:  # This process's predecessor died in the middle of it.
+            self.replace(unfinished.decode())
+
+    # -- the cut ----------------------------------------------------------------------------------------------------
+
+    def take(self, name: str, paths: Sequence[str]) -> None:
+        """Keep one cut of these homes under a name.
+
+        Raises:
+            HoldfastError: one of them is not recorded, or the store refused.
+        """
+        homes = [self._recorded(path) for path in paths]
+        group = Group(FORMAT, self._homes.node.wall(), [_image(home) for home in homes])
+        self._homes.journal.note(_key(name), msgspec.msgpack.encode(group))
+
+    def _recorded(self, path: str) -> Switch:
+        home = self._homes.at(path)
+        if home is None:
+            raise HoldfastError(f"{path} is not recorded: only actors with recovery=hybrid(...) can be in a group")
+        if not home.method.replays:
+            raise HoldfastError(f"{path} replays nothing: only actors with recovery=hybrid(...) can be in a group")
+        return home
+
+    # -- the way back -----------------------------------------------------------------------------------------------
+
+    def members(self, name: str) -> list[str]:
+        """The addresses in a group snapshot.
+
+        Raises:
+            NoSuchGroup: there is none of that name.
+        """
+        return [image.path for image in self._group(name).images]
+
+    def names(self) -> list[str]:
+        """The group snapshots there are, oldest first."""
+        return [key.removeprefix(_key("")) for key in self._homes.journal.notes(_key(""))]
+
+    def forget(self, name: str) -> None:
+        """Remove a group snapshot.
+
+        Raises:
+            NoSuchGroup: there is none of that name. HoldfastError: the store refused.
+        """
+        if self._homes.journal.noted(_key(name)) is None:
+            raise NoSuchGroup(name)
+        self._homes.journal.note(_key(name), None)
+
+    def replace(self, name: str) -> None:
+        """Have the next lives at its addresses begin at the cut. Nobody may live there now.
+
+        Raises:
+            NoSuchGroup: there is none of that name. HoldfastError: the store refused; what is left to do is done when
+                it is opened again.
+        """
+        group, journal = self._group(name), self._homes.journal
+        journal.note(RESTORING, name.encode())
+        for image in group.images:
+            self._homes.vacate(image.path, "its group goes back to an earlier snapshot")
+        for image in group.images:
+            meta = msgspec.msgpack.decode(image.meta, type=Meta)
+            meta = msgspec.structs.replace(meta, time=self._homes.node.wall())  # Its timers have stood still.
+            entries: list[Entry] = [tuple(_tuple(part) for part in entry) for entry in image.entries]
+            if journal.durable:
+                old = [position for position, _ in journal.load(image.path).entries]
+                fresh = msgspec.structs.replace(meta, epoch=journal.epoch)
+                journal.cut(image.path, msgspec.msgpack.encode(fresh), old, turn=meta.turn, keep=1)
+                if entries:
+                    journal.append([(image.path, entry) for entry in entries])
+            self._homes.planted[image.path] = Saved(
+                msgspec.msgpack.encode(meta), meta.turn, list(enumerate(entries, 1))
+            )
+        journal.note(RESTORING, None)
+
+    def _group(self, name: str) -> Group:
+        data = self._homes.journal.noted(_key(name))
+        if data is None:
+            raise NoSuchGroup(name)
+        return msgspec.msgpack.decode(data, type=Group)
+
+    def wait(self, paths: Iterable[str]) -> None:
+        """From now on these homes hold what waits, until `let_go`: what they send would find nobody."""
+        self._waiting.update(paths)
+
+    def let_go(self, paths: Iterable[str]) -> None:
+        """All of them are there, or will not come."""
+        for path in paths:
+            self._waiting.discard(path)
+            home = self._homes.at(path)
+            if home is None or not home.kept_back:
+                continue
+            home.kept_back = False
+            live = home.live
+            if home.port is None or live is None or not live.done() or live.cancelled():
+                continue  # It lets itself go when it is live.
+            if live.exception() is None and not home.is_released:
+                home.let_at()
+
+    def opened(self, home: Switch) -> None:
+        """A home has its next cell: it holds what waits while its group is restored."""
+        home.kept_back = home.path in self._waiting
+
+
+def _key(name: str) -> str:
+    return f"group {name}"
+
+
+def _image(home: Switch) -> Image:
+    """What its store would have of it, if the root died now."""
+    timers, topics = outlasting(home)
+    newest = home.newest or Meta(FORMAT, -1, 0, [], {}, [], home.journal.epoch, b"")
+    state = newest.state
+    if newest.blocks:  # They are removed when later snapshots do not need them: a group has its own copy.
+        state = b"".join(part.data for part in home.images.restore(newest.blocks))
+    meta = msgspec.structs.replace(
+        newest,
+        format=FORMAT,
+        next_id=home.next_id,
+        timers=timers,
+        topics=topics,
+        state=state,
+        blocks=[],
+        earlier=[],
+        owed=owed(home),
+        ties=home.ties.saved(),
+    )
+    inputs = {turn.input.id: turn.input for turn in home.turns.values()} | home.open
+    entries: list[Entry] = [_in(inputs[key]) for key in sorted(inputs)]
+    outcomes = sorted(home.calls.outcomes.items())
+    entries += [("got", turn, k, answer.kind, answer.name, answer.body) for (turn, k), answer in outcomes]
+    for number, turn in home.turns.items():
+        entries.append(("end", number, turn.input.id, turn.status, tuple(turn.digests), *turn.digests_of_end()))
+    if home.partial:
+        entries.append(("out", home.turn + 1, home.partial_id, tuple(home.partial)))
+    return Image(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in entries])
+
+
+def _in(source: Input) -> Entry:
+    return ("in", source.id, source.kind, source.name, source.body, source.time, source.sender, source.origin)
+
+
+def _tuple(part: Any) -> Any:
+    return tuple(part) if isinstance(part, list) else part

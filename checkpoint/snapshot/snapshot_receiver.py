@@ -1,0 +1,62 @@
+"""Snapshots as they come home, in pieces or as an image: kept, or tried again when they could not be."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...actors.errors import HoldfastError
+from ...actors.events import SnapshotTaken
+from ...actors.kernel.message import message_name
+from ..protocol import Snapshot, SnapshotNow
+from .snapshot_record import cut
+
+if TYPE_CHECKING:
+    from ..home.switch import Switch
+
+
+class Arrival:
+    """The snapshot that is on its way to one home."""
+
+    def __init__(self, home: Switch) -> None:
+        self._home = home
+        self._pieces: list[bytes] = []
+
+    def cancel(self) -> None:
+        """The life is over: what has come of it will not be complete."""
+        self._pieces.clear()
+        self._home.images.cancel()
+
+    def take(self, record: Snapshot) -> None:
+        """One more piece, or an image; the last piece completes it."""
+        home = self._home
+        if record.image is not None:
+            home.images.take(record, record.image)
+            return
+        self._pieces.append(record.data)
+        if not record.is_last:
+            return
+        state = b"".join(self._pieces)
+        self._pieces.clear()
+        try:
+            cut(home, state, record)
+        except HoldfastError as error:
+            self._refused(record, error)
+            return
+        becomes = home.becomes
+        kind = "" if becomes is None or not record.is_replaced else message_name(becomes.kind)
+        if becomes is not None and home.cell is not None and record.kind == kind:
+            home.node.respec(home.cell, becomes)  # Now: the answer to whoever has replaced the code may never come.
+        home.limit.cut()
+        home.due.kept(record.turn)
+        if home.node.watched:
+            home.node.emit(SnapshotTaken(home.path, record.turn, len(state), record.pause, len(state)))
+
+    def _refused(self, record: Snapshot, error: HoldfastError) -> None:
+        """It could not be kept: the older snapshot and the whole journal are still there."""
+        home = self._home
+        home.due.failed(str(error))
+        if home.port is not None:
+            home.port.to_life(SnapshotNow(at_once=False))
+        if record.is_replaced and home.cell is not None:
+            home.is_void, home.unsaved = True, [*home.unsaved, str(error)]
+            home.cell.kill()

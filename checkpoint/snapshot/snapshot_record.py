@@ -1,0 +1,343 @@
+"""What a home keeps in the store: the snapshot with what the home knew then, and the journal behind it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ...actors.errors import HoldfastError
+from ...actors.events import SnapshotDamaged
+from ..home.durable_links import Tie
+from ..home.durable_timers import Saved
+from ..home.inputs import OVERHEAD, Input, Turn
+from ..home.pending_asks import SwitchAsk, origin_of
+from ..journal import DamagedStore, Entry
+from ..journal import Saved as Journaled
+from ..protocol import DOWN, EXIT, PIPE, STASHED, TICK, Answer, Snapshot
+from ..schema import as_shape, kind_in
+from .compression import PLAIN, compressor, decompress
+from .shared_blocks import Place
+
+if TYPE_CHECKING:
+    from ..home.switch import Switch
+
+FORMAT = 1
+IMAGES = 2
+"""The format of snapshots that an older holdfast would take for empty: in blocks, or compressed."""
+
+
+class Meta(msgspec.Struct, array_like=True, frozen=True):
+    """A snapshot, with what the home knew when it came.
+
+    A large state is not in `state`, but in `blocks`: places in packs. `earlier` packs are needed by older snapshots.
+    `codec`: how `state` is compressed, and `length` what it was before.
+
+    `time` (Unix) is when it was made, 0 in stores of before: timers have run on since. `owed`: inputs that are to be
+    answered later, with the address that has asked and their origin.
+
+    `turn` is the one it is restored after; its state is that after `base`, which is earlier if the turns in between
+    were undone (stores of before do not say). An empty `state` stands for none: the actor begins afresh. `traps`:
+    whether it traps exits.
+
+    `kind`: the class whose state it is, `variables` those that it had when `__init__` had run, and `shapes` the fields
+    of its messages (see `schema.py`); stores of before do not say.
+    """
+
+    format: int
+    turn: int
+    next_id: int
+    stash: list[int]
+    timers: dict[str, Saved]
+    topics: list[str]
+    epoch: int
+    state: bytes
+    base: int = -1
+    blocks: list[Place] = []
+    earlier: list[int] = []
+    codec: int = PLAIN
+    length: int = 0
+    time: float = 0.0
+    owed: dict[int, tuple[str, str]] = {}
+    ties: list[Tie] = []
+    traps: bool = False
+    kind: str = ""
+    variables: list[str] = []
+    shapes: dict[str, list[Any]] = {}
+
+    @property
+    def has_state(self) -> bool:
+        """Whether there is a state; else the actor begins afresh."""
+        return bool(self.state or self.blocks)
+
+
+def decode_meta(data: bytes) -> Meta:
+    """A snapshot as the store has it.
+
+    Raises:
+        HoldfastError: it is of a format that this holdfast does not know, or damaged. It stays as it is.
+    """
+    try:
+        meta = msgspec.msgpack.decode(data, type=Meta)
+        if meta.format not in (FORMAT, IMAGES):
+            raise HoldfastError(f"a snapshot has format {meta.format}, which this holdfast does not know")
+        if meta.codec == PLAIN:
+            return meta
+        state = decompress(meta.codec, meta.state, meta.length)
+    except (msgspec.DecodeError, msgspec.ValidationError, ValueError) as error:
+        raise HoldfastError(f"a snapshot cannot be read: {error}") from error
+    return msgspec.structs.replace(meta, state=state, codec=PLAIN, length=0)
+
+
+def encode_meta(meta: Meta, compress: bool | int) -> bytes:
+    """A snapshot as the store will have it."""
+    if compress and meta.state:
+        codec, state = compressor(compress)(meta.state)
+        if codec != PLAIN:
+            meta = msgspec.structs.replace(meta, format=IMAGES, codec=codec, length=len(meta.state), state=bytes(state))
+    return msgspec.msgpack.encode(meta)
+
+
+def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> Meta:
+    """A snapshot of the state after `turn`, with what the home knows at this moment."""
+    timers, topics = outlasting(home)
+    epoch, now = home.journal.epoch, home.node.wall()
+    return Meta(
+        FORMAT,
+        turn,
+        home.next_id,
+        stash,
+        timers,
+        topics,
+        epoch,
+        state,
+        turn,
+        time=now,
+        owed=owed(home),
+        ties=home.ties.saved(),
+        kind=home.shapes.kind,
+        variables=[] if home.newest is None else home.newest.variables,
+    )
+
+
+def cut(home: Switch, state: bytes, record: Snapshot) -> None:
+    """A snapshot is complete: keep it durably, then forget what it contains.
+
+    Raises:
+        HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
+    """
+    older = home.newest
+    meta = meta_now(home, record.turn, record.stash, state)
+    more = made_by(home, record)
+    meta = msgspec.structs.replace(meta, earlier=home.images.earlier(), traps=record.traps, **more)
+    put(home, meta, home.method.keep)
+    # In a store that lasts it is read back when it is wanted.
+    home.older = older if home.method.keep > 1 and not home.journal.durable else None
+    home.images.tidy()
+
+
+def made_by(home: Switch, record: Snapshot) -> dict[str, Any]:
+    """Whose state a snapshot is, as the life says that has made it."""
+    if record.kind:
+        home.shapes.kind = record.kind
+    return {"kind": home.shapes.kind, "variables": record.variables}
+
+
+def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:
+    """Timers and topics as they are after the last turn, though some of it may not have taken effect yet."""
+    timers, topics = home.timers.saved(), dict(home.topics)
+    for out in home.outputs.kept:
+        match out.verb:
+            case "timer":
+                timers[out.to] = (out.name, out.body, out.seconds, out.interval)
+            case "cancel":
+                timers.pop(out.to, None)
+            case "subscribe":
+                topics[out.to] = None
+            case _:
+                topics.pop(out.to, None)
+    return timers, list(topics)
+
+
+def owed(home: Switch) -> dict[int, tuple[str, str]]:
+    """The asks from recorded turns that are to be answered later."""
+    asks = ((key, ask) for key, ask in home.later.items() if isinstance(ask, SwitchAsk) and not ask.is_over)
+    return {key: (ask.sender.path, origin_of(ask)) for key, ask in asks}
+
+
+def put(home: Switch, meta: Meta, keep: int) -> None:
+    """Have the next life begin with this, and forget the turns up to `meta.turn`; `keep` as in `Journal.cut`.
+
+    Raises:
+        HoldfastError: it could not be kept, and nothing has changed.
+    """
+    covered = [number for number in home.turns if number <= meta.turn]
+    entries = [known for number, known in home.positions.items() if number <= meta.turn]  # of hooks, too
+    if home.journal.durable:
+        meta = msgspec.structs.replace(meta, shapes=home.shapes.saved())
+        home.journal.barrier()  # From here on it is known where everything stands.
+        drop = [*(position for known in home.dropped for position in known)]
+        drop += [*(position for known in entries for position in known)]
+        # An image may be behind: what was stashed when it was begun may have been handled since.
+        later = {turn.input.id for number, turn in home.turns.items() if number > meta.turn}
+        for number in covered:
+            source = home.turns[number].input
+            if source.id not in home.open and source.id not in later:  # Else it is stashed, and not handled yet.
+                drop.extend(source.positions)
+        home.journal.cut(home.path, encode_meta(meta, home.method.compress), drop, turn=meta.turn, keep=keep)
+    home.images.cancel()
+    home.dropped.clear()
+    home.newest, home.stash = meta, meta.stash
+    done = (home.turns.pop(number) for number in covered)
+    home.bytes -= sum(len(turn.input.body) + OVERHEAD for turn in done if turn.status != STASHED)
+    for known in (home.positions, home.pipes_done):
+        for number in [number for number in known if number <= meta.turn]:
+            del known[number]
+    for key in [key for key in home.calls.outcomes if key[0] <= meta.turn]:
+        del home.calls.outcomes[key]
+
+
+def go_back(home: Switch, meta: Meta) -> None:
+    """Between two lives: timers, subscriptions and ties are those of the snapshot again, as the state is."""
+    home.outputs.kept.clear()  # What has not taken effect yet is undone, too.
+    if home.cell is not None:
+        for topic in home.topics:
+            if topic not in meta.topics:  # Those of its class are subscribed anew with the next life.
+                home.node.topics.unsubscribe(topic, home.cell)
+    home.topics = dict.fromkeys(meta.topics)
+    home.timers.replace(meta.timers)
+    home.ties.go_back(meta.ties)
+
+
+def load(home: Switch, planted: Journaled | None = None) -> None:
+    """Take up where the store left off, or (in memory) where something else says."""
+    if planted is not None and not home.journal.durable:
+        saved, newest = planted, None if planted.snapshot is None else decode_meta(planted.snapshot)
+    else:
+        saved, newest = load_newest(home)
+    timers: dict[str, Saved] = {}
+    if newest is not None:
+        meta = home.newest = newest
+        home.turn, home.next_id, home.stash = meta.turn, meta.next_id, meta.stash
+        home.topics, home.owed = dict.fromkeys(meta.topics), dict(meta.owed)
+        home.ties.replace(meta.ties)
+        home.shapes.loaded(meta.kind, {name: map(as_shape, all_) for name, all_ in meta.shapes.items()})
+        timers = {
+            key: (name, body, left - elapsed(home, meta.time), interval)
+            for key, (name, body, left, interval) in meta.timers.items()
+        }
+    for position, entry in saved.entries:
+        _reload(home, position, entry, timers)
+    home.ties.loaded()
+    for source in home.open.values():
+        home.bytes += len(source.body) + OVERHEAD
+    for turn in home.turns.values():
+        if turn.status != STASHED:
+            home.bytes += len(turn.input.body) + OVERHEAD
+    for key, (name, body, left, interval) in timers.items():
+        home.timers.start(key, name, body, max(0.0, left), interval)
+    home.shapes.kind = home.shapes.kind or kind_in(home)
+
+
+def elapsed(home: Switch, since: float) -> float:
+    """Seconds since a moment that a store of before may not have (0), by a clock that may have been set back."""
+    return max(0.0, home.node.wall() - since) if since else 0.0
+
+
+def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:
+    """The newest snapshot that can be used, with the journal since then; an event says if it is not the newest.
+
+    Raises:
+        DamagedStore: none can.
+    """
+    reason, tried = "", set[bytes]()
+    for older in range(home.method.keep + 2):  # More may be there for a moment, and some were passed over already.
+        saved = home.journal.load(home.path, older=older)
+        reason = reason or saved.passed_over
+        if saved.snapshot is None:
+            return saved, None
+        if saved.snapshot in tried:
+            continue
+        tried.add(saved.snapshot)
+        try:
+            meta = decode_meta(saved.snapshot)
+            home.images.fetch(meta)
+        except HoldfastError as error:
+            reason = reason or str(error)
+            continue
+        if reason:
+            home.node.emit(SnapshotDamaged(home.path, saved.turn, reason))
+        home.images.loaded(meta)
+        return saved, meta
+    raise DamagedStore(home.path, home.path, None, f"no snapshot is left: {reason}")
+
+
+def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:
+    """One journal entry, read again in order."""
+    values: tuple[Any, ...] = entry
+    match values:
+        case ("in", key, kind, name, body, when, sender, origin):
+            source = home.open[key] = Input(key, kind, name, body, when, sender)
+            source.origin = origin
+            source.positions = [position]
+            home.next_id = max(home.next_id, key + 1)
+            if kind == TICK and origin in timers and not timers[origin][3]:
+                del timers[origin]
+            if kind in (EXIT, DOWN):
+                told = msgspec.msgpack.decode(body)
+                if not told.get("recovering"):
+                    home.ties.over(told.get("verb", "link"), told["source"])
+            if kind == PIPE and origin:
+                turn, k = map(int, origin.split("."))
+                home.pipes_done.setdefault(turn, set()).add(k)
+        case ("end", turn, key, status, digests, *more):
+            if key not in home.open:
+                return
+            past = home.turns[turn] = Turn(home.open[key], status, list(digests), *more)
+            home.positions_of(turn).append(position)
+            past.input.turn = home.turn = turn
+            home.partial, home.partial_id = [], -1
+            if status != STASHED:
+                del home.open[key]
+        case ("out", turn, key, digests):
+            home.positions_of(turn).append(position)
+            if turn > home.turn:
+                home.partial, home.partial_id = list(digests), key
+        case ("got", turn, k, kind, name, body):
+            home.positions_of(turn).append(position)
+            home.calls.outcomes[turn, k] = Answer(kind, name, body)
+        case ("drop", key):
+            dropped = home.open.pop(key, None)
+            home.dropped += ([] if dropped is None else dropped.positions, [position])
+        case ("tried", key, count):
+            if key in home.open:
+                home.open[key].deliveries = count
+                home.open[key].positions.append(position)
+        case ("shape", name, shape):
+            home.dropped.append([position])  # The next snapshot keeps it.
+            home.shapes.read(name, as_shape(shape))
+        case ("tie", turn, verb, path):
+            home.positions_of(turn).append(position)
+            home.ties.turn(verb, path)
+        case ("later", turn, key):
+            home.positions_of(turn).append(position)
+            source = home.turns[turn].input
+            if source.sender is not None:
+                home.owed[key] = (source.sender, source.origin)
+        case ("replied", turn, key):
+            home.positions_of(turn).append(position)
+            home.owed.pop(key, None)
+        case ("op", turn, verb, key, name, body, seconds, interval, *when):
+            home.positions_of(turn).append(position)
+            match verb:
+                case "timer":
+                    timers[key] = (name, body, seconds - elapsed(home, *when or (0.0,)), interval)
+                    home.timers.made_again(key)
+                case "cancel":
+                    timers.pop(key, None)
+                case "subscribe":
+                    home.topics[key] = None
+                case _:
+                    home.topics.pop(key, None)
+        case _:
+            raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")

@@ -1,0 +1,125 @@
+"""Packs: files beside the database with the blocks of large snapshots, each there completely or not at all.
+
+A pack holds what one snapshot wrote anew; the snapshot's row names the blocks of all packs that it consists of. The
+bytes: magic, then for each block a head (offset in its segment, length, stored length, codec, checksum) and the block.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import re
+import struct
+import zlib
+from collections.abc import Collection, Sequence
+from hashlib import blake2b
+from typing import Final
+
+from ..journal import DamagedStore, StoreFailed
+from ..snapshot.compression import PLAIN, compressor, decompress
+from ..snapshot.shared_blocks import PAGE, Segment, memory_file
+from .snapshot_files import refuse_shared, write_durably
+from .store_parts import Parts
+
+_NAME: Final = re.compile(r"[0-9a-f]+\.pack")
+_MAGIC: Final = b"HFPK\x01\0\0\0"
+_HEAD: Final = struct.Struct("<QIIII")  # offset, length, stored length, codec, checksum
+
+
+class Packs:
+    """The packs of the store at `path`, in a folder for each address."""
+
+    def __init__(self, path: str, parts: Parts) -> None:
+        self.path = path
+        self.folder = f"{path}-packs"
+        self._parts = parts
+
+    def write(self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int) -> None:
+        """Write a new pack durably.
+
+        Raises:
+            StoreFailed: it is not written, and nothing of it is left.
+        """
+        deflate = compressor(compress)
+        parts: list[bytes | memoryview] = [_MAGIC]
+        for offset, block in blocks:
+            codec, data = deflate(block)
+            head = _HEAD.pack(offset, len(block), len(data), codec, 0)[:-4]
+            parts += (head, struct.pack("<I", zlib.crc32(block, zlib.crc32(head))), data)
+        folder = self._folder(address)
+        try:
+            for one in (self.folder, folder):
+                with contextlib.suppress(FileExistsError):
+                    os.mkdir(one, mode=0o700)
+                if one == self.folder:
+                    self._parts.mark(one)
+                if os.path.islink(one):
+                    raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), one)
+            write_durably(self._file(address, number), parts)
+        except OSError as error:
+            raise StoreFailed(self.path, f"snapshot not written: {error}; older one and journal stay") from error
+
+    def read(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """Read back the blocks at these (offset, length), and verify them.
+
+        Raises:
+            DamagedStore: one is missing or damaged.
+        """
+        name = self._file(address, number)
+        wanted = set(places)
+        file = memory_file(number)
+        try:
+            with open(os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as pack:
+                refuse_shared(name, os.fstat(pack.fileno()))
+                if pack.read(len(_MAGIC)) != _MAGIC:
+                    raise ValueError("it is no pack")
+                while wanted and (head := pack.read(_HEAD.size)):
+                    offset, length, stored, codec, crc = _HEAD.unpack(head)
+                    data = pack.read(stored)
+                    if (offset, length) not in wanted:
+                        continue
+                    block = data if codec == PLAIN else decompress(codec, data, length)
+                    if len(block) != length or zlib.crc32(block, zlib.crc32(head[:-4])) != crc:
+                        raise ValueError(f"the checksum of the block at {offset} is wrong")
+                    os.pwrite(file, block, offset)
+                    wanted.discard((offset, length))
+            if wanted:
+                raise ValueError(f"the block at {min(wanted)[0]} is missing")
+            end = max((offset + length for offset, length in places), default=0)
+            os.ftruncate(file, -(-end // PAGE) * PAGE)
+            return Segment(number, file)
+        except (OSError, ValueError, struct.error) as error:
+            os.close(file)
+            raise DamagedStore(self.path, address, None, f"snapshot file {name}: {error}") from error
+
+    def names(self, address: str) -> set[int]:
+        """The packs of an address."""
+        try:
+            found = os.listdir(self._folder(address))
+        except FileNotFoundError:
+            return set()
+        return {int(name[: -len(".pack")], 16) for name in found if _NAME.fullmatch(name)}
+
+    def remove(self, address: str, numbers: Collection[int]) -> None:
+        """Remove packs that no snapshot needs."""
+        for number in numbers:
+            with contextlib.suppress(FileNotFoundError):
+                os.unlink(self._file(address, number))
+
+    def erase(self, address: str) -> None:
+        """Remove all packs of an address, and what was left half made."""
+        folder = self._folder(address)
+        with contextlib.suppress(FileNotFoundError):
+            for name in os.listdir(folder):
+                if _NAME.fullmatch(name.removesuffix(".tmp")):
+                    with contextlib.suppress(FileNotFoundError):
+                        os.unlink(os.path.join(folder, name))
+            if not os.listdir(folder):  # Else somebody has put something there that is not ours.
+                os.rmdir(folder)
+
+    def _folder(self, address: str) -> str:
+        return os.path.join(self.folder, blake2b(address.encode(errors="surrogatepass"), digest_size=12).hexdigest())
+
+    def _file(self, address: str, number: int) -> str:
+        return os.path.join(self._folder(address), f"{number:x}.pack")

@@ -1,0 +1,143 @@
+"""What is in the file: which entries each address has, found by one scan that notices whether any is missing."""
+
+from __future__ import annotations
+
+import sqlite3
+from array import array
+from dataclasses import dataclass, field
+from typing import Final
+
+from ..journal import DamagedStore
+from .row_codec import crc_of
+from .store_parts import NOTE
+
+MODULUS: Final = 1 << 62  # SQLite integers end at 2**63
+
+
+@dataclass(slots=True)
+class Chain:
+    """What is known of one address. `path` is `None` while an erase is under way."""
+
+    id: int
+    path: str | None
+    removed: int = 0  # rows removed by cuts, and the sum of their chain numbers
+    removed_sum: int = 0
+    floor: int = 0  # the chain is at least this long
+    kept: list[int] = field(default_factory=list[int])  # ids of its snapshots, oldest first
+    last: int = 0  # newest chain number
+    total: int = 0  # sum of the chain numbers of `positions`
+    positions: array[int] = field(default_factory=lambda: array("q"))
+    damage: DamagedStore | None = None
+
+    def write(self, db: sqlite3.Connection) -> None:
+        """Bring the row of the address up to date, within the running transaction."""
+        kept = ",".join(map(str, self.kept))
+        fields = self.id, self.path, self.removed, self.removed_sum, self.floor, kept
+        db.execute(
+            "UPDATE addresses SET path = ?, removed = ?, removed_sum = ?, floor = ?, kept = ?, crc = ? WHERE id = ?",
+            (*fields[1:], crc_of(*fields), self.id),
+        )
+
+
+def create_chain(db: sqlite3.Connection, address: str) -> Chain:
+    """Give an address its row, within the running transaction."""
+    number = db.execute("INSERT INTO addresses(path) VALUES (?)", (address,)).lastrowid
+    assert number is not None
+    chain = Chain(number, address)
+    chain.write(db)
+    return chain
+
+
+@dataclass(slots=True)
+class Contents:
+    """What the file holds, apart from entries and snapshots themselves."""
+
+    chains: dict[str, Chain]  # by address
+    erased: list[Chain]  # whose erase was begun
+    notes: dict[str, bytes]
+    last: int  # newest position ever handed out
+    live: int  # rows in `entries`
+
+
+class Scan:
+    """One look at the whole file."""
+
+    def __init__(self, db: sqlite3.Connection, path: str) -> None:
+        self._db, self._path = db, path
+
+    def contents(self) -> Contents:
+        """Find where each address has its entries, and verify that none is missing.
+
+        Raises:
+            DamagedStore: something is wrong that cannot be laid to one address; else its chain says so (`damage`).
+        """
+        floor, live = self._db.execute("SELECT floor, live FROM store").fetchone()
+        chains = self._addresses()
+        last, total = self._entries(chains)
+        for chain in chains.values():
+            self._verify(chain)
+        last = max(last, floor)
+        if total != live + last - floor and not any(chain.damage for chain in chains.values()):
+            reason = f"there should be {live + last - floor} entries, there are {total}"
+            raise DamagedStore(self._path, None, None, reason)
+        known = {chain.path: chain for chain in chains.values() if chain.path is not None}
+        erased = [chain for chain in chains.values() if chain.path is None]
+        return Contents(known, erased, self._notes(), last, total)
+
+    def _addresses(self) -> dict[int, Chain]:
+        chains: dict[int, Chain] = {}
+        for *fields, crc in self._db.execute("SELECT id, path, removed, removed_sum, floor, kept, crc FROM addresses"):
+            if crc_of(*fields) != crc:
+                raise DamagedStore(self._path, str(fields[1]), None, "the checksum of the row of the address is wrong")
+            number, path, removed, removed_sum, floor, kept = fields
+            ids = [int(snapshot) for snapshot in kept.split(",") if snapshot]
+            chains[number] = Chain(number, path, removed, removed_sum, floor, ids)
+        for number, address in self._db.execute("SELECT id, address FROM snapshots"):
+            if address not in chains:
+                raise DamagedStore(self._path, None, None, f"snapshot {number} belongs to no address")
+        return chains
+
+    def _entries(self, chains: dict[int, Chain]) -> tuple[int, int]:
+        """Give each chain its positions; return the newest position and the number of entries."""
+        position = total = 0
+        for position, address, number in self._db.execute(
+            "SELECT position, address, chain FROM entries ORDER BY position"
+        ):
+            chain = chains.get(address)
+            if chain is None or type(number) is not int:
+                raise DamagedStore(self._path, None, position, "the entry belongs to no address")
+            if number <= chain.last and chain.damage is None:
+                chain.damage = DamagedStore(self._path, chain.path, position, "the entry is out of order")
+            chain.last = number
+            chain.total += number
+            chain.positions.append(position)
+            total += 1
+        return position, total
+
+    def _notes(self) -> dict[str, bytes]:
+        notes: dict[str, bytes] = {}
+        for name, value, crc in self._db.execute("SELECT name, value, crc FROM notes ORDER BY key"):
+            if crc != crc_of(name, value):
+                raise DamagedStore(self._path, None, None, f"the checksum of note {name!r} is wrong")
+            if name != NOTE:
+                notes[name] = value
+        return notes
+
+    def _verify(self, chain: Chain) -> None:
+        """Note the damage if entries are missing anywhere but at the end."""
+        length = len(chain.positions) + chain.removed
+        missing = (length * (length + 1) // 2 - chain.total - chain.removed_sum) % MODULUS
+        if chain.damage is None and (missing or length < max(chain.floor, chain.last)):
+            chain.damage = DamagedStore(self._path, chain.path, self._hole(chain), "entries are missing")
+        chain.last = length
+
+    def _hole(self, chain: Chain) -> int | None:
+        """The position before which the missing entry was, if it is certain which one it is."""
+        length = len(chain.positions) + chain.removed + 1  # if it is only one, and it is not the last
+        absent = (length * (length + 1) // 2 - chain.total - chain.removed_sum) % MODULUS
+        for position, number in self._db.execute(
+            "SELECT position, chain FROM entries WHERE address = ? ORDER BY position", (chain.id,)
+        ):
+            if number >= absent:
+                return int(position) if number > absent else None
+        return None

@@ -1,0 +1,467 @@
+"""The open store: what it holds, as the memory has it, and writes that happen as the owner's or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import sqlite3
+import threading
+import uuid
+from array import array
+from collections.abc import Generator, Sequence
+from time import monotonic
+from typing import Final
+
+from ...actors.errors import HoldfastError
+from ..journal import DamagedStore, Entry, StaleEpoch, StoreFailed
+from .append_log import FrontLog, NoRoom, Row, Sealed
+from .database import VERSION, VERSION_WITH_LOG, connect, create_database, result_code
+from .entry_chains import Chain, Scan, create_chain
+from .in_hand import Hands
+from .ownership import Claim
+from .position_mark import Mark
+from .snapshot_files import SnapshotFiles, sync
+from .store_parts import Parts
+
+INSERT: Final = "INSERT INTO entries VALUES (?, ?, ?, ?, ?, ?)"
+_CHECKPOINT_BYTES: Final = 4 << 20
+LOOK_SECONDS: Final = 0.05
+"""How long writes may be acknowledged after the store was deleted or replaced, before anybody looks."""
+_WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
+
+
+class Store:
+    """One process's hold on a store, from `opening` to `close`.
+
+    Attributes:
+        lock: guards the writing connection and all that memory says of the file; it may be taken again by its holder.
+        read_lock: guards the reading connection.
+        chains: by address.
+        erased: chains whose erase an earlier owner began and did not finish.
+        last: newest position handed out.
+        live: rows in `entries`, and in the log in front of it.
+        log: rows that are not in the database yet. Each transaction brings them there.
+        in_doubt: whether memory may be behind or ahead of the file.
+        failure: why everything is refused from now on.
+    """
+
+    def __init__(self, path: str, *, fsync: bool) -> None:
+        self.path = path
+        self.files = SnapshotFiles(path)
+        self.parts = Parts(path, (self.files.folder, f"{path}-log", f"{path}-packs"))
+        self.lock = threading.RLock()
+        self.read_lock = threading.Lock()
+        self.chains: dict[str, Chain] = {}
+        self.notes: dict[str, bytes] = {}
+        self.erased: list[Chain] = []
+        self.last = self.live = 0
+        self.failure: HoldfastError | None = None
+        self.log = FrontLog(path, is_used=not fsync)
+        self._fsync = fsync
+        self._look_at = 0.0
+        self._mark = Mark(path)
+        self.hands = Hands(path)
+        self.in_doubt = False
+        self._wal = -1  # a descriptor of the WAL, once somebody has it synced
+        self._is_unsynced = True  # Was anything committed since the last sync?
+        self._sync_lock = threading.Lock()
+        self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly
+        self._checkpointer: threading.Thread | None = None
+
+    # ---- opening and closing
+
+    @contextlib.contextmanager
+    def opening(self, *, takeover: bool) -> Generator[None, None, None]:
+        """Open the store, then do what the caller has to do before it counts as open; if anything fails, let go of it.
+
+        Raises:
+            StoreInUse, DamagedStore, StoreFailed: see `SqliteJournal`.
+        """
+        try:
+            self._connect()
+            try:
+                self.claim.take(takeover)
+                self._configure()
+                try:
+                    self._scan()
+                    self._begin_log()
+                    self.hands.open(uuid.UUID(self.parts.id).bytes)
+                    yield
+                    self.parts.opened()
+                except BaseException:
+                    with contextlib.suppress(sqlite3.Error):
+                        self.claim.release()
+                    raise
+            except BaseException:
+                self._disconnect()
+                raise
+        except (sqlite3.Error, OSError) as error:
+            raise self.translate(error) from error
+        except UnicodeDecodeError as error:  # SQLite quotes a damaged schema, and Python cannot read the quotation.
+            raise DamagedStore(self.path, None, None, "its tables are not as they were created") from error
+
+    def _connect(self) -> None:
+        is_there = self.parts.inspect()
+        with contextlib.suppress(FileExistsError):
+            os.mkdir(self.files.folder, mode=0o700)  # not its parents: a mistyped path should not be made true
+        if not is_there:
+            self.log.make_folder()
+            create_database(self.path, self.files.folder)
+        if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
+            raise DamagedStore(self.path, None, None, "the file is empty")
+        self.db, self.reader = connect(self.path), connect(self.path)
+        self.claim = Claim(self.db, self.parts)
+
+    def _configure(self) -> None:
+        self.db.execute(f"PRAGMA synchronous = {'FULL' if self._fsync else 'NORMAL'}")
+        self.db.execute(f"PRAGMA journal_size_limit = {_WAL_FRAMES * 4096}")
+
+    def _scan(self) -> None:
+        """Take into memory what is in the file."""
+        found = Scan(self.db, self.path).contents()
+        self.chains, self.erased, self.notes = found.chains, found.erased, found.notes
+        self.last, self.live, self.in_doubt = found.last, found.live, False
+        rows = self.log.rows
+        if rows and rows[0][0] <= self.last:  # It was only broken off when all was done.
+            self.log.restart()
+        elif rows:
+            self._take_in(rows)
+
+    def _take_in(self, rows: Sequence[Row]) -> None:
+        """Take into memory what is in the log."""
+        chains = {chain.id: chain for chain in self.chains.values()}
+        for position, key, number, *_ in rows:
+            chain = chains.get(key)
+            if chain is None:
+                raise DamagedStore(self.path, None, position, "the entry belongs to no address")
+            if number != chain.last + 1 and chain.damage is None:
+                chain.damage = DamagedStore(self.path, chain.path, position, "entries are missing")
+            chain.last = number
+            chain.positions.append(position)
+        self.last = rows[-1][0]
+        self.live += len(rows)
+
+    def _begin_log(self) -> None:
+        """Bring into the database what earlier owners have left in their logs, and begin one of our own."""
+        log = self.log
+        log.epoch = self.claim.epoch
+        (version,) = self.db.execute("PRAGMA user_version").fetchone()
+        if log.make_folder():
+            if version == VERSION_WITH_LOG:
+                os.rmdir(log.folder)
+                reason = f"its log is missing (make an empty folder {log.folder} to go on without what was in it)"
+                raise DamagedStore(self.path, None, None, reason)
+            sync(os.path.dirname(self.path))
+        self.parts.adopt(self.db)
+        # A store was closed, and its owner killed before it had removed these; or its WAL is missing: the mark knows.
+        stale, left = (log.left(), []) if version == VERSION else ([], log.left())
+        rows: list[Row] = []
+        for batch in log.read(left):
+            if batch[0][0] == self.last + 1:
+                self._take_in(batch)
+                rows += batch
+            elif batch[-1][0] > self.last:
+                break  # A power loss has taken what was before it: the mark knows whether it may be missing.
+        self._mark.check(self.last, synced=self._fsync)
+        if stale:
+            log.remove(stale)
+        log.rows = rows
+        if left:  # They are removed next.
+            self.db.execute("PRAGMA synchronous = FULL")
+        with self.transaction() as db:
+            db.execute(f"PRAGMA user_version = {VERSION_WITH_LOG}")
+        if left:
+            log.remove(left)
+            self._configure()
+
+    def close(self) -> None:
+        """Release the store and sync it; a second call does nothing.
+
+        Raises:
+            StoreFailed: it is not where it was opened, which nobody was told before: what was acknowledged may be gone.
+        """
+        lost = ""
+        with self.lock:
+            if not self._mark.is_open:
+                return
+            if self.failure is None and self._is_ours():
+                lost = self._lost()
+            clean = self.failure is None and not self.in_doubt
+            self.failure = self.failure or StoreFailed(self.path, "it is closed")
+            self._mark.close()
+            checkpointer = self._checkpointer
+        if checkpointer is not None:
+            checkpointer.join()  # not under the lock, which it may need
+        with self.lock, self.read_lock:
+            try:
+                with contextlib.suppress(sqlite3.Error):
+                    self._retire(clean)
+            finally:
+                self._disconnect()
+        if lost:
+            raise StoreFailed(self.path, lost)
+
+    def _retire(self, clean: bool) -> None:
+        """Leave the last word on how much there is, so that the mark is not needed, and strike ourselves out."""
+        db = self.db
+        if clean:
+            db.execute("PRAGMA synchronous = FULL")
+            db.execute("BEGIN IMMEDIATE")
+            clean = db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,)
+            if clean:
+                db.executemany(INSERT, self.log.rows)
+                db.execute(f"PRAGMA user_version = {VERSION}")
+                self.claim.write(self.last, self.live)
+            db.execute("COMMIT")
+        if clean:
+            self._mark.remove()
+        self.hands.close(remove=clean)
+        self.log.close(remove=clean)
+        self.claim.release()
+
+    def _disconnect(self) -> None:
+        self._mark.close()
+        self.log.close(remove=False)
+        self.hands.close(remove=False)
+        self.parts.close()
+        if self._wal >= 0:
+            wal, self._wal = self._wal, -1
+            os.close(wal)
+        for db in (self.reader, self.db):
+            with contextlib.suppress(sqlite3.Error):
+                db.close()
+
+    # ---- transactions
+
+    @contextlib.contextmanager
+    def transaction(self, size: int = 0, *, note: bool = False) -> Generator[sqlite3.Connection, None, None]:
+        """Run a write of about `size` bytes as the owner, or not at all.
+
+        What is in the log goes before it. With `note` the transaction takes a position of its own, so that the mark
+        shows if it is lost, and the store row is brought up to date.
+        """
+        with self.lock:
+            self.refresh()
+            db, log = self.db, self.log
+            try:
+                db.execute("BEGIN IMMEDIATE")
+                (current,) = db.execute("SELECT epoch FROM store").fetchone()
+                if current != self.claim.epoch:
+                    raise StaleEpoch(self.path, self.claim.epoch, current)
+                self.in_doubt = True
+                if log.is_due:
+                    log.prepare()
+                    db.executemany(INSERT, log.rows)
+                yield db
+                if note:
+                    self.last += 1
+                    self.claim.write(self.last, self.live)
+                db.execute("COMMIT")
+                self._is_unsynced = True
+                if log.is_due:
+                    self._unsaved_bytes += log.size
+                    log.restart()
+                self.in_doubt = False
+                self._mark.set(self.last)
+            except BaseException as error:
+                if db.in_transaction:
+                    with contextlib.suppress(sqlite3.Error):
+                        db.execute("ROLLBACK")
+                if isinstance(error, sqlite3.Error | OSError):
+                    raise self.translate(error) from error
+                raise
+            self._unsaved_bytes += size + 8192
+            if self._unsaved_bytes > _CHECKPOINT_BYTES:
+                self._start_checkpoint()
+
+    def takes(self, entries: Sequence[tuple[str, Entry]], size: int) -> bool:
+        """Whether the log takes these entries, encoded in so many bytes; else they need a transaction."""
+        if self.in_doubt or self.failure is not None or not self.log.takes(len(entries), size):
+            return False
+        if monotonic() >= self._look_at:
+            self._look()
+        for address, _ in entries:
+            chain = self.chains.get(address)
+            if chain is None or chain.damage is not None:
+                return False
+        return True
+
+    def write_log(self, rows: list[Row]) -> None:
+        """Acknowledge rows that memory has already (`in_doubt`), by writing them to the log.
+
+        Raises:
+            StaleEpoch, StoreFailed: they are not.
+        """
+        try:
+            self.log.write(rows)
+        except Sealed as error:
+            (current,) = self.db.execute("SELECT epoch FROM store").fetchone()
+            raise StaleEpoch(self.path, self.claim.epoch, current) from error
+        except OSError as error:
+            raise self.translate(error) from error
+        self.in_doubt = False
+        self._mark.set(self.last)
+
+    def sync(self) -> None:
+        """Bring what was appended and committed so far to the disk.
+
+        Without the lock while the disk works: the WAL only grows, or begins again when all of it is in the synced
+        database; and its file stays the same for as long as somebody has it open.
+        """
+        with self._sync_lock:
+            with self.lock:
+                self.refuse_failed()
+                last, is_unsynced, self._is_unsynced = self.last, self._is_unsynced, False
+                files, kept = self.log.promise(), self.log.kept()
+                if self._wal < 0:  # It has no locks: to close it later drops none.
+                    self._wal = os.open(f"{self.path}-wal", os.O_RDONLY | os.O_CLOEXEC)
+            try:
+                if is_unsynced:
+                    os.fdatasync(self._wal)
+                self.log.sync(files)
+            except OSError as error:
+                with self.lock:
+                    raise self.translate(error) from error
+            with self.lock:
+                self.refuse_failed()
+                self.log.free(kept)
+                self._mark.set_synced(last)
+
+    def sync_rows(self) -> None:
+        """Bring what was committed to the disk, before anything is removed that it does not name any more.
+
+        Raises:
+            StoreFailed: from now on everything is refused: the WAL is what the journal stands in.
+        """
+        try:
+            self.files.sync_rows()
+        except OSError as error:
+            with self.lock:
+                raise self.translate(error) from error
+
+    def remove_files(self, names: Sequence[str]) -> None:
+        """Remove snapshot files that no row names.
+
+        Raises:
+            StoreFailed: they could not be removed, which is done at the next opening; or as `sync_rows`.
+        """
+        if not names:
+            return
+        self.sync_rows()
+        try:
+            self.files.remove(names)
+        except OSError as error:
+            raise StoreFailed(self.path, f"{error}; snapshot files are left behind") from error
+
+    def refuse_failed(self) -> None:
+        """Raise the failure that ended the store, if there is one."""
+        if self.failure is not None:
+            raise type(self.failure)(*self.failure.args)  # a new one: tracebacks would grow on a shared one
+
+    def refresh(self) -> None:
+        """Make sure that memory and file agree, after a transaction that was broken off."""
+        self.refuse_failed()
+        if monotonic() >= self._look_at:
+            self._look()
+        if self.in_doubt:
+            self.log.is_broken_off = True
+            try:
+                self._scan()
+            except sqlite3.Error as error:
+                raise self.translate(error) from error
+
+    def _look(self) -> None:
+        """See now and then that what is written to is still the store: files that were deleted take writes, too.
+
+        Raises:
+            StoreFailed: it is not; from now on everything is refused.
+        """
+        self._look_at = monotonic() + LOOK_SECONDS
+        lost = self._lost()
+        if lost and self._is_ours():  # Else its new owner has done that, and the write itself says so.
+            self.failure = StoreFailed(self.path, lost)
+            self.refuse_failed()
+
+    def _is_ours(self) -> bool:
+        with contextlib.suppress(sqlite3.Error):
+            return bool(self.db.execute("SELECT epoch FROM store").fetchone() == (self.claim.epoch,))
+        return True
+
+    def _lost(self) -> str:
+        problem = self.parts.lost()
+        return problem and f"{problem}: nothing is acknowledged any more; put the store back, and start again"
+
+    def translate(self, error: sqlite3.Error | OSError) -> HoldfastError:
+        """Our error for theirs; after damage or an I/O error the journal stops for good."""
+        code = result_code(error)
+        # Our statements are fixed: if SQLite finds one in error, the file is no longer what they are for.
+        damaged = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+        translated: HoldfastError
+        if isinstance(error, NoRoom):
+            return StoreFailed(self.path, f"{error}; nothing was written, make room and try again")
+        if isinstance(error, OSError) or code in (sqlite3.SQLITE_IOERR, sqlite3.SQLITE_CANTOPEN):
+            translated = StoreFailed(self.path, f"{error}; open it again, which verifies it")
+        elif code in damaged:
+            translated = DamagedStore(self.path, None, None, str(error))
+        else:
+            hint = {sqlite3.SQLITE_BUSY: "try again", sqlite3.SQLITE_FULL: "make room and try again"}
+            return StoreFailed(self.path, f"{error}; nothing was written, {hint.get(code, 'it cannot be')}")
+        self.failure = self.failure or translated
+        return translated
+
+    def chain(self, address: str) -> Chain:
+        """The chain of an address, made within the running transaction if there is none.
+
+        Raises:
+            DamagedStore: the chain is damaged.
+        """
+        chain = self.chains.get(address)
+        if chain is None:
+            chain = self.chains[address] = create_chain(self.db, address)
+        elif chain.damage is not None:
+            raise DamagedStore(*chain.damage.args)
+        return chain
+
+    @contextlib.contextmanager
+    def view(self, address: str) -> Generator[tuple[Chain, array[int], list[int]] | None, None, None]:
+        """Freeze the file, for the reading connection, at the very state that the memory describes now."""
+        db = self.reader
+        with self.lock:
+            if self.log.rows:
+                with self.transaction():
+                    pass
+            self.refresh()
+            db.execute("BEGIN")
+            (current,) = db.execute("SELECT epoch FROM store").fetchone()
+            chain = self.chains.get(address)
+            view = None if chain is None else (chain, chain.positions[:], chain.kept[:])
+        try:
+            if current != self.claim.epoch:
+                raise StaleEpoch(self.path, self.claim.epoch, current)
+            if chain is not None and chain.damage is not None:
+                raise DamagedStore(*chain.damage.args)
+            yield view
+        finally:
+            db.execute("ROLLBACK")
+
+    # ---- checkpoints
+
+    def _start_checkpoint(self) -> None:
+        if self._checkpointer is None or not self._checkpointer.is_alive():
+            self._unsaved_bytes = 0
+            self._checkpointer = threading.Thread(target=self._checkpoint, name="holdfast-store", daemon=True)
+            self._checkpointer.start()
+
+    def _checkpoint(self) -> None:
+        """Bring the WAL into the database: in a thread, for it syncs twice, which takes milliseconds.
+
+        Writers go on meanwhile, so it seldom finds an end; only a WAL grown too long makes them wait for one.
+        """
+        try:
+            with contextlib.closing(connect(self.path)) as db:
+                _, frames, _ = db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+                if frames > _WAL_FRAMES:
+                    with self.lock:
+                        db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
+        except sqlite3.Error as error:
+            self.translate(error)  # A failed sync stops the journal; a lock in the way does not.

@@ -1,0 +1,169 @@
+"""Who owns the store: one process at a time, told apart by pid and start time, and by an epoch."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import signal
+import sqlite3
+import time
+from collections.abc import Generator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from ..journal import DamagedStore, StoreInUse
+from .database import refuse_broken, refuse_foreign, result_code
+from .row_codec import crc_of
+from .store_parts import Parts, identity_of, lock_holder
+
+_KILL_SECONDS: Final = 10.0
+
+
+class StoreRow(NamedTuple):
+    """The one row of the table `store`."""
+
+    epoch: int
+    pid: int  # of the owner, 0 for none, with its start
+    start: str
+    floor: int  # up to this position there were `live` entries
+    live: int
+
+
+class Claim:
+    """Our claim to be the owner of the store, made through one connection."""
+
+    def __init__(self, db: sqlite3.Connection, parts: Parts) -> None:
+        self._db = db
+        self._parts = parts
+        self.path = parts.path
+        self.epoch = 0
+        self._owner = 0, ""
+
+    def take(self, takeover: bool) -> None:
+        """Become the owner, with a new epoch, unless a living process is.
+
+        Raises:
+            StoreInUse: a living process has the store open, and it may not or cannot be killed.
+            DamagedStore: the file is not ours, or is broken. ForeignStore: what lies beside it is of another store.
+        """
+        deadline = time.monotonic() + _KILL_SECONDS
+        while True:
+            try:
+                refuse_foreign(self._db, self.path)
+                seen = self.read()
+                self._refuse_living(seen.pid, seen.start, takeover)
+                refuse_broken(self._db, self.path)
+                self._parts.compare(identity_of(self._db, self.path))
+                self._parts.lock()
+                if self._write_in(seen):
+                    return
+            except sqlite3.OperationalError as error:
+                if result_code(error) != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
+                    raise
+                # A process that was stopped inside a transaction, or while it opened or closed the store.
+                holder = lock_holder(self.path)
+                if holder is not None and holder != os.getpid():
+                    self._refuse_living(holder, None, takeover)
+                time.sleep(0.01)
+
+    def _refuse_living(self, pid: int, start: str | None, takeover: bool) -> None:
+        """Raise `StoreInUse` if that process lives, or see it dead first if we may."""
+        with living(pid, start) as pidfd:
+            if pidfd is None:
+                return
+            if not takeover or pid == os.getpid():
+                raise StoreInUse(self.path, pid)
+            try:
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+            except PermissionError as error:
+                raise StoreInUse(self.path, pid) from error
+            except ProcessLookupError:
+                pass
+            if not has_ended(pidfd, _KILL_SECONDS):  # It hangs in the kernel, and may still write when it wakes.
+                raise StoreInUse(self.path, pid)
+
+    def _write_in(self, seen: StoreRow) -> bool:
+        """Write ourselves in as the owner, if nobody was quicker."""
+        db = self._db
+        # Synced even under "os": an epoch that was seen outside must not come again after a power loss.
+        db.execute("PRAGMA synchronous = FULL")
+        db.execute("BEGIN IMMEDIATE")
+        try:
+            if self.read() != seen:
+                return False
+            self.epoch = seen.epoch + 1
+            self._owner = os.getpid(), start_of(os.getpid()) or ""
+            self.write(seen.floor, seen.live)
+            db.execute("COMMIT")
+        finally:
+            if db.in_transaction:
+                db.execute("ROLLBACK")
+        return True
+
+    def read(self) -> StoreRow:
+        """The row of the store as it is now.
+
+        Raises:
+            DamagedStore: it is missing or its checksum is wrong.
+        """
+        row = self._db.execute("SELECT epoch, pid, start, floor, live, crc FROM store").fetchone()
+        if row is None or row[5] != crc_of(*row[:5]):
+            raise DamagedStore(self.path, None, None, "the checksum of the store row is wrong")
+        return StoreRow(*row[:5])
+
+    def write(self, floor: int, live: int) -> None:
+        """Bring the row up to date, within a transaction of the caller."""
+        fields = (self.epoch, *self._owner, floor, live)
+        self._db.execute(
+            "UPDATE store SET epoch = ?, pid = ?, start = ?, floor = ?, live = ?, crc = ?", (*fields, crc_of(*fields))
+        )
+
+    def release(self) -> None:
+        """Strike ourselves out as the owner, leaving everything else as it is."""
+        db = self._db
+        db.execute("BEGIN IMMEDIATE")
+        epoch, floor, live = db.execute("SELECT epoch, floor, live FROM store").fetchone()
+        if epoch == self.epoch:
+            self._owner = 0, ""
+            self.write(floor, live)
+        db.execute("COMMIT")
+
+
+def boot_id() -> str:
+    """Identify the time since the machine was started."""
+    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def start_of(pid: int) -> str | None:
+    """Identify one life of a pid: boot and start time in clock ticks; `None` if that cannot be read."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return None
+    return f"{boot_id()}:{fields[19]}"
+
+
+@contextlib.contextmanager
+def living(pid: int, start: str | None) -> Generator[int | None, None, None]:
+    """Hold a pidfd of that very process, or `None` if it is dead. One that may not be looked at counts as alive."""
+    try:
+        pidfd = os.pidfd_open(pid) if pid > 0 else None
+    except ProcessLookupError:
+        pidfd = None
+    if pidfd is None:
+        yield None
+        return
+    try:
+        # The start time is read after the pidfd is held: the pid cannot pass to another process in between.
+        same = start is None or start_of(pid) in (start, None)
+        yield pidfd if same and not has_ended(pidfd, 0.0) else None
+    finally:
+        os.close(pidfd)
+
+
+def has_ended(pidfd: int, seconds: float) -> bool:
+    """Whether the process behind the pidfd is dead, or dies within that time."""
+    poll = select.poll()
+    poll.register(pidfd, select.POLLIN)
+    return bool(poll.poll(seconds * 1000))

@@ -1,0 +1,84 @@
+"""The board for actors: its measurements are a topic, and to switch a channel is a message."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable
+from typing import TypeVar
+
+from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.message import Message, Refusal
+from .client import Board, BoardError
+from .frames import Measurements, Specification
+
+T = TypeVar("T")
+
+TOPIC = "/board_measurements"
+
+
+class BoardMeasured(Message):
+    """What the board measures, and the Unix time at which that came; on `/board_measurements`."""
+
+    time: float
+    measurements: Measurements
+
+
+class SwitchChannel(Message):
+    """Switch a channel, 0 to 9; answered when the board has acknowledged. Refused with BoardFailed."""
+
+    channel: int
+    on: bool
+
+
+class GetSpecification(Message[Specification]):
+    """What is the board? Refused with BoardFailed."""
+
+
+class BoardFailed(Refusal):
+    """The board could not be reached, did not answer, or refused; `kind` is the class of the error."""
+
+    kind: str
+    why: str
+
+
+class BoardActor(Actor):
+    """Holds the connection to a board, also while there is none.
+
+    Args:
+        url: `tcp://host:port`.
+        interval: seconds between two measurements.
+        timeout: seconds for a request; no other is handled meanwhile.
+    """
+
+    deterministic = False
+
+    def __init__(self, url: str, *, interval: float = 1.0, timeout: float = 2.0) -> None:
+        self._url, self._interval, self._timeout = url, interval, timeout
+
+    async def on_start(self, restored: bool) -> None:
+        """Begin to connect; whether there is a board shows later."""
+        self._board = Board(self._url, timeout=self._timeout, broadcast=self._interval, rng=self.ctx.random)
+        entered: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self.ctx.create_task(self._publish(entered))
+        await entered
+
+    async def _publish(self, entered: asyncio.Future[None]) -> None:
+        """Until the life ends; as a task of it, it also ends when the actor is killed."""
+        async with self._board:
+            entered.set_result(None)
+            async for measured in self._board.measurements():
+                await self.ctx.publish(TOPIC, BoardMeasured(self.ctx.now(), measured))
+
+    @on(SwitchChannel)
+    async def _switch(self, message: SwitchChannel) -> None:
+        await self._tried(self._board.switch(message.channel, message.on))
+
+    @on(GetSpecification)
+    async def _specification(self, message: GetSpecification) -> Specification:
+        return await self._tried(self._board.specification())
+
+    async def _tried(self, work: Awaitable[T]) -> T:
+        try:
+            return await work
+        except BoardError as error:
+            raise BoardFailed(kind=type(error).__name__, why=str(error)) from error

@@ -1,0 +1,51 @@
+"""The repairer as a child of a supervision tree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+from ...actors.kernel.actor import Start
+from ...supervision.backoff import Backoff
+from ...supervision.spec import ChildSpec, child
+from ..model import Declaration, Model, System
+from ..planning import Planner
+from .actions import RepairAction, Repertoire
+from .ledger import Memory
+from .policy import NORMAL, Policy
+from .repairer import Repairer
+
+
+def repairer(
+    model: Model | Declaration | System,
+    actions: Repertoire | Iterable[RepairAction],
+    policy: Policy | None = None,
+    *,
+    name: str = "repairer",
+    addresses: Mapping[str, str] | None = None,
+    base: Iterable[str] = (),
+    planner: Planner | None = None,
+    diagnoser: str | None = None,
+    mode: str = NORMAL,
+) -> ChildSpec:
+    """The spec of a repairer, for `tree(..., repairer=...)`.
+
+    What was tried, given up and forbidden, and the mode, outlive its restarts.
+
+    Args:
+        model, actions, policy, addresses, base, planner, diagnoser: see `Repairer`.
+        name: the last part of its address.
+        mode: at first; `SetMode` changes it.
+
+    Raises:
+        ModelError: something is wrong with the model. PlanningError: with the actions.
+    """
+    made = model if isinstance(model, Model) else Model(model)
+    repertoire = actions if isinstance(actions, Repertoire) else Repertoire(actions)
+    options = {
+        "addresses": dict(addresses or {}),
+        "base": tuple(base),
+        "planner": planner,
+        "diagnoser": diagnoser,
+        "memory": Memory(mode=mode),
+    }
+    return child(name, Start(Repairer, (made, repertoire, policy), options), backoff=Backoff(initial=0.1))

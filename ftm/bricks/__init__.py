@@ -1,0 +1,1 @@
+"""Bricks: what mechanisms are made of, and how the bricks of two replicas talk."""

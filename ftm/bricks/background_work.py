@@ -1,0 +1,40 @@
+"""Background work (`pipe_to_self`) of a protected actor: it runs in the process that leads, and is part of no state."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ..events import BackgroundWorkLost
+
+if TYPE_CHECKING:
+    from ...checkpoint.protocol import Out, PipeDone
+    from ..group.group import Group
+
+
+class Background:
+    """What is out of it, as far as the home knows."""
+
+    def __init__(self, group: Group) -> None:
+        self._group = group
+        self._out: set[tuple[int, int]] = set()  # by turn and output
+
+    def note(self, turn: int, outs: list[Out]) -> None:
+        """A turn has begun some."""
+        done = self._group.switch.pipes_done.get(turn, ())
+        self._out.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
+
+    def back(self, record: PipeDone) -> None:
+        """It has an outcome."""
+        self._out.discard((record.turn, record.k))
+
+    def is_lost(self, turn: int | None = None) -> bool:
+        """What turns up to this one (None: all) have begun has ended without an outcome.
+
+        Is it begun again if all is replayed? What is not is told of.
+        """
+        lost = {one for one in self._out if turn is None or one[0] <= turn}
+        self._out -= lost
+        if not lost or self._group.switch.method.replays:
+            return bool(lost)
+        self._group.node.emit(BackgroundWorkLost(self._group.path, self._group.epoch, len(lost)))
+        return False

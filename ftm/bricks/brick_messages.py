@@ -1,0 +1,241 @@
+"""What bricks say to each other: requests in batches, their outcomes, roles, and states that are transferred."""
+
+from __future__ import annotations
+
+import msgspec
+
+from ...actors.kernel.message import Message, Refusal
+from ...checkpoint.protocol import (
+    Closed,
+    Feed,
+    Go,
+    Hooked,
+    Ignored,
+    Live,
+    Outcome,
+    PipeDone,
+    Released,
+    Snapshot,
+    SnapshotNow,
+    TurnEnd,
+    Unsaved,
+)
+from ..replica.state_images import Image, Patch
+
+
+class StaleEpoch(Refusal):
+    """Whoever says this has been replaced: a higher epoch has been seen here."""
+
+    path: str
+    seen: int
+    got: int
+
+
+class ConfigMismatch(Refusal):
+    """The two replicas have different stacks of mechanisms: what one says makes no sense to the other."""
+
+    path: str
+    here: int
+    there: int
+
+
+class NotFollowing(Refusal):
+    """This life has not been told that it follows in this epoch: what was meant for the one before is not for it."""
+
+    path: str
+    seen: int
+    got: int
+
+
+class CannotJoin(Refusal):
+    """This replica cannot be brought to the state of the one that leads."""
+
+    path: str
+    why: str
+
+
+class RequestDropped(Refusal):
+    """A brick of the mechanism has neither passed this request on nor ended it.
+
+    `may_have_run`: a turn was handled whose outcome was lost in the bricks too, and that may be this one.
+    """
+
+    path: str
+    number: int
+    may_have_run: bool = False
+
+
+class ReplyEvicted(Refusal):
+    """The request was handled, but its reply is not kept any more: the reply log is bounded."""
+
+    path: str
+    number: int
+
+
+FORWARDED = -(1 << 40)
+"""A batch with this number or a lower one came from a leader, and home knows nothing of it here.
+
+Each state that a follower takes lowers the number: what was on its way to the one before is known by that.
+"""
+
+
+def marker_of(epoch: int) -> int:
+    """The number of the batch that a new leader sends through its own bricks before any request.
+
+    When it comes out, all that the last leader gave this replica to compute has ended.
+    """
+    return -2 - epoch
+
+
+def is_marker(number: int) -> bool:
+    """Whether a batch is the first one of a new leader."""
+    return FORWARDED < number < -1
+
+
+class CannotLead(Refusal):
+    """This replica does not have the state of the last leader (any more): another one has to lead, or none."""
+
+    path: str
+
+
+class Request(msgspec.Struct, array_like=True, gc=False):
+    """One request: who has sent it, in which life, and its number at the address (A45)."""
+
+    client: str
+    incarnation: int
+    feed: Feed
+
+    @property
+    def number(self) -> int:
+        """It counts the inputs of the address."""
+        return self.feed.id
+
+
+Logged = tuple[str, int, int, TurnEnd]
+"""An entry of the reply log: client, incarnation, number, outcome."""
+
+
+class Work(Message):
+    """A batch of requests on its way in. `copy`: home wants the state behind it too."""
+
+    epoch: int
+    config: int
+    number: int
+    requests: list[Request]
+    go: Go | None = None  # replay is over behind these
+    copy: bool = False
+
+
+class Taken(msgspec.Struct, array_like=True):
+    """The state behind these outcomes is captured, or nobody needs it: go on."""
+
+
+class Strayed(msgspec.Struct, array_like=True, tag=41):
+    """From a leader: the replica at this path has not got our state any more, and does not count."""
+
+    path: str
+
+
+class WorkLost(msgspec.Struct, array_like=True, tag=42):
+    """From a leader: background work that turns up to this one had begun has ended with the life that ran it."""
+
+    turn: int
+
+
+Beside = PipeDone | Snapshot | Unsaved | Closed | Ignored | Hooked | Strayed | WorkLost
+"""What goes home besides the ends of turns, behind them."""
+
+
+class Done(Message[Taken]):
+    """Outcomes on their way out, in turn order: all of a batch, or a part of it. Asked by Proceed, told to the Proxy.
+
+    `more` goes home behind the ends, `live` behind all. `part` counts what Proceed hands over; with `wait` it waits
+    for `Ended` of it.
+    """
+
+    epoch: int
+    config: int
+    number: int
+    ends: list[TurnEnd]
+    is_last: bool
+    live: Live | None = None
+    more: list[Beside] = []  # noqa: RUF012  # a struct copies it
+    part: int = 0
+    wait: bool = False
+
+
+class Inward(Message):
+    """From the home to the life, past the bricks: outcomes of asks, an order for a snapshot."""
+
+    epoch: int
+    records: list[Outcome | SnapshotNow]
+
+
+class Outward(Message):
+    """From the life to the home, past the bricks: what is released in the middle of a turn that is at the front."""
+
+    epoch: int
+    records: list[Released | PipeDone | Snapshot | Unsaved | Ignored | Hooked]
+
+
+class Ended(Message):
+    """The home has the outcomes of part `number` and of all before it. Sent only if a `Done` asks for it."""
+
+    epoch: int
+    number: int
+
+
+class State(msgspec.Struct, array_like=True, tag=1):
+    """The state of the server after turn `turn`, with what belongs to it: `data`, and `deltas` on top of that.
+
+    `live`: it has caught up with its home. Large ones travel in pieces.
+    """
+
+    turn: int
+    data: Image
+    deltas: list[bytes]
+    stash: list[Feed]
+    returned: list[Feed]
+    live: bool
+    stash_ids: list[int] = []
+    traps: bool = False  # `ctx.trap_exits`
+    absent: list[str] = []  # variables that `__init__` has made, and that are no more
+
+
+class Change(msgspec.Struct, array_like=True, tag=2):
+    """What leads from the state after turn `base` to that after `turn`.
+
+    Either `deltas` (with their checksum) on top of those that are there, or, with a `patch`, another image with these.
+    """
+
+    turn: int
+    base: int
+    patch: Patch | None
+    deltas: list[bytes]
+    check: int
+    stash: list[Feed]
+    returned: list[Feed]
+    live: bool
+    stash_ids: list[int] = []
+    traps: bool = False
+    absent: list[str] = []
+
+
+class Lead(Message[int]):
+    """Be primary (leader) from now on; the reply is the turn of the state it goes on from.
+
+    `turn`: the last one that home knows of. Those that are lost (which only a mechanism that does not wait for its
+    backup admits) are not numbered anew. `peer`: a replica that stays a member under this leader.
+    """
+
+    epoch: int
+    config: int
+    turn: int = -1
+    peer: str | None = None
+
+
+class Follow(Message[int]):
+    """Be backup (follower) of this epoch."""
+
+    epoch: int
+    config: int

@@ -1,0 +1,366 @@
+"""Bricks: Before, Proceed and After, as a mechanism's file derives them; what it leaves out passes through.
+
+`work -> Before -> Proceed -> After -> done`, each an actor that is joined to the `next` one by a binding. A mechanism's
+brick sets `before`, `after` or `from_peer`, and may use `ask_peer`, `state`, `leads`, `epoch`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import deque
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import msgspec
+
+from ...actors.errors import HoldfastError
+from ...actors.kernel import lifecycle
+from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.bindings import Binding
+from ...actors.kernel.envelope import ReplyHandle
+from ...actors.kernel.message import Message
+from ...actors.kernel.ref import current
+from ...checkpoint.protocol import DROPPED, MESSAGE, REPLY, Answer, Live, Outcome, Released, Snapshot, TurnEnd
+from .batch_end import sealed
+from .brick_messages import FORWARDED, Done, Ended, Inward, Outward, Request, StaleEpoch, Taken, Work
+from .letters import FOREVER as FOREVER
+from .peer_channel import Inbox, Posting
+
+if TYPE_CHECKING:
+    from ..mechanisms.mechanism import Mechanism
+    from ..replica.standing import Standing
+
+R = TypeVar("R")
+
+
+class Settle(Message[None]):
+    """Answered when all that came before it was handled."""
+
+
+class Flush(Message[None]):
+    """Answered when all that is ready was handed over."""
+
+
+class Abandon(Message[None]):
+    """Drop what is being computed, and what waits to be; answered when nothing is."""
+
+
+class Brick(Posting):
+    """What all bricks have in common."""
+
+    deterministic = False
+
+    next: Binding[Actor]
+    peer: Binding[Actor]
+    state: Binding[Actor]
+
+    def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
+        self._standing, self.mechanism, self.slot = standing, mechanism, slot
+        self._sheets: dict[int, list[bytes]] = {}
+        self._inboxes: dict[int, Inbox] = {}
+        self._numbers = itertools.count(1)
+        self._sending = asyncio.Lock()
+        self._handle: ReplyHandle[Any] | None = None
+
+    @property
+    def leads(self) -> bool:
+        """Whether this replica is the primary (leader)."""
+        return self._standing.leads
+
+    @property
+    def role(self) -> str:
+        """What the mechanism calls this replica's part."""
+        return "" if self.mechanism is None else self.mechanism.role_name(leads=self._standing.leads)
+
+    @property
+    def epoch(self) -> int:
+        """The highest epoch that was seen here."""
+        return self._standing.epoch
+
+    @property
+    def has_peer(self) -> bool:
+        """Whether another replica has all that this one has acknowledged."""
+        return self._standing.peer_state == "live"
+
+    # -- the other replica ------------------------------------------------------------------------------------------
+
+    async def from_peer(self, message: Message[Any]) -> Any:
+        """Take what the same brick of the other replica says; its epoch and configuration are ours."""
+        raise TypeError(f"{type(self).__name__} takes nothing from its peer, and got {type(message).__name__}")
+
+    @on(Settle)
+    def _settle(self, message: Settle) -> None:
+        """All that came before is done."""
+
+    async def drain(self) -> None:
+        """Wait until the other replica has what it was sent, if that is not waited for anyway; nothing new comes."""
+
+    async def answered(self) -> None:
+        """Wait until whoever has asked has the answer."""
+
+    def _refuses(self, epoch: int | None = None) -> bool:
+        """Whether this comes from an earlier epoch, or nothing from here counts any more.
+
+        What the bricks of a replica say to each other is refused for the latter only: a follower that leads from now
+        on has still to compute what the last leader gave it.
+        """
+        standing = self._standing
+        if standing.is_fenced or (epoch is not None and epoch < standing.epoch):
+            standing.refused += 1
+            return True
+        return False
+
+
+class Before(Brick):
+    """What is done with a batch before it is computed; without `before` it passes through."""
+
+    async def before(self, work: Work) -> Work | None:
+        """Prepare a batch. None: none of its requests goes further from here.
+
+        A request that is neither passed on nor ended by `answer` or `refuse` fails, and that is told
+        (`RequestsDropped`).
+        """
+        return work
+
+    def message_of(self, request: Request) -> Any:
+        """The message that a request brings to the protected actor; None if it is something else, such as a timer."""
+        feed, cell = request.feed, self._standing.server.cell
+        if feed.kind != MESSAGE or cell is None:
+            return None
+        return cell.node.codec.message_in(cell, feed.name, feed.body)
+
+    def answer(self, work: Work, request: Request, reply: object) -> Work:
+        """End one request here with this reply; it is computed nowhere. Returns the batch without it."""
+        node = self._standing.node
+        return self._end(work, request, Answer(REPLY, "", node.codec.encode(reply, self._standing.address)))
+
+    def refuse(self, work: Work, request: Request, error: HoldfastError) -> Work:
+        """End one request here: whoever has asked gets the error. Returns the batch without it."""
+        return self._end(work, request, Answer(*self._standing.node.codec.encode_error(error)))
+
+    def _end(self, work: Work, request: Request, answer: Answer) -> Work:
+        standing = self._standing
+        if self.leads:  # Elsewhere, nobody hears of outcomes.
+            end = TurnEnd(-1, request.feed.id, DROPPED, [], answer if request.feed.is_ask else Answer())
+            done = Done(standing.epoch, standing.config, -1, [end], False)
+            standing.node.cell_at(standing.paths["protocol"]).ref.tell(done)
+        return msgspec.structs.replace(work, requests=[one for one in work.requests if one is not request])
+
+    @on(Work)
+    async def _work(self, work: Work) -> None:
+        if self._refuses():
+            return
+        out = await self.before(work)
+        self.next.tell(msgspec.structs.replace(work, requests=[]) if out is None else out)
+
+
+class After(Brick):
+    """What is done with outcomes before they leave; without `after` they pass through."""
+
+    async def after(self, done: Done) -> Done | None:
+        """Make outcomes ready to leave. None: they do not, and their requests have been let fall.
+
+        Proceed goes on when this has returned, or has said `taken()`: the state is not looked at after that.
+        """
+        return done
+
+    def taken(self) -> None:
+        """The state behind these outcomes has been captured, or is not needed: the next turns may run."""
+        if self._handle is not None:
+            self._handle.reply(Taken())
+
+    @on(Done)
+    async def _done(self, done: Done) -> Any:
+        self._handle = handle = self.ctx.reply_handle()
+        if not self._refuses():
+            try:
+                out = await self.after(done)
+                if out is None and self._standing.leads:  # Whoever let the batch in hears that it is over.
+                    out = msgspec.structs.replace(done, ends=[], more=[])
+            except StaleEpoch:
+                out = None  # Another one leads: these outcomes never were.
+            if out is not None:
+                await self.next.ask(out, timeout=FOREVER)
+        handle.reply(Taken())
+        return handle
+
+
+class Proceed(Brick):
+    """Has the protected actor compute: one turn for each request of a batch, one batch after the other (A49)."""
+
+    server: Binding[Actor]
+    out: Binding[Actor]
+
+    def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
+        super().__init__(standing, mechanism, slot)
+        self._works: deque[Work] = deque()
+        self._task: asyncio.Task[None] | None = None
+        self._number = -1
+        self._last, self._last_epoch = -1, -1  # batch that came last
+        self._at_home: asyncio.Future[None] | None = None
+        self._flushes: list[ReplyHandle[None]] = []
+        self._work_now: Work | None = None
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether a batch is being computed, or handed over."""
+        return self._task is not None
+
+    def take_over(self) -> None:
+        """The server reports here from now on. (Not from the start: a brick that is only prepared must not hear it.)"""
+        server = self._standing.server
+        server.on_more = self._go_on
+        server.outward = self._outward
+        server.hand_over = self._hand_over_before
+
+    async def heard(self, outcome: Outcome) -> None:
+        """An ask of the protected actor has an outcome; called before it gets it."""
+
+    # -- batches ----------------------------------------------------------------------------------------------------
+
+    @on(Work)
+    def _take(self, work: Work) -> None:
+        if self._refuses() or self._knows(work):
+            return
+        self._works.append(work)
+        self._go_on()
+
+    def _knows(self, work: Work) -> bool:
+        """Whether this came before (a duplicate on its way here), or was meant for a state that is not here any more.
+
+        To run it again is to do it twice.
+        """
+        if work.number <= FORWARDED:
+            return work.number != self._standing.forwarded_as
+        if work.number < 0:  # A marker.
+            return False
+        is_known = work.number <= self._last and work.epoch == self._last_epoch
+        if is_known:
+            self._standing.refused += 1
+        else:
+            self._last, self._last_epoch = work.number, work.epoch
+        return is_known
+
+    @on(Abandon)
+    def _abandon(self, message: Abandon) -> Any:
+        self._works.clear()
+        if self._work_now is not None:
+            self._standing.server.abandon()
+        return self._flushed()
+
+    @on(Flush)
+    def _flush(self, message: Flush) -> Any:
+        return self._flushed()
+
+    def _flushed(self) -> ReplyHandle[None]:
+        handle: ReplyHandle[None] = self.ctx.reply_handle()
+        self._flushes.append(handle)
+        self._go_on()
+        return handle
+
+    def _go_on(self) -> None:
+        """See to it that what waits is handled. Called from our turns, and from the protected actor's."""
+        if self._task is not None or self.ctx.closed:
+            return
+        cell = self.ctx.cell
+        context = cell.context or lifecycle.open_context(cell)
+        if current.get(None) is self.ctx:
+            self._task = self.ctx.create_task(self._run())
+        else:  # What the task sends must not count as sent by somebody else's turn.
+            self._task = context.run(self.ctx.create_task, self._run())
+
+    async def _run(self) -> None:
+        server = self._standing.server
+        try:
+            while True:
+                if self._works:
+                    self._work_now = self._works.popleft()
+                    await self._batch(self._work_now)
+                elif server.more or server._snapshot_wanted:
+                    more = server.take_more()
+                    if not more:
+                        break  # A snapshot that has to wait.
+                    await self._pass(Done(self.epoch, self._standing.config, self._number, [], False, None, more))
+                else:
+                    break
+        finally:
+            self._task = self._work_now = None
+            flushes, self._flushes = self._flushes, []
+            for handle in flushes:
+                handle.reply(None)
+
+    async def _batch(self, work: Work) -> None:
+        server = self._standing.server
+        self._number = work.number
+        if work.number >= 0 and self.leads:
+            server.confirmed = server.handed  # It is sent when home has all that came before.
+        pending = deque(work.requests)
+        while True:
+            ends = await server.part(pending)
+            is_last = not pending or server.is_over
+            live = None
+            if is_last and work.go is not None:
+                is_live = server.life is not None and server.life.is_live
+                live = Live(0.0) if is_live else await server.go(work.go)
+            ends = await sealed(server, ends, pending)
+            if pending and not server.is_over:  # Some of it has to be run again.
+                is_last, live = False, None
+            waits = not is_last and self.leads and server.runs_alone(pending[0])
+            await self._hand(ends, is_last=is_last, live=live, wait=waits)
+            if is_last:
+                return
+
+    async def _hand_over_before(self, ends: list[TurnEnd], wait: bool) -> None:
+        """A turn in hand has to wait until home has what came before it."""
+        await self._hand(ends, is_last=False, live=None, wait=wait)
+
+    async def _hand(self, ends: list[TurnEnd], *, is_last: bool, live: Live | None, wait: bool) -> None:
+        server, standing = self._standing.server, self._standing
+        server.handed = part = server.handed + 1
+        more = server.take_more()
+        while len(more) > 1 and any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more):
+            first, more = more[:1], more[1:]
+            await self._pass(Done(standing.epoch, standing.config, self._number, ends, False, None, first))
+            ends = []
+        done = Done(standing.epoch, standing.config, self._number, ends, is_last, live, more, part, wait)
+        if wait:
+            self._at_home = standing.node.loop.create_future()
+        await self._pass(done)
+        if self._at_home is not None:
+            await self._at_home
+            self._at_home = None
+
+    async def _pass(self, done: Done) -> None:
+        while True:
+            try:
+                await self.next.ask(done, timeout=FOREVER)
+            except HoldfastError:  # It was exchanged in between: the one that is bound now gets it.
+                await asyncio.sleep(0)
+                continue
+            return
+
+    # -- past the bricks --------------------------------------------------------------------------------------------
+
+    @on(Ended)
+    def _ended(self, message: Ended) -> None:
+        server = self._standing.server
+        if self._refuses(message.epoch):
+            return
+        server.confirmed = max(server.confirmed, min(message.number, server.handed))
+        if self._at_home is not None and server.confirmed >= server.handed and not self._at_home.done():
+            self._at_home.set_result(None)
+
+    @on(Inward)
+    async def _inward(self, message: Inward) -> None:
+        if self._refuses(message.epoch):
+            return
+        for record in message.records:
+            if isinstance(record, Outcome):
+                await self.heard(record)
+            self._standing.server.inward(record)
+
+    def _outward(self, record: Released) -> None:
+        standing = self._standing
+        if standing.leads and not standing.is_fenced:
+            # Called in the protected actor's turn: a plain `tell` would be taken for one of its own.
+            self.ctx.tell(self.out._cell, Outward(standing.epoch, [record]))

@@ -1,0 +1,163 @@
+"""Letters: what bricks of two replicas say to each other, and how over a secured link."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterator
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from ...actors.errors import AskTimeout, HoldfastError
+from ...actors.kernel.actor import Actor
+from ...actors.kernel.envelope import ReplyHandle
+from ...actors.kernel.message import Message, Refusal, message_name
+from ...actors.kernel.ref import ActorRef
+from ...checkpoint.protocol import pieces
+from ..replica.standing import PeerLost
+from .brick_messages import NotFollowing, StaleEpoch
+from .sealed_frames import Back, Call, LinkLost, Part, Refused, Sealed
+
+if TYPE_CHECKING:
+    from ..replica.standing import Standing
+    from .sealed_frames import SecuredLink
+
+
+FOREVER = 10.0 * 86400.0
+"""Seconds: the bricks of one replica wait for each other as long as it takes; a death is told otherwise."""
+SEALED = "sealed"
+"""The name of a letter that says it inside."""
+LETTER_BYTES = 8 * 1024 * 1024
+"""What is said to the other replica in one message; more goes in sheets."""
+
+
+class Letter(Message[bytes]):
+    """What a brick says to the same brick of the other replica; sheets with its number come before it."""
+
+    epoch: int
+    config: int
+    name: str
+    body: bytes
+    sheets: int = 0
+    size: int = 0  # of the body, sheets and all
+    stream: int = 0
+    number: int = 0  # in the stream
+    floor: int = 0  # of those before it, none is asked again
+
+
+class Sheet(Message):
+    """A piece of a letter that is too large for one message."""
+
+    sheets: int
+    data: bytes
+
+
+class Letters(Actor):
+    """Opens sealed letters, and seals what is answered."""
+
+    _is_part: ClassVar[bool] = True
+
+    peer_messages: ClassVar[tuple[type[Message[Any]], ...]] = ()
+    """What `from_peer` understands."""
+    answers_later: ClassVar[bool] = False
+    """Whether other messages are handled while `from_peer` waits for something."""
+    follows_at_once: ClassVar[bool] = False
+    """Whether a follower takes what the next leader says before it is told of it: it says itself what it builds on."""
+
+    slot: str
+    _standing: Standing
+    _numbers: Iterator[int]
+
+    async def from_peer(self, message: Message[Any]) -> Any:
+        """Take what the same brick of the other replica says."""
+        raise NotImplementedError
+
+    def _check_sender(self, epoch: int, config: int) -> None:
+        """Refuse what an earlier leader says, and, as a rule, what one says of whom we were not told.
+
+        Raises:
+            StaleEpoch, ConfigMismatch, NotFollowing.
+        """
+        standing = self._standing
+        standing.check(epoch, config)
+        if epoch > standing.epoch:
+            follows = standing.epoch >= 0 and not standing.leads and not standing.is_fenced
+            if not (follows and self.follows_at_once):
+                raise NotFollowing(standing.path, standing.epoch, epoch)
+            standing.epoch = epoch
+
+    async def _ask_sealed(
+        self,
+        link: SecuredLink,
+        path: str,
+        slot: str,
+        part: Part,
+        find: Callable[[], Awaitable[ActorRef[Any]]],
+        failed: Callable[[HoldfastError], None],
+        still: Callable[[], bool],
+    ) -> bytes:
+        """Ask a brick over a secured link, which does again what has to be; `failed` hears when it is not there.
+
+        Raises:
+            PeerLost: nobody waits any longer. What the brick has raised.
+        """
+        standing = self._standing
+
+        async def reach(said: Message[Any], seconds: float) -> Any:
+            if not still():
+                raise PeerLost("it does not count any more")
+            try:
+                if not isinstance(said, Sealed):
+                    ref, out = standing.node.cell_at(f"{path}/protocol").ref, said
+                else:
+                    ref = await find()
+                    out = self._sheets_of(ref, said.frame)
+                return await standing.wait_for(ref.ask(out, timeout=seconds))
+            except (PeerLost, AskTimeout, Refused):
+                raise
+            except HoldfastError as error:  # It has died, which we shall be told, or its brick was exchanged.
+                failed(error)
+                raise
+
+        try:
+            back = await link.call(path, slot, part, reach, still, standing.epoch, standing.config)
+        except LinkLost:
+            raise PeerLost("it was replaced, or is gone") from None
+        if back.kind == "reply":
+            return back.body
+        error = standing.node.codec.decode_error(back.kind, back.name, back.body)
+        if isinstance(error, StaleEpoch):
+            standing.fence()
+        raise error
+
+    def _sheets_of(self, ref: ActorRef[Any], frame: bytes) -> Letter:
+        number = 0
+        if len(frame) > LETTER_BYTES:
+            number = next(self._numbers)
+            for part in pieces(frame):
+                ref.tell(Sheet(number, part))
+            frame = b""
+        return Letter(-1, -1, SEALED, frame, number)
+
+    async def _take_sealed(self, link: SecuredLink, frame: bytes) -> bytes | ReplyHandle[bytes]:
+        if not self.answers_later:
+            return await link.take(frame, self._read)
+        handle: ReplyHandle[bytes] = self.ctx.reply_handle()
+        self.ctx.create_task(self._answer_sealed(handle, link, frame))
+        return handle
+
+    async def _answer_sealed(self, handle: ReplyHandle[bytes], link: SecuredLink, frame: bytes) -> None:
+        try:
+            handle.reply(await link.take(frame, self._read))
+        except Refusal as no:
+            handle.fail(no)
+
+    async def _read(self, call: Call) -> Back:
+        """What was in a sealed letter."""
+        codec = self._standing.node.codec
+        try:
+            self._check_sender(call.epoch, call.config)
+            kind = next((one for one in self.peer_messages if message_name(one) == call.parts[0].name), None)
+            if kind is None or call.stream != self.slot:
+                raise Refused(path=self.ctx.path, reason="malformed")
+            reply = await self.from_peer(codec.decode(kind, call.parts[0].body))
+        except Refusal as no:
+            return Back(*codec.encode_error(no))
+        return Back("reply", "", codec.encode(reply, self.ctx.path))

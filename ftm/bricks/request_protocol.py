@@ -1,0 +1,507 @@
+"""RequestProtocol: the entry of a replica. One batch at a time inside, duplicates from the reply log, epochs checked.
+
+Everything the root says to a replica comes here. Between two batches, with nothing inside, another replica is brought
+to our state, or the state is given out.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from collections.abc import Awaitable, Coroutine
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ...actors.errors import ActorStopped, AskTimeout, HoldfastError
+from ...actors.exit_reasons import unpack_exit
+from ...actors.kernel.actor import on
+from ...actors.kernel.bindings import Binding
+from ...actors.kernel.envelope import ReplyHandle
+from ...actors.kernel.message import Message, message_name
+from ...checkpoint.protocol import DROPPED, Answer, TurnEnd
+from ...checkpoint.snapshot.key_variables import save_state
+from ..alarms import RequestsDropped
+from ..replica.replica_orders import (
+    Abort,
+    Commit,
+    Computes,
+    Doing,
+    EndTurn,
+    Export,
+    Exported,
+    Finish,
+    Install,
+    Join,
+    Peer,
+    Prepare,
+    Quiesce,
+    Rehearse,
+    Stand,
+)
+from ..replica.state_images import image_from
+from .brick_messages import (
+    CannotLead,
+    ConfigMismatch,
+    Done,
+    Ended,
+    Follow,
+    Inward,
+    Lead,
+    ReplyEvicted,
+    Request,
+    RequestDropped,
+    State,
+    Taken,
+    Work,
+    marker_of,
+)
+from .bricks import FOREVER, Brick, Flush, Proceed, Settle
+from .peer_channel import Where
+from .sealed_frames import Opened, Refused
+from .state_transfer import Assume, Play, Transfer
+
+if TYPE_CHECKING:
+    from ...actors.kernel.actor import Actor
+    from ..mechanisms.mechanism import Mechanism
+    from ..replica.standing import Standing
+
+
+CANARY = -1
+"""The number of a batch without requests that only shows whether all bricks let it pass."""
+
+
+class InnerProtocol(Brick):
+    """Where an inner layer begins and ends: its entry for the outer Before, and its exit to the outer After (A64)."""
+
+    before: Binding[Actor]
+
+    @on(Work)
+    def _work(self, work: Work) -> None:
+        if not self._refuses():
+            self.before.tell(work)
+
+    @on(Done)
+    async def _done(self, done: Done) -> Taken:
+        return await self.next.ask(done, timeout=FOREVER)
+
+
+class RequestProtocol(Transfer):
+    """The entry and exit of a replica; `next` is the Proxy."""
+
+    before: Binding[Actor]
+
+    def __init__(self, standing: Standing, mechanism: Mechanism | None, slot: str) -> None:
+        super().__init__(standing, mechanism, slot)
+        self._held: deque[Work] = deque()
+        self._current: int | None = None  # the batch that is inside
+        self._holds = 0  # who wants nothing to go in
+        self._idle: list[asyncio.Future[None]] = []
+        self._pieces: list[bytes] = []
+        self._lock = asyncio.Lock()
+        self._marker: int | None = None  # what the last leader gave us to compute is over when this comes back
+        self._least = -1  # the turn after which we go on, if those up to it have left nothing here
+        self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
+        self._later: list[Any] = []  # what goes home behind that
+        self._turn = -1  # the last one before the batch that is inside
+        self._came_out = 0  # turns of it that have come out of the bricks
+        self._copies = False  # home gets the state behind it
+        self._behind: tuple[list[TurnEnd], list[Any]] = [], []  # what goes home with that
+        self.paths: dict[str, str] = {}
+
+    # -- requests ---------------------------------------------------------------------------------------------------
+
+    @on(Work)
+    def _work(self, work: Work) -> None:
+        standing = self._standing
+        if not self._admits():
+            return
+        if work.epoch != standing.epoch or work.config != standing.config or not standing.leads or standing.is_fenced:
+            standing.refused += 1
+            return
+        self._held.append(work)
+        self._go_on()
+        if self._wanted is not None:
+            self._flush_known(self._wanted)
+
+    def _go_on(self) -> None:
+        while self._held and self._current is None and not self._holds:
+            self._begin(self._held.popleft())
+        if self._current is None:
+            idle, self._idle = self._idle, []
+            for one in idle:
+                if not one.done():
+                    one.set_result(None)
+
+    def _begin(self, work: Work) -> None:
+        known, left = self._split(work)
+        goes_in = bool(left) or work.go is not None
+        if known or self._later or not goes_in:
+            more, self._later = self._later, []
+            if work.copy and not goes_in:
+                more += self._standing.server.copied()
+            self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in, None, more))
+        if goes_in:
+            self._standing.inside.update((one.feed.id, one) for one in left)
+            self._current, self._copies = work.number, work.copy
+            self._turn, self._came_out, self._behind = self._standing.server.turn, 0, ([], [])
+            self.before.tell(Work(work.epoch, work.config, work.number, left, work.go))
+
+    def _split(self, work: Work) -> tuple[list[TurnEnd], list[Request]]:
+        """The outcomes that are known, in turn order, and the requests that were never handled."""
+        standing, left, known = self._standing, list[Request](), list[TurnEnd]()
+        log = standing.log
+        for request in work.requests:
+            number = request.feed.id
+            end = log.find(number)
+            if end is not None:
+                log.duplicates += 1
+                known.append(end)
+            elif request.feed.turn < 0 and log.was_evicted(number):
+                error = ReplyEvicted(path=standing.address, number=number)
+                answer = Answer(*standing.node.codec.encode_error(error))
+                known.append(TurnEnd(-1, number, DROPPED, [], answer))
+            else:
+                left.append(request)
+        known.sort(key=lambda end: end.turn)
+        return known, left
+
+    @on(Done)
+    def _done(self, done: Done) -> Taken:
+        standing = self._standing
+        if self._refuses():
+            return Taken()
+        standing.log.add(standing.entries(done.ends))
+        for end in done.ends:
+            standing.inside.pop(end.id, None)
+        if self._marker is not None:
+            self._drained(done)
+        elif standing.leads:
+            if done.epoch != standing.epoch:
+                done = msgspec.structs.replace(done, epoch=standing.epoch)
+            self._came_out += len({end.turn for end in done.ends if end.turn > self._turn})
+            self._leave(done)
+        if done.is_last and done.number == self._current:
+            self._current = None
+            if standing.leads and done.number >= 0 and not standing.server.is_over:
+                dropped = [number for number, one in standing.inside.items() if not standing.server.has_taken(one)]
+                if dropped:
+                    self._end_dropped(done, dropped)
+            standing.inside.clear()
+            self._go_on()
+        return Taken()
+
+    def _leave(self, done: Done) -> None:
+        """Outcomes go home; with the state behind them if home wants it, which is only there when no turn is run."""
+        if self._copies and done.number == self._current:
+            ends, more = self._behind
+            ends += done.ends
+            more += done.more
+            if not (done.is_last or done.wait):
+                return
+            self._behind = [], []
+            done = msgspec.structs.replace(done, ends=ends, more=[*more, *self._standing.server.copied()])
+        self.next.tell(done)
+
+    def _end_dropped(self, done: Done, numbers: list[int]) -> None:
+        """The batch is over, and these requests have no end: a brick has let them fall."""
+        standing = self._standing
+        may_have_run = standing.server.turn - self._turn > self._came_out
+        standing.node.emit(RequestsDropped(standing.address, standing.path, ", ".join(map(str, numbers))))
+        ends = list[TurnEnd]()
+        for number in numbers:
+            error = RequestDropped(path=standing.path, number=number, may_have_run=may_have_run)
+            ends.append(TurnEnd(-1, number, DROPPED, [], Answer(*standing.node.codec.encode_error(error))))
+        self.next.tell(Done(standing.epoch, done.config, -1, ends, False))
+
+    def _drained(self, done: Done) -> None:
+        """An outcome of what the last leader gave us: home gets it, in its order, when it asks for it again."""
+        self._later += done.more
+        if done.number == self._marker:
+            self._marker = self._wanted = None
+            if self._standing.server.turn < self._least:
+                self._standing.server.skip_to(self._least)
+        elif done.wait:
+            self._flush_known(done.part)
+
+    def _flush_known(self, part: int) -> None:
+        """A turn waits until home has all that came before it: that is what home asks for again and we know."""
+        self._wanted = part
+        while self._held:
+            work = self._held.popleft()
+            known, left = self._split(work)
+            waits = bool(left)
+            if known or not waits:
+                done = Done(work.epoch, work.config, work.number, known, not waits, None, [], part, waits)
+                self.next.tell(done)
+            if waits:
+                self._held.appendleft(msgspec.structs.replace(work, requests=left))
+                self._wanted = None
+                if not known:
+                    self.proceed.tell(Ended(self._standing.epoch, part))
+                return
+
+    @on(Inward)
+    def _inward(self, message: Inward) -> None:
+        if self._admits():
+            self.proceed.tell(message)
+
+    @on(Ended)
+    def _ended(self, message: Ended) -> None:
+        if self._admits():
+            self.proceed.tell(message)
+
+    # -- orders -----------------------------------------------------------------------------------------------------
+
+    def _answer(self, work: Coroutine[Any, Any, Any]) -> ReplyHandle[Any]:
+        """Answer when the work is done; the bricks may need us meanwhile. One such work at a time."""
+        handle = self.ctx.reply_handle()
+        task = self.ctx.create_task(self._answered(handle, work))
+        task.add_done_callback(lambda done: work.close())  # We may end before it has begun.
+        return handle
+
+    async def _answered(self, handle: ReplyHandle[Any], work: Awaitable[Any]) -> None:
+        async with self._lock:
+            try:
+                handle.reply(await work)
+            except HoldfastError as error:
+                handle.fail(error)
+            except BaseException:
+                handle.fail(ActorStopped(self._standing.path))  # We end: nobody must wait for us.
+                raise
+
+    async def _quiet(self) -> None:
+        """Wait until nothing is inside, or another epoch has begun. Whoever calls has raised `_holds`."""
+        while self._current is not None:
+            idle: asyncio.Future[None] = self._standing.node.loop.create_future()
+            self._idle.append(idle)
+            await idle
+
+    def _check(self, epoch: int, config: int | None = None) -> None:
+        standing = self._standing
+        if not self._admits():
+            raise Refused(path=standing.path, reason="plain")
+        standing.check(epoch, config)
+        standing.epoch = epoch
+
+    @on(Install)
+    def _install(self, message: Install) -> Any:
+        self._check(message.epoch)
+        return self._answer(self._installed(message))
+
+    async def _installed(self, message: Install) -> None:
+        self._pieces.append(message.data)
+        if message.is_last:
+            data, self._pieces = b"".join(self._pieces), []
+            server = self._standing.server
+            await server.drop_life()
+            server.install(State(message.turn, image_from(data), [], [], [], False, message.stash, message.traps))
+            self._standing.log.replace(message.log)
+
+    @on(Lead)
+    def _lead(self, message: Lead) -> Any:
+        self._check(message.epoch, message.config)
+        if self._standing.leads and self._standing.leading != message.epoch:
+            # The bricks have kept what was inside, and are others now: it is asked for again. Whoever waits for its
+            # end was told so in another epoch.
+            self._current = self._marker = None
+            self._go_on()
+        return self._answer(self._begin_to_lead(message))
+
+    async def _begin_to_lead(self, order: Lead) -> int:
+        standing, server, epoch = self._standing, self._standing.server, order.epoch
+        if standing.leads and standing.leading == epoch:
+            return server.turn
+        if standing.follows and not standing.is_ready:  # It has diverged, or was never brought to the leader's state.
+            raise CannotLead(path=standing.path)
+        standing.set_peer(order.peer, "live")
+        standing.is_fenced = standing.follows = False
+        standing.ready()
+        # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
+        self._current = self._marker = marker = marker_of(epoch)
+        self._least = order.turn
+        await self._order(Assume(True))
+        standing.leading = epoch
+        self.before.tell(Work(epoch, standing.config, marker, []))
+        server.lead()
+        return server.turn
+
+    @on(Follow)
+    def _follow(self, message: Follow) -> Any:
+        self._check(message.epoch, message.config)
+        return self._answer(self._begin_to_follow())
+
+    async def _begin_to_follow(self) -> int:
+        standing = self._standing
+        standing.set_peer(None, "none")
+        standing.is_fenced, standing.leading, standing.follows = False, -1, True
+        self._held.clear()
+        self._current = self._marker = self._wanted = None
+        standing.inside.clear()
+        standing.unready()
+        await self._order(Assume(False))
+        return standing.server.turn
+
+    def _order(self, message: Message[Any]) -> asyncio.Future[Any]:
+        """Have the replica do it, which obeys us alone."""
+        parent = self.ctx.cell.parent
+        assert parent is not None
+        return parent.ref.ask(Opened(self._standing.put_opened(message)), timeout=FOREVER)
+
+    @on(Prepare)
+    def _prepare(self, message: Prepare) -> Any:
+        return self._passed_on(message)
+
+    @on(Commit)
+    def _commit(self, message: Commit) -> Any:
+        # What was done already changes nothing, whichever way the order has come this time.
+        return self._passed_on(message, changes=message.config != self._standing.config)
+
+    @on(Abort)
+    def _abort(self, message: Abort) -> Any:
+        return self._passed_on(message)
+
+    def _passed_on(self, message: Message[Any], *, changes: bool = True) -> ReplyHandle[Any]:
+        """To the replica; not in line with other orders, nor with what else comes: the bricks may need us meanwhile."""
+        if changes and not self._admits():
+            raise Refused(path=self._standing.path, reason="plain")
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._passed(handle, self._order(message)))
+        return handle
+
+    @on(Where)
+    def _where(self, message: Where) -> str:
+        self._standing.check(self._standing.epoch, message.config)
+        path = self._standing.paths.get(message.slot)
+        if path is None:
+            raise ConfigMismatch(self._standing.path, self._standing.config, message.config)
+        return path
+
+    @on(EndTurn)
+    def _end_turn(self, message: EndTurn) -> None:
+        self._check(message.epoch)
+        self._standing.server.end_turn(message.number, again=message.again)
+
+    # -- the state --------------------------------------------------------------------------------------------------
+
+    @on(Export)
+    def _export(self, message: Export) -> Any:
+        self._check(message.epoch)
+        return self._answer(self._give_out())
+
+    async def _give_out(self) -> Exported:
+        epoch = self._standing.epoch
+        self._holds += 1
+        try:
+            await self._quiet()
+            self._standing.check(epoch)
+            server = self._standing.server
+            await server.ensure()
+            await server.until_work_is_back()
+            await self.proceed.ask(Flush(), timeout=FOREVER)  # What has come of it goes home first.
+            life = server.life
+            assert life is not None
+            assert life.cell.actor is not None
+            stash = [fed.feed.id for fed in life.stash]
+            return Exported(life.turn, save_state(life.cell.actor), stash, life.cell.extra().trap_exits)
+        finally:
+            self._holds -= 1
+            self._go_on()
+
+    @on(Quiesce)
+    def _quiesce(self, message: Quiesce) -> Any:
+        self._check(message.epoch, message.config)
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(
+            self._come_to_rest(handle, message)
+        )  # Not in line with other orders: one of them may unblock it.
+        return handle
+
+    async def _come_to_rest(self, handle: ReplyHandle[Any], message: Quiesce) -> None:
+        standing = self._standing
+        self._holds += 1
+        try:
+            await self._quiet()
+            await self.proceed.ask(Flush(), timeout=FOREVER)
+            await self._drain_bricks()
+            handle.reply(Stand(standing.epoch, standing.config, standing.server.turn, standing.leads))
+        except HoldfastError as error:
+            handle.fail(error)
+        finally:
+            self._holds -= 1
+            self._go_on()
+
+    @on(Computes)
+    def _computes(self, message: Computes) -> Any:
+        if self._standing.leads:
+            return self._doing(message)
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._follows(handle, message))
+        return handle
+
+    async def _follows(self, handle: ReplyHandle[Any], message: Computes) -> None:
+        """Bricks of one that does not lead wait for nobody: what has come to them is handled soon."""
+        node, paths = self._standing.node, self._standing.paths
+        bricks = [path for slot, path in paths.items() if slot.endswith((".before", ".after"))]
+        asked = [node.cell_at(path).ref.ask(Settle(), timeout=message.seconds) for path in bricks]
+        found = await asyncio.gather(*asked, return_exceptions=True)
+        passes = not any(isinstance(one, AskTimeout) for one in found)
+        handle.reply(msgspec.structs.replace(self._doing(message), passes=passes))
+
+    def _doing(self, message: Computes) -> Doing:
+        standing = self._standing
+        servers = (standing.server, *standing.shadows)
+        computes = any(one.life is not None and one.life.feed is not None for one in servers)
+        proceed = self.proceed._cell.actor
+        hands_over = isinstance(proceed, Proceed) and proceed.is_at_work  # It hands it to whoever comes after.
+        return Doing(computes, hands_over or standing.server.turn <= message.turn)
+
+    @on(Rehearse)
+    def _rehearse(self, message: Rehearse) -> Any:
+        if self._standing.epoch >= 0:  # It has a part: whoever says this, plain, must not take it from there.
+            raise Refused(path=self._standing.path, reason="plain")
+        return self._answer(self._rehearsed(message))
+
+    async def _rehearsed(self, message: Rehearse) -> None:
+        """Whatever a brick does wrong when it starts, or when a batch comes, it does here, where it hurts nobody."""
+        standing = self._standing
+        await self._order(Play(message.leads, message.is_new))
+        self._current = self._marker = CANARY
+        self.before.tell(Work(standing.epoch, standing.config, CANARY, []))
+        await self._quiet()
+
+    @on(Finish)
+    def _finish(self, message: Finish) -> Any:
+        self._check(message.epoch)
+        return self._answer(self._end(message.reason))
+
+    async def _end(self, reason: dict[str, Any]) -> None:
+        self._holds += 1
+        server = self._standing.server
+        if server.life is not None and server.cell is not None:
+            gone = server.cell.ended()
+            server.finish(unpack_exit(reason))
+            await gone
+        await self.proceed.ask(Flush(), timeout=FOREVER)
+
+
+RequestProtocol.handlers = {
+    Work: "_work",
+    Inward: "_inward",
+    Ended: "_ended",
+    Install: "_install",
+    Lead: "_lead",
+    Follow: "_follow",
+    Peer: "_peer",
+    EndTurn: "_end_turn",
+    Prepare: "_prepare",
+    Commit: "_commit",
+    Abort: "_abort",
+    Join: "_join",
+    Export: "_export",
+    Quiesce: "_quiesce",
+    Computes: "_computes",
+    Rehearse: "_rehearse",
+    Finish: "_finish",
+}
+OPENED = {message_name(kind): kind for kind in RequestProtocol.handlers}

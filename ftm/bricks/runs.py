@@ -1,0 +1,403 @@
+"""Runs: what a batch comes to when it is computed once more, from the same state, by another version or replica.
+
+A shadow is a second life of the protected actor in a replica: what it computes is compared, and leaves only if the
+replica that leads takes it over.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+from collections import deque
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
+
+import msgspec
+
+from ...actors.errors import HoldfastError, type_name
+from ...actors.exit_reasons import SHUTDOWN, ExitReason
+from ...actors.kernel import lifecycle
+from ...actors.kernel.actor import Actor, Start
+from ...actors.kernel.cell import Cell
+from ...actors.values import decode_value, state_digest
+from ...checkpoint.protocol import AWAITED, CRASH, DROPPED, FAILED, Answer, Outcome, TurnEnd
+from ...supervision.spec import child
+from ..replica.protected_actor import Server
+from ..replica.replica_life import ServerLife
+from .brick_messages import Beside, Done, Request, State, Work
+from .bricks import After, Before
+from .canonical import canonical, end_form
+from .voters import Agreed, AnyVoter, Undecided, _decide
+
+if TYPE_CHECKING:
+    from ..replica.standing import Standing
+    from ..replica.state_images import Image
+
+_NUMBERS: Final = itertools.count(1)
+MOST_INPUTS: Final = 4096
+"""Requests that are remembered: more than can be inside a replica."""
+
+
+class Run(msgspec.Struct):
+    """What requests have come to: how turns ended, what they let out in their middle, and the state they have left."""
+
+    ends: list[TurnEnd]
+    released: list[tuple[int, list[int]]]
+    state: State | None
+    digest: bytes = b""  # of the state, where that has stayed where it is
+    objections: list[tuple[int, str]] = []
+
+    @property
+    def objection(self) -> str:
+        """What is against it; "" if nothing."""
+        return "; ".join(dict.fromkeys(why for _, why in self.objections))
+
+
+class Missing(msgspec.Struct):
+    """Instead of a run: nobody has computed it, or it came to no end."""
+
+    why: str
+
+
+def plain(run: Run, *, with_state: bool = True) -> tuple[Any, ...]:
+    """What two runs have to have in common to be equal, as it is: cheap to compare."""
+    released = dict(run.released)
+    ends = [
+        (
+            end.id,
+            end.turn,
+            end.status,
+            end.answer.kind,
+            end.answer.name,
+            b"" if end.answer.kind == CRASH else end.answer.body,  # A traceback tells where it stood.
+            (*released.get(end.turn, ()), *(out.digest() for out in end.outs)),
+        )
+        for end in run.ends
+    ]
+    if not with_state:
+        return (ends,)
+    if run.state is None:
+        return ends, run.digest
+    state = run.state
+    return ends, state.turn, state.data, state.deltas, [feed.id for feed in state.stash]
+
+
+def form(run: Run, *, with_state: bool = True) -> Any:
+    """The canonical form of a run: ("run", ends, what was released, state)."""
+    ends = ("list", *(end_form(end, with_state=False) for end in run.ends))
+    released = ("list", *(f"{turn}: {digests}" for turn, digests in run.released))
+    if not with_state:
+        return ("run", ends, released, "")
+    if run.state is None:
+        return ("run", ends, released, run.digest)
+    return ("run", ends, released, state_form(run.state))
+
+
+def state_form(state: State) -> Any:
+    """The canonical form of a state."""
+    saved = state.data.value()
+    stash = ("list", *(f"{feed.id}" for feed in state.stash))
+    return ("state", f"{state.turn}", canonical(saved), canonical(list(map(decode_value, state.deltas))), stash)
+
+
+def digest_of_state(state: State) -> bytes:
+    """A digest of a state; the order of sets and dicts does not count. See `Digests`, if it is one of many."""
+    return Digests().of(state)
+
+
+class Digests:
+    """Takes digests of states that follow each other: of what was there the last time, only deltas that are new count.
+
+    The digest is a chain: that of the whole state, then that of each delta on top of it. So replicas that have come to
+    the same state in the same steps come to the same digest, and an actor with `get_delta` pays for what has changed.
+    """
+
+    def __init__(self) -> None:
+        self._data: Image | None = None
+        self._deltas: list[bytes] = []
+        self._chain = b""
+
+    def of(self, state: State) -> bytes:
+        """The digest of one state."""
+        known = len(self._deltas)
+        if state.data is not self._data or state.deltas[:known] != self._deltas:
+            saved = state.data.value()
+            if saved is not None and type(saved[2]) is dict and all(type(name) is str for name in saved[2]):
+                saved = (*saved[:2], sorted(saved[2].items()))  # Large and small ones have their own order in an image.
+            self._data, self._chain, known = state.data, state_digest(saved), 0
+        for delta in state.deltas[known:]:
+            self._chain = state_digest([self._chain, decode_value(delta)])
+        self._deltas = state.deltas
+        return state_digest([state.turn, [feed.id for feed in state.stash], self._chain])
+
+
+def vote(voter: AnyVoter, runs: Sequence[Run | None], *, with_state: bool = True) -> Agreed[Run] | Undecided:
+    """Vote on runs; None is one that is missing."""
+    rows = [None if run is None else plain(run, with_state=with_state) for run in runs]
+    first = runs[0]
+    if first is not None and all(row == rows[0] for row in rows):
+        return Agreed(first, 0, tuple(range(len(runs))))
+    decided = _decide(voter, runs, lambda run: form(run, with_state=with_state))
+    if isinstance(decided, Agreed) and decided.choice is None:
+        return Undecided("no run has come to what is in the middle")
+    return decided
+
+
+def turns_of(runs: Sequence[Run | None]) -> str:
+    """The turns that have not ended alike in all runs, as text; the last one, if only the states differ."""
+    rows = [plain(run, with_state=False)[0] for run in runs if run is not None]
+    found = sorted({row[0][1] for row in zip(*rows, strict=False) if any(one != row[0] for one in row)})
+    last = max((run.ends[-1].turn for run in runs if run is not None and run.ends), default=-1)
+    return ", ".join(map(str, found or [last]))
+
+
+# -- shadows ---------------------------------------------------------------------------------------------------------
+
+
+class Shadow(Server):
+    """A second life of the protected actor, maybe of another class with the same state: it only computes.
+
+    Its asks get the outcomes that the first run had; one that the first run has not made ends the run.
+    """
+
+    def __init__(self, standing: Standing, kind: type[Actor] | None, within: float = 30.0) -> None:
+        main = standing.server
+        super().__init__(standing, main.method)
+        assert main.cell is not None
+        start = main.cell.extra().start
+        assert start is not None
+        self._recipe: Start[Any] = start if kind is None else Start(kind, start.args, start.kwargs)
+        self._within = within
+        self._why = ""
+        self.hooks = main.hooks
+        self._is_again = True
+
+    async def run(self, before: State, requests: list[Request], heard: list[Outcome]) -> Run | Missing:
+        """Run requests from a state."""
+        self._why, self.objections, self.released = "", {}, {}
+        self.heard = {(one.turn, one.k): one for one in heard}
+        ends, state = list[TurnEnd](), None
+        try:
+            async with asyncio.timeout(self._within):
+                ends, state = await self._run(before, requests)
+        except TimeoutError:
+            self._why = f"it has not come to an end within {self._within} s"
+        except Exception as error:  # What the user's own values and methods raise when the state is captured.
+            self._why = str(error) or type_name(type(error))
+        if self._why:
+            await self.drop_life()
+            self.point = None
+            return Missing(self._why)
+        objections = sorted(self.objections.items())
+        return Run(ends, sorted(self.released.items()), state, objections=objections)
+
+    async def _run(self, before: State, requests: list[Request]) -> tuple[list[TurnEnd], State | None]:
+        self._place()
+        await self._go_back(before)
+        pending, ends = deque(requests), list[TurnEnd]()
+        while pending and not self.is_over and not self._is_stopping:
+            new = await self.part(pending)
+            self._keep_tail(self.begun, new)
+            ends += new
+        self._skips.clear()
+        if self._is_stopping:  # Stopped in the middle: what has no end here may well have one elsewhere.
+            self._fail("its replica ends")
+        if self._why:
+            return ends, None
+        if self.is_over:
+            self._why = "it has ended itself"
+            return ends, None
+        await self.ensure()
+        return ends, self.capture()
+
+    async def _go_back(self, before: State) -> None:
+        point, life = self.point, self.life
+        if life is not None and point is not None and not self.tail and point == before:
+            return  # It stands there already.
+        is_plain = not (before.stash or before.returned) and life is not None and not life.returned
+        if is_plain and life is not None and life.is_live == before.live and life.feed is None:
+            self.rewind(before)
+            return
+        await self.drop_life()
+        self.install(before)
+        await self.ensure()
+
+    def _place(self) -> None:
+        """The address at which it lives: below the replica's."""
+        if self.cell is not None:
+            return
+        node, main = self.standing.node, self.standing.server.cell
+        assert main is not None
+        assert main.parent is not None
+        name = f"shadow-{next(_NUMBERS)}"
+        cell = node.cell_below(main.parent, name, self)
+        self.standing.shadows.add(self)
+        cell.spec = child(name, self._recipe)
+        cell.extra().start = self._recipe
+        for port, target in main.extra().bindings.items():
+            node.bind(cell, port, target)
+        self.start(cell)
+
+    async def close(self) -> None:
+        """It is not needed any more."""
+        await self.drop_life()
+        if self.cell is not None:
+            lifecycle.retire(self.cell, SHUTDOWN)
+            self.cell = None
+            self.standing.shadows.discard(self)
+
+    # -- nothing leaves ---------------------------------------------------------------------------------------------
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self._is_stopping = True
+        self.kill(cell)
+
+    def wants_out(self, life: ServerLife) -> None:
+        if life is not self.life:
+            return
+        known = [self.heard.get((life.turn, out.k)) for out in life.outs if out.verb in AWAITED]
+        if any(one is None for one in known):
+            self._fail("it has asked what the first run has not asked")
+            return
+        self._note_released(life)
+        life.outs = []
+        for one in known:
+            assert one is not None
+            life.from_home(one)
+
+    def _fail(self, why: str) -> None:
+        self._why = self._why or why
+        self.abandon()
+
+    def tell_more(self, record: Beside) -> None:
+        """It goes nowhere."""
+
+    def take_more(self) -> list[Beside]:
+        return []
+
+    def want_snapshot(self) -> None:
+        """None is taken."""
+
+
+# -- deciding --------------------------------------------------------------------------------------------------------
+
+
+class Remembering(Before):
+    """A Before that keeps what goes in: the other runs get that, whatever has become of it further inside."""
+
+    async def before(self, work: Work) -> Work:
+        """Remember the requests of a batch."""
+        inputs = self._standing.inputs
+        inputs.update((one.feed.id, one) for one in work.requests)
+        while len(inputs) > MOST_INPUTS:
+            del inputs[next(iter(inputs))]
+        return work
+
+
+class Deciding(After):
+    """Base of Afters that compute a part more than once, and decide what is right.
+
+    What cannot be decided for a part as a whole is decided request by request; one for which nothing is found fails
+    with a typed error, and leaves no trace.
+    """
+
+    async def choose(self, before: State, requests: list[Request], first: Run | None) -> Run | HoldfastError:
+        """The run that is right, or why there is none. Without `first`, the actor has not run these requests yet."""
+        raise NotImplementedError
+
+    async def begun(self, done: Done) -> None:
+        """Hear of the first turn, about which nothing can be decided."""
+
+    async def after(self, done: Done) -> Done | None:
+        """Have the part decided; what was found in place of what had come out goes on."""
+        server = self._standing.server
+        if not done.ends or server.is_over or server.life is None:
+            return done
+        if server.life.feed is not None:  # A follower's turn waits in the middle: this cannot be decided here.
+            if any(end.id in server.objections for end in done.ends):
+                raise HoldfastError(f"{self._standing.path}: an assertion has failed while a turn waits")
+            return done
+        if server.previous is None:
+            await self.begun(done)
+            return done  # The very first turn, `on_start`: there is nothing to begin again from.
+        before, asked = server.previous
+        before = msgspec.structs.replace(before, live=server.life.is_live)
+        dropped = {end.id for end in done.ends if end.status == DROPPED}
+        inputs = self._standing.inputs
+        asked = [inputs.get(one.feed.id, one) for one in asked]
+        requests = [one if one.feed.id in dropped else without_deadline(one) for one in asked]
+        first = self._last_run(before, done.ends)
+        server.objections = {}
+        found = await self.choose(before, requests, first)
+        if found is first:
+            return done
+        ends = await self._take(before, requests, found, first)
+        return Done(
+            done.epoch, done.config, done.number, ends, done.is_last, done.live, done.more, done.part, done.wait
+        )
+
+    def _last_run(self, before: State, ends: list[TurnEnd]) -> Run:
+        server = self._standing.server
+        released = sorted((turn, one) for turn, one in server.released.items() if turn > before.turn)
+        known = {end.id for end in ends}
+        objections = sorted((key, why) for key, why in server.objections.items() if key in known)
+        return Run(ends, released, server.capture(), objections=objections)
+
+    async def run_here(self, before: State, requests: list[Request]) -> Run:
+        """Have the actor itself run requests, from a state."""
+        server = self._standing.server
+        ends, _ = await server.again(before, requests)
+        return self._last_run(before, ends)
+
+    async def _take(
+        self, state: State, requests: list[Request], found: Run | HoldfastError, first: Run
+    ) -> list[TurnEnd]:
+        """Put what was found in place; one request after the other, if nothing was found for all of them."""
+        server, ends = self._standing.server, list[TurnEnd]()
+        if isinstance(found, Run):
+            ends, state = self._taken(found), found.state or state
+        elif len(requests) == 1:
+            ends, state = self._failed(state, first.ends, found)
+        else:
+            for one in requests:
+                run = await self.choose(state, [one], None)
+                if isinstance(run, Run):
+                    ends += self._taken(run)
+                    state = run.state or state
+                else:
+                    failed, state = self._failed(state, [TurnEnd(0, one.feed.id, FAILED, [], Answer())], run)
+                    ends += failed
+        if server.point is not state or server.life is None:
+            await server.adopt(state)
+        return ends
+
+    def _taken(self, run: Run) -> list[TurnEnd]:
+        self._standing.server.released.update(run.released)
+        return run.ends
+
+    def _failed(self, state: State, ends: list[TurnEnd], error: HoldfastError) -> tuple[list[TurnEnd], State]:
+        """These requests fail: their numbers are used, and nothing else has happened."""
+        answer = Answer(*self._standing.node.codec.encode_error(error))
+        numbers = list(dict.fromkeys(end.id for end in ends))
+        failed = [
+            TurnEnd(turn, number, FAILED, [], answer if self._is_ask(state, number) else Answer())
+            for turn, number in enumerate(numbers, state.turn + 1)
+        ]
+        return failed, msgspec.structs.replace(state, turn=state.turn + len(failed))
+
+    def _is_ask(self, state: State, number: int) -> bool:
+        request = self._standing.inside.get(number)
+        feeds = [request.feed] if request is not None else [*state.stash, *state.returned]
+        return any(feed.id == number and feed.is_ask for feed in feeds)
+
+    def heard(self, before: State) -> list[Outcome]:
+        """What the actor's asks have come to since a state."""
+        return [one for one in self._standing.server.heard.values() if one.turn > before.turn]
+
+
+def without_deadline(request: Request) -> Request:
+    """It was begun in time: it is not too late for the next run of it."""
+    feed = request.feed
+    if not feed.deadline:
+        return request
+    return Request(request.client, request.incarnation, msgspec.structs.replace(feed, deadline=0.0))

@@ -1,0 +1,194 @@
+"""State transfer: another replica is brought to the state of the one that leads, between two batches (T8c).
+
+The two RequestProtocols do it: the leader's captures and sends, the follower's takes, and may ask for it again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Coroutine
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import HoldfastError
+from ...actors.kernel.actor import on
+from ...actors.kernel.bindings import Binding
+from ...actors.kernel.envelope import ReplyHandle
+from ...actors.kernel.message import Message
+from ..replica.replica_orders import Join, Peer
+from ..replica.standing import PeerLost
+from .brick_messages import CannotJoin, ConfigMismatch, Done, Logged, StaleEpoch, State, Strayed
+from .bricks import FOREVER, Abandon, Brick
+from .sealed_gate import Gate
+
+if TYPE_CHECKING:
+    from ...actors.kernel.actor import Actor
+
+
+class Take(Message[int]):
+    """The state and reply log of the replica that leads, for one that joins; the reply is its turn."""
+
+    leader: str
+    state: State | None
+    log: list[Logged]
+
+
+class Assume(Message[None]):
+    """To the replica: have its bricks play the part of one that leads, or not."""
+
+    leads: bool
+
+
+class Play(Message[None]):
+    """To a replica that is no part of a group yet: have the bricks of this role, but not the protected actor.
+
+    `is_new`: all of them are made anew.
+    """
+
+    leads: bool
+    is_new: bool
+
+
+class Astray(Message[None]):
+    """To the RequestProtocol of the leader: this follower does not have your state any more. Do not count on it."""
+
+    path: str
+
+
+class GoneAstray(Message):
+    """To the RequestProtocol of a follower, from its After: tell the leader."""
+
+
+class Transfer(Gate):
+    """The part of a RequestProtocol that speaks with that of the other replica."""
+
+    peer_messages = (Take, Astray)
+    answers_later = True
+
+    next: Binding[Actor]
+    proceed: Binding[Actor]
+
+    _holds: int  # who wants nothing to go in
+    _lock: asyncio.Lock
+
+    def _check(self, epoch: int, config: int | None = None) -> None:
+        """Refuse an order of an earlier epoch; from here on this one counts."""
+        raise NotImplementedError
+
+    def _answer(self, work: Coroutine[Any, Any, Any]) -> ReplyHandle[Any]:
+        """Answer when the work is done."""
+        raise NotImplementedError
+
+    async def _quiet(self) -> None:
+        """Wait until nothing is inside, or another epoch has begun."""
+        raise NotImplementedError
+
+    def _go_on(self) -> None:
+        """Let in what waits, if nothing is inside."""
+        raise NotImplementedError
+
+    @on(Peer)
+    def _peer(self, message: Peer) -> None:
+        self._check(message.epoch)
+        standing = self._standing
+        if message.path != standing.peer:
+            standing.set_peer(message.path, "live")
+
+    @on(Join)
+    def _join(self, message: Join) -> Any:
+        self._check(message.epoch)
+        return self._answer(self._bring(message.peer))
+
+    async def _bring(self, path: str) -> int:
+        """Bring another replica to our state; requests wait only while that is captured."""
+        standing, server = self._standing, self._standing.server
+        if not standing.leads:
+            raise CannotJoin(path=path, why=f"{standing.path} does not lead")
+        if standing.peer == path:  # It follows anew, or has lived anew: whatever it had, it does not count on that.
+            standing.set_peer(path, "joining")
+        epoch = standing.epoch
+        self._holds += 1
+        try:
+            await self._quiet()
+            standing.check(epoch)
+            await server.ensure()
+            state = None
+            if server.has_access:
+                state = server.capture() if server.point is not None or server.turn >= 0 else None
+            elif server.turn >= 0:
+                why = "the state of the protected actor cannot be read, and it has handled requests already"
+                raise CannotJoin(path=path, why=why)
+            log = standing.log.entries()
+            standing.set_peer(path, "joining", -2 if state is None else state.turn)
+            asked = self.ctx.create_task(self._offer(Take(standing.path, state, log)))
+        finally:
+            self._holds -= 1
+            self._go_on()
+        turn = await asked
+        if isinstance(turn, HoldfastError):
+            if standing.peer == path:
+                standing.set_peer(None, "none")
+            raise CannotJoin(path=path, why=str(turn))
+        if standing.peer == path:
+            standing.peer_state = "live"
+            await self._drain_bricks()  # What left while it joined may have gone home ahead of the state behind it.
+        if standing.peer != path:
+            raise CannotJoin(path=path, why="another one has taken its place, or it was given up meanwhile")
+        return turn
+
+    async def _drain_bricks(self) -> None:
+        for path in list(self._standing.paths.values()):
+            cell = self._standing.node.find(path)
+            if cell is not None and isinstance(cell.actor, Brick):
+                await cell.actor.drain()  # No ask: one of them may be waiting for us.
+
+    async def _offer(self, take: Take) -> int | HoldfastError:
+        try:
+            return await self.ask_peer(take)
+        except (PeerLost, ConfigMismatch, StaleEpoch, HoldfastError) as error:
+            return error
+
+    async def from_peer(self, message: Message[Any]) -> Any:
+        """We join, or a follower has to join again."""
+        if isinstance(message, Astray):
+            self._forsake(message.path)
+            return None
+        assert isinstance(message, Take)
+        return await self._taken(message)
+
+    def _forsake(self, path: str) -> None:
+        """From here on no reply counts on this follower, and the root is told: it has to join again."""
+        standing = self._standing
+        if not standing.leads or standing.is_fenced:
+            return
+        if standing.peer == path:
+            standing.set_peer(None, "none")
+        self.next.tell(Done(standing.epoch, standing.config, -1, [], False, None, [Strayed(path)]))
+
+    @on(GoneAstray)
+    def _astray(self, message: GoneAstray) -> None:
+        self.ctx.create_task(self._tell_leader())
+
+    async def _tell_leader(self) -> None:
+        with contextlib.suppress(
+            HoldfastError
+        ):  # It has died, or counts no more: whoever leads now brings us its state.
+            await self.ask_peer(Astray(self._standing.path))
+
+    async def _taken(self, take: Take) -> int:
+        standing, server = self._standing, self._standing.server
+        standing.set_peer(take.leader, "live")
+        if take.state is not None and standing.kept > (standing.epoch, take.state.turn):
+            standing.ready()  # It has computed with the leader meanwhile, and is further than that.
+            return server.turn
+        standing.unready()
+        standing.forwarded_as -= 1  # What is on its way to Proceed now, or in it, leads on from another state.
+        await self.proceed.ask(Abandon(), timeout=FOREVER)
+        await server.drop_life()
+        server.install(take.state)
+        standing.log.replace(take.log)
+        standing.inside.clear()
+        if standing.computes:
+            await server.ensure()
+        standing.ready()
+        return server.turn

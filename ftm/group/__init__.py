@@ -1,0 +1,1 @@
+"""A group of replicas as the root has it: who is in it, who leads, and how that changes."""

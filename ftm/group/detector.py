@@ -1,0 +1,172 @@
+"""The failure detector: heartbeats judged by phi accrual, on a clock that stands still while the observer does.
+
+A late observer sees all heartbeats late. What it was late itself is no silence of theirs, so its lag is taken out. So
+is the time for which a replica had no processor to beat with, and what going through its state may take it.
+
+Source:
+    Hayashibara, Defago, Yared and Katayama, "The phi accrual failure detector" (2004).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections import deque
+from typing import TYPE_CHECKING, ClassVar
+
+from ...actors.errors import SpecError
+from ...actors.kernel.actor import Actor, on
+from ...actors.observer_clock import OwnClock
+from ..replica.replica_orders import Beat, Broken
+from .membership import is_within
+
+if TYPE_CHECKING:
+    import asyncio
+
+    from .group import Group
+
+KEPT = 200
+"""Intervals between heartbeats that are remembered."""
+HIGHEST = 1000.0
+"""Phi when the silence is longer than can be told."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Detection:
+    """How replicas are watched.
+
+    Args:
+        interval: seconds between two heartbeats.
+        threshold: phi from which on a replica is suspected: 8 is one wrong suspicion in 10^8 looks, if delays vary as
+            they did before.
+        pause: seconds of silence that are always acceptable, besides what the heartbeats so far let expect.
+        spread: the least standard deviation that is reckoned with, in seconds.
+        hopeless: seconds after which even a replica is given up that nobody could take over from.
+        watch_turns: seconds that a turn may take, what it waits for included; None: as many as it wants.
+    """
+
+    interval: float = 0.05
+    threshold: float = 8.0
+    pause: float = 0.5
+    spread: float = 0.01
+    hopeless: float = 10.0
+    watch_turns: float | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("interval", "threshold", "spread", "hopeless"):
+            value = getattr(self, name)
+            if not _number(value) or not 0 < value < math.inf:
+                raise SpecError("Detection", f"{name} must be a finite number > 0, not {value!r}")
+        turns = self.watch_turns
+        if turns is not None and (not _number(turns) or not 0 < turns < math.inf):
+            raise SpecError("Detection", f"watch_turns must be seconds > 0 or None, not {turns!r}")
+        if not _number(self.pause) or not 0 <= self.pause < math.inf:
+            raise SpecError("Detection", f"pause must be seconds >= 0, not {self.pause!r}")
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+class Accrual:
+    """What is known of one replica's heartbeats, and how much its silence means."""
+
+    def __init__(self, detection: Detection, now: float, starved: float = 0.0) -> None:
+        self._detection, self._last, self.starved = detection, now, starved
+        self._gaps: deque[float] = deque(maxlen=KEPT)
+        self._sum = self._squares = 0.0
+
+    @property
+    def last(self) -> float:
+        """When it was heard of last."""
+        return self._last
+
+    def heard(self, now: float, starved: float = 0.0) -> None:
+        """A heartbeat has come, from one that had no processor for so many seconds of its life."""
+        gap, self._last, self.starved = max(0.0, now - self._last), now, starved
+        if len(self._gaps) == KEPT:
+            oldest = self._gaps[0]
+            self._sum -= oldest
+            self._squares -= oldest * oldest
+        self._gaps.append(gap)
+        self._sum += gap
+        self._squares += gap * gap
+
+    def phi(self, now: float) -> float:
+        """Minus the decimal logarithm of the chance that a heartbeat still comes after this silence."""
+        detection, count = self._detection, len(self._gaps)
+        mean = detection.interval if not count else max(self._sum / count, detection.interval)
+        variance = 0.0 if not count else max(0.0, self._squares / count - (self._sum / count) ** 2)
+        deviation = max(math.sqrt(variance), detection.spread)
+        late = (now - self._last - mean - detection.pause) / deviation
+        chance = 0.5 * math.erfc(late / math.sqrt(2.0))
+        return min(HIGHEST, -math.log10(chance)) if chance > 0 else HIGHEST
+
+    def is_suspect(self, now: float) -> bool:
+        """Whether its silence is too long."""
+        return self.phi(now) >= self._detection.threshold
+
+
+class Detector(Actor):
+    """The root's side: hears the heartbeats of a group's replicas, and tells the failover manager whom it suspects."""
+
+    _is_part: ClassVar[bool] = True
+
+    deterministic = False
+
+    def __init__(self, group: Group) -> None:
+        self._group = group
+        self._known: dict[tuple[str, int], Accrual] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self._period = group.detection.interval / 2
+
+    def on_start(self, restored: bool) -> None:
+        """Nothing is known yet: whoever is silent from now on is suspected in its time."""
+        self._clock = OwnClock(self.ctx.cell.node.loop.time(), self._period)
+        self._look()
+
+    def on_stop(self, reason: object) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+
+    @on(Beat)
+    def heard(self, beat: Beat) -> None:
+        """A replica is alive."""
+        group = self._group
+        life = group.life_of(beat.name)
+        if not life or not is_within(group.place(beat.name), self.ctx.sender):
+            return  # It has died since it said so; or another one has said it.
+        accrual = self._known.get((beat.name, life))
+        now = self._clock.at(self.ctx.cell.node.loop.time())
+        if accrual is None or group.up.get(beat.name) != life:  # Or it is another replica of that name.
+            for old in [one for one in self._known if one[0] == beat.name]:
+                del self._known[old]
+            self._known[beat.name, life] = Accrual(group.detection, now, group.starved(beat.name))
+        else:
+            accrual.heard(now, group.starved(beat.name))
+        group.heard(beat.name, life)
+
+    @on(Broken)
+    def broken(self, message: Broken) -> None:
+        """A replica is ending: nobody needs to wait for that."""
+        group = self._group
+        if group.life_of(message.name) == message.life and is_within(group.place(message.name), self.ctx.sender):
+            group.broken(message.name, message.life, message.why)
+
+    def _look(self) -> None:
+        if self.ctx.closed:
+            return  # This life was killed: the next one looks, and this one hears nothing any more.
+        loop = self.ctx.cell.node.loop
+        now = self._clock.tick(loop.time())
+        for name, life in self._group.watched():
+            accrual = self._known.get((name, life))
+            if accrual is None:  # Not heard yet by this life of ours.
+                self._known[name, life] = Accrual(self._group.detection, now, self._group.starved(name))
+            elif accrual.is_suspect(now) and self._is_silent(name, accrual, now):
+                self._group.silent(name, life, f"no heartbeat for {now - accrual.last:.3f} s")
+        self._timer = loop.call_later(self._period, self._look)
+
+    def _is_silent(self, name: str, accrual: Accrual, now: float) -> bool:
+        """Whether it would also be suspected if it had had a processor, and no large state to go through."""
+        heard = now - self._group.starved(name) + accrual.starved
+        return accrual.is_suspect(heard) and accrual.is_suspect(heard - self._group.at_work(name))

@@ -1,0 +1,72 @@
+"""Whether an actor is protected now, by what, who leads, and whether a replica could die."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
+    from .group import Group
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class ProtectionStatus:
+    """How an actor is protected, as `system.protection` tells it."""
+
+    address: str
+    stack: tuple[str, ...]
+    """The names of its mechanisms, outermost first; none if it is not protected."""
+    replicas: dict[str, str]
+    """By name: "leads", "follows" (it could lead), "joining", "silent" (it is suspected), or "down"."""
+    leader: str | None
+    """The one that leads; None while there is none."""
+    epoch: int
+    """It rises with each failover and each new life."""
+    config: int
+    """It rises with each change of the stack."""
+    is_whole: bool
+    """Whether one replica leads, and all others could."""
+    since: float
+    """Since when it is whole, or is not: seconds since the epoch of the clock; 0.0 if it is not protected."""
+    is_changing: bool
+    """Whether another stack is on its way."""
+    is_on_probation: bool
+    """Whether the stack is new, and the one before may yet come back."""
+
+    @property
+    def is_protected(self) -> bool:
+        """Whether it has any mechanism."""
+        return bool(self.stack)
+
+
+def protection_of(cell: Cell) -> ProtectionStatus:
+    """What the root knows of the protection of an address."""
+    from .group_host import GroupHost  # Whoever only reads an answer, in another process, needs none of it.
+
+    host = cell.host
+    if not isinstance(host, GroupHost):
+        return ProtectionStatus(cell.path, (), {}, None, 0, 0, False, 0.0, False, False)
+    stack, group, probation = tuple(layer.name for layer in host.layers), host.group, host.probation
+    is_new = probation is not None and not probation.is_over
+    if group is None or group.is_over:  # It is being recovered.
+        return ProtectionStatus(
+            cell.path, stack, {}, None, host.epoch, host.config, False, host.ended_at, False, is_new
+        )
+    replicas = {name: _state_of(group, name) for name in group.names}
+    is_whole, since = group.whole_since()
+    is_changing = group.change is not None
+    return ProtectionStatus(
+        cell.path, stack, replicas, group.primary, group.epoch, group.config, is_whole, since, is_changing, is_new
+    )  # fmt: skip
+
+
+def _state_of(group: Group, name: str) -> str:
+    life = group.life_of(name)
+    if not life:
+        return "down"
+    if group.suspects.get(name) == life:
+        return "silent"
+    if group.members.get(name) != life:
+        return "joining"
+    return "leads" if name == group.primary else "follows"

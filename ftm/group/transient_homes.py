@@ -1,0 +1,53 @@
+"""Homes of actors without recovery: they stand only as long as a mechanism protects them, and keep nothing."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...actors.errors import AskFailed
+from ...checkpoint.method import Method
+from ...checkpoint.snapshot.snapshot_record import meta_now, put
+
+if TYPE_CHECKING:
+    from ...checkpoint.home.switch import Switch
+    from ...checkpoint.snapshot.snapshot_record import Meta
+
+UNKEPT = Method("protected", durability="memory")
+"""Of a child without recovery, as long as it is protected."""
+
+
+def is_unkept(method: Method) -> bool:
+    """Whether the actor has a home for as long as it is protected, and begins afresh."""
+    return method.name == UNKEPT.name
+
+
+def forget_ended(switch: Switch) -> None:
+    """Forget all ended turns of an actor that would begin afresh."""
+    put(switch, meta_now(switch, switch.turn, sorted(switch.stashed() & switch.open.keys())), 1)
+
+
+def begin_afresh(switch: Switch) -> None:
+    """Between two lives of an actor that is not recorded: timers, subscriptions and the stash end with a life."""
+    if switch.newest is None and not switch.turns:
+        return
+    forget_ended(switch)
+    assert switch.newest is not None
+    newest = switch.newest
+    switch.newest = type(newest)(
+        newest.format, switch.turn, newest.next_id, [], {}, [], newest.epoch, b"", switch.turn
+    )  # fmt: skip
+    switch.stash = []
+    switch.timers.replace({})
+    switch.topics.clear()
+
+
+def begin_again(switch: Switch, copy: Meta) -> bool:
+    """Between two lives of an actor whose mechanism was not trusted: whether it begins with the copy of its state."""
+    return switch.newest is copy and copy.turn == switch.turn
+
+
+def forget_later(switch: Switch, why: str) -> None:
+    """Replies that the ended life owed will not come."""
+    for ask in switch.later.values():
+        ask.fail(AskFailed(switch.path, why))
+    switch.later.clear()

@@ -1,0 +1,115 @@
+"""The trial of a stack of mechanisms: a replica that is no part of the group plays all of its roles first.
+
+Code that has never run is tried where it can hurt nobody: in a process that holds no state, that nobody waits for and
+that is killed in any case. Whatever it does there (raise, hang, block its process, end it), the group does not notice.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Awaitable
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from ...actors.errors import AskTimeout, HoldfastError
+from ...actors.kernel.cell import Cell
+from ...supervision.admin import DeleteChild, StartChild, TerminateChild
+from ..replica.replica_orders import Rehearse
+from .failover import killed, why_ended
+
+if TYPE_CHECKING:
+    from ...supervision.spec import ChildSpec
+    from .group import Group
+
+T = TypeVar("T")
+
+TRIAL: Final = "trial"
+"""How the replica is called that only tries."""
+STARTED_WITHIN: Final = 30.0
+"""Seconds that its process and its bricks may take to come up."""
+PASSED_WITHIN: Final = 15.0
+"""Seconds that it may take to play one of its parts."""
+PARTS: Final = ((True, False), (True, True), (False, False), (False, True))
+"""Each role (whether it leads), and both ways into it: from the other one, and made in it."""
+
+
+class TrialFailed(HoldfastError, text="{why}"):
+    """The stack was tried, and does not work."""
+
+    actor: str
+    why: str
+
+
+async def tried(group: Group, above: Cell, spec: ChildSpec) -> None:
+    """Start a replica as `spec` says, have it play all roles, and end it.
+
+    Args:
+        group: whose stack it is to be.
+        above: the supervisor of its replicas.
+        spec: that of a replica called `TRIAL`.
+
+    Raises:
+        TrialFailed: it does not start, does not let a batch pass, or not in time.
+    """
+    await ended(group, above)  # Whoever has tried before may have died of it.
+    group.expect(TRIAL)
+    ref: Any = above.ref
+    try:
+        try:
+            await ref.ask(StartChild(dataclasses.replace(spec, restart="temporary")), STARTED_WITHIN)
+        except AskTimeout:
+            raise TrialFailed(group.path, f"its bricks were not up within {STARTED_WITHIN:g} s") from None
+        except HoldfastError as error:
+            raise TrialFailed(group.path, str(error)) from error
+        await rehearsed(group, TRIAL)
+    finally:
+        await ended(group, above)
+
+
+async def rehearsed(group: Group, name: str) -> None:
+    """Have a replica that has no part yet play all parts, each with a batch without requests.
+
+    Raises:
+        TrialFailed: a brick has not started, has ended its replica, or has kept the batch.
+    """
+    life = group.life_of(name)
+    try:
+        for part in PARTS:
+            await group.entry(name).ask(Rehearse(*part), PASSED_WITHIN)
+    except AskTimeout:
+        why = f"one of its bricks did not start, or pass on an empty batch, within {PASSED_WITHIN:g} s"
+        raise TrialFailed(group.path, why) from None
+    except HoldfastError as error:
+        raise TrialFailed(group.path, await why_ended(group, name, life, error)) from error
+
+
+async def ended(group: Group, above: Cell) -> None:
+    """End the replica that tries: its process is killed, whatever it does."""
+    ref: Any = above.ref
+    for order in (TerminateChild(TRIAL), DeleteChild(TRIAL)):
+        cell = group.cell_of(TRIAL)
+        if cell is None:
+            return
+        await killed(group, TRIAL, cell.life)  # It is in nobody's hands: the change itself is made by leave.
+        try:
+            await ref.ask(order, STARTED_WITHIN)
+        except HoldfastError:
+            continue  # It is gone already.
+
+
+async def until_given_up(work: Awaitable[T], given_up: asyncio.Future[str]) -> T:
+    """What comes of some work, unless nobody wants it any more.
+
+    Raises:
+        TrialFailed: it was given up.
+    """
+    task = asyncio.ensure_future(work)
+    try:
+        await asyncio.wait((task, given_up), return_when=asyncio.FIRST_COMPLETED)
+        if not task.done():
+            raise TrialFailed("", given_up.result())
+    finally:
+        if not task.done():
+            task.cancel()
+            await asyncio.wait((task,))
+    return task.result()

@@ -1,0 +1,1 @@
+"""Attach and detach: the life of an actor moves into a group of replicas and out of it."""

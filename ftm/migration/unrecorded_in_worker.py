@@ -1,0 +1,271 @@
+"""A life that is not recorded is handed over, as the process of its supervisor sees it: it leaves, or comes back.
+
+It leaves: the life comes to rest with its state packed, and goes on if the group does not come so far. It comes back:
+a new life is begun beside the address, and is disposed of if it is not to be.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import HoldfastError, StartFailed, error_text
+from ...actors.exit_reasons import Shutdown
+from ...actors.kernel import lifecycle, links, mailbox
+from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.context import ActorContext
+from ...actors.kernel.envelope import Item
+from ...actors.kernel.lifecycle import Stop
+from ...actors.kernel.mailbox import Bound, Bounded
+from ...actors.kernel.timers import Timer
+from ...actors.kernel.topics import Topics
+from ...actors.migration.luggage import Stays, check_sendable, pack_rest
+from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, settle, sorted_out, twin
+from ...actors.migration.to_task import dispose
+from ...actors.migration.worker_moves import await_up
+from ...actors.process.worker_node import GuestHost, InnerHost
+from ...checkpoint.life.worker_lives import GuestKeeper
+from ...checkpoint.snapshot.key_variables import restore_state, save_state
+from .protected_stand_ins import InnerGroupHost, respec
+from .unrecorded_luggage import Incoming, carry, pack, refuse, unpack
+
+if TYPE_CHECKING:
+    from ...actors.kernel.actor import Actor
+    from ...actors.process.worker_node import Guest
+    from ...checkpoint.protocol import Carried
+
+LIVES: dict[str, Carrier] = {}
+"""By address: a process has one guest."""
+
+
+def hear(guest: Guest, path: str, record: Carried) -> None:
+    """What the root says of a life that is handed over."""
+    one = LIVES.get(path)
+    if one is None:
+        one = LIVES[path] = Carrier(guest, path)
+    one.hear(record)
+
+
+class Carrier:
+    """The handing over of the lives at one address."""
+
+    def __init__(self, guest: Guest, path: str) -> None:
+        self._guest, self._path = guest, path
+        self._port = guest.recovery.port_of(path)
+        self._attempt, self._incoming = -1, Incoming(imports=True)
+        self._take: Take | None = None
+        self._cell: Cell | None = None  # where a life is at rest, or comes back to
+        self._other: Cell | None = None  # beside it: the life that comes back
+        self._held: list[Any] | None = None  # what has been sent to it here meanwhile
+
+    def hear(self, record: Carried) -> None:
+        if record.attempt != self._attempt:
+            self._attempt, self._incoming = record.attempt, Incoming(imports=True)
+        told = self._incoming.take(record)
+        if told is None:
+            return
+        match record.step:
+            case "take":
+                self._come_to_rest()
+            case "back":
+                self._go_on()
+            case "leave":
+                self._leave(told)
+            case "come":
+                self._come(told)
+            case "stay":
+                self._stay()
+            case _:
+                self._settle_in(told)
+
+    def _say(self, step: str, **told: Any) -> None:
+        carry(self._port.to_home, self._path, self._attempt, step, **told)
+
+    # -- leaving ----------------------------------------------------------------------------------------------------
+
+    def _come_to_rest(self) -> None:
+        cell = self._guest.node.find(self._path)
+        if cell is None or cell.state is not RUNNING or not isinstance(cell.host, InnerHost):
+            self._say("refused", why="it is being restarted; try again")
+            return
+        take = Take(_owe, self._at_rest, lambda why: self._say("refused", why=why))
+        self._take, self._cell = take, cell
+
+        def ended(done: asyncio.Future[Any]) -> None:
+            if self._take is take and not take.is_done:
+                self._say("refused", why="its life has ended; try again")
+
+        cell.ended().add_done_callback(ended)
+        lifecycle.urge(cell, take)
+
+    def _at_rest(self, actor: Actor, state: bytes) -> None:
+        """Called in its place between two turns; if this raises, the actor goes on."""
+        cell = actor.ctx.cell
+        check_sendable(cell)
+        rest, stash = pack_rest(actor), pack(self._guest, cell, cell.extra().stash or ())
+        self._say("taken", at=now(), state=save_state(actor), rest=rest, stash=stash)
+
+    def _go_on(self) -> None:
+        take, self._take, cell = self._take, None, self._cell
+        if take is None or cell is None:
+            return
+        take.is_void = True
+        if take.is_done and cell.state is RUNNING:
+            resume(cell)
+
+    def _leave(self, told: dict[str, Any]) -> None:
+        """The group lives it from now on; nobody hears of that but the actor itself."""
+        guest, cell, self._take = self._guest, self._cell, None
+        assert cell is not None
+        more, bound = cell.extra(), cell.extra().bound
+        waiting: list[Any] = []
+        if bound is not None:
+            waiting, bound.waiting = list(bound.waiting), deque()
+        old = part(cell)
+        items, commands = sorted_out(cell)
+        queue = pack(guest, cell, (*items, *waiting))
+        self._hand_ties_over(cell)
+        self._say("left", queue=queue, bound=None if bound is None else [bound.capacity, bound.overflow])
+        respec(cell, told["layers"])
+        if isinstance(cell.node.keeper, GuestKeeper):
+            cell.node.keeper.begins(cell.path)
+        host = InnerGroupHost(guest, cell.spec, guest.recovery.port_of)
+        host.bound = None if bound is None else Bounded(bound.capacity, bound.overflow)
+        more.bound = None
+        host.take_up(cell, told["number"])
+        if bound is not None:
+            bound.release()
+        obey_commands(cell, commands)
+        farewell(old, Stop(Shutdown("moved into a group of replicas")))
+
+    def _hand_ties_over(self, cell: Cell) -> None:
+        """Links, and monitors that reach out of this process, are the root's from now on; so are subscriptions."""
+        more, guest = cell.extra(), self._guest
+        for peer in more.links:
+            guest.command(cell, "link", {"peer": peer.path})
+        for watch in [one for one in more.watching if one.life == cell.life]:
+            watch.cancel()
+            guest.command(watch.target, "monitor", {"watcher": cell.path, "for_good": watch.for_good})
+        more.monitors = [one for one in more.monitors if isinstance(one.watcher.host, (GuestHost, InnerHost))]
+        for topic in list(more.topics):
+            Topics.unsubscribe(guest.node.topics, topic, cell)
+
+    # -- coming back ------------------------------------------------------------------------------------------------
+
+    def _come(self, told: dict[str, Any]) -> None:
+        """Begin the life beside its address; it handles nothing yet."""
+        cell = self._guest.node.find(self._path)
+        if cell is None or cell.state is not RUNNING or not isinstance(cell.host, InnerGroupHost):
+            self._say("failed", why="its life has ended")
+            return
+        start = cell.extra().start
+        assert start is not None
+        self._cell, self._other = cell, twin(cell)
+        other = self._other
+        other.table = start.kind._table
+        other.extra().bindings = cell.extra().bindings
+        try:
+            lifecycle.build(other, start, ActorContext)
+            other.extra().trap_exits = told["traps"]
+            assert other.actor is not None
+            restore_state(other.actor, told["state"])
+        except StartFailed as error:
+            self._fail(other, error.reason)
+        except Exception as error:  # What a class of the state raises when it is read.
+            self._fail(other, f"its state could not be restored: {error_text(error)}")
+        else:
+            settled = await_up(other, start)
+            settled.add_done_callback(lambda done: self._is_up(other, done))
+            other.ended().add_done_callback(lambda done: self._fail(other, str(done.result())))
+
+    def _fail(self, other: Cell, why: str) -> None:
+        if self._other is other and self._held is None:  # Else it is the one already, as far as the root knows.
+            self._other = None
+            dispose(other)
+            self._say("failed", why=why)
+
+    def _is_up(self, other: Cell, done: asyncio.Future[None]) -> None:
+        error = None if done.cancelled() else done.exception()
+        if error is not None:
+            self._fail(other, error.reason if isinstance(error, StartFailed) else str(error))
+        elif self._other is other and self._cell is not None:
+            self._held, self._cell.admit = [], self._hold  # All that was sent before is ahead of what is said now.
+            self._say("up")
+
+    def _hold(self, cell: Cell, item: Any) -> None:
+        """Stands in `cell.admit` until it is known where the life goes on."""
+        if not isinstance(item, Item) and type(item) not in cell.table:
+            cell.require(item)
+        assert self._held is not None
+        self._held.append(item)
+
+    def _stay(self) -> None:
+        """The group goes on."""
+        cell, other, held = self._cell, self._other, self._held or []
+        self._other = self._held = None
+        if other is not None:
+            dispose(other)
+        if cell is None or not isinstance(cell.host, InnerGroupHost):
+            return
+        if cell.admit == self._hold:
+            cell.admit = cell.host.way_home
+        for item in held:
+            cell.admit(cell, item)
+
+    def _settle_in(self, told: dict[str, Any]) -> None:
+        """From here on the new life is the one."""
+        guest, cell, other, held = self._guest, self._cell, self._other, self._held or []
+        self._other = self._held = None
+        assert cell is not None
+        assert other is not None
+        more, host = cell.extra(), cell.host
+        assert isinstance(host, InnerGroupHost)
+        own, commands = sorted_out(other, ticks=True)
+        has_ended = other.state is not RUNNING  # by its background work
+        if not has_ended:
+            settle(other, cell)
+        self._port.on_group = None
+        cell.host, cell.admit, cell.queue = guest.node.here, mailbox.admit_first, None
+        if host.bound is not None:
+            more.bound = Bound(host.bound.capacity, host.bound.overflow)
+            cell.admit = mailbox.admit_bounded
+        queue = mailbox.queue_of(cell)
+        queue.extend((*own, *unpack(guest, cell, told["queue"])))
+        if more.bound is not None:
+            more.bound.count = sum(map(mailbox.counts, queue))
+        stash = unpack(guest, cell, told["stash"])
+        more.stash = deque(stash) if stash else None
+        for name, body, left, interval in told["timers"] if not has_ended else ():
+            message = cell.node.codec.decode(cell.table.kind_named(name), body)
+            Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
+        self._take_ties_over(cell, told)
+        respec(cell, [])
+        more.suspended = bool(told["is_suspended"])
+        if more.suspended:
+            mailbox.hold(cell)
+        for item in held:
+            try:
+                cell.admit(cell, item)
+            except HoldfastError as error:
+                refuse(cell, item, error)
+        obey_commands(cell, commands)
+        if has_ended:
+            lifecycle.ended(cell, other.extra().reason)
+        else:
+            lifecycle.up(cell)
+
+    def _take_ties_over(self, cell: Cell, told: dict[str, Any]) -> None:
+        node = self._guest.node
+        for path in told["links"]:
+            links.link(node.cell_at(path), cell)
+        for path, for_good in told["monitors"]:
+            links.monitor(node.cell_at(path), cell, for_good=for_good)
+        for path, for_good in told["watches"]:
+            links.monitor(cell, node.cell_at(path), for_good=for_good)
+        for topic in told["topics"]:
+            node.topics.subscribe(topic, cell)
+
+
+def _owe(ask: Any) -> int:
+    raise Stays("an ask waits for its reply, which it could not give from another place")

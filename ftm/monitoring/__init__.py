@@ -1,0 +1,1 @@
+"""Monitoring: whether the mechanism in force still suits what there is."""

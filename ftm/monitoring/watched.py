@@ -1,0 +1,82 @@
+"""A watch over a protected actor as it is: the mechanism of its spec, what its class says, changes by transactions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import SpecError
+from ...actors.kernel.node import cell_kind
+from ..mechanisms.mechanism import compose
+from ..model.application import Application
+from ..model.composition import layers_of
+from .judge import Judge, Settings
+from .monitor import Adapt, Watch
+
+if TYPE_CHECKING:
+    from ...actors.kernel.ref import ActorRef
+    from ..mechanisms.mechanism import Mechanism
+    from ..model.change_model import Resources
+
+PLAIN = ("pbr", "lfr", "tmr", "tr")
+"""Mechanisms that need nothing but the actor itself."""
+BRINGS = ("versions", "alternates")
+"""Settings that name other versions of the actor."""
+CHANGED_WITHIN = 30.0
+"""Seconds that a change may take."""
+
+
+def watch_of(
+    system: Any,
+    ref: ActorRef[Any],
+    settings: Settings,
+    *,
+    mechanisms: Iterable[Any] = PLAIN,
+    resources: Resources | None = None,
+    known: dict[str, Any] | None = None,
+    **options: Any,
+) -> Watch:
+    """What a `MonitoringEngine` needs to look after an actor: it changes its mechanism by transactions.
+
+    Args:
+        system: the system that it lives in.
+        ref: the actor, protected or not.
+        settings: how quick and how stubborn.
+        mechanisms: those that may be chosen, with their settings: instances, classes, names or files. Those that the
+            actor has now are among them in any case.
+        resources: what there is; measured, if it is left out.
+        known: what is known of the application and its class does not say: `{"rate": 100.0}`.
+        options: those of `Watch`: `probe`, `veto`, `degrade`, `signs`, `patience`.
+
+    Raises:
+        SpecError: no spec says what protects it: nobody supervises it. MechanismRefused: there is no such mechanism.
+    """
+    cell = ref._cell
+    kind, spec = cell_kind(cell), cell.spec
+    if kind is None or not hasattr(spec, "mechanism"):
+        raise SpecError(ref.path, "it is not supervised, so no mechanism could be given to it")
+    made: dict[str, Mechanism] = {}
+    for one in mechanisms:
+        made.update((layer.name, layer) for layer in layers_of(one))
+    present = () if spec.mechanism is None else compose(spec.mechanism)
+    made.update((layer.name, layer) for layer in present)
+
+    async def change(adapt: Adapt) -> None:
+        there = system.node.find(adapt.address)
+        protected = there is not None and there.spec.mechanism is not None
+        layers = tuple(made[name] for name in adapt.target)
+        async with system.transaction(timeout=CHANGED_WITHIN) as step:
+            if not layers:
+                step.detach(adapt.address)
+            elif protected:
+                step.transition(adapt.address, layers, whole=True)
+            else:
+                step.attach(adapt.address, layers)
+
+    assertions = sum(len(getattr(one, "assertions", ())) for one in made.values())
+    versions = sum(len(getattr(one, name, ())) for one in made.values() for name in BRINGS)
+    application = Application.of(kind, **{"assertions": assertions, "versions": 1 + versions, **(known or {})})
+    judge = Judge(settings, application, tuple(one.name for one in present), list(made.values()), resources)
+    watch = Watch(ref.path, judge, change, **options)
+    watch.kind = kind
+    return watch

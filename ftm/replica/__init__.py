@@ -1,0 +1,1 @@
+"""A replica: the process in which the protected actor lives, with the bricks around it."""

@@ -1,0 +1,85 @@
+"""The heart of a replica: it beats as long as the bricks run."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar
+
+from ...actors.errors import HoldfastError
+from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.bindings import Binding
+from ...actors.kernel.message import Message
+from ...checkpoint.protocol import START
+from ..bricks.sealed_frames import tell_over
+from .replica_life import ServerLife
+from .replica_orders import Beat, Stalled
+
+if TYPE_CHECKING:
+    from .rewind_points import Points
+    from .standing import Standing
+
+
+class Tick(Message):
+    """It is time for a heartbeat."""
+
+
+Turn = tuple[int, ServerLife, int]
+"""A turn in hand: epoch, life, input."""
+
+
+class Heart(Actor):
+    """Tells the failure detector that the bricks of this replica run, and that a turn does not end."""
+
+    _is_part: ClassVar[bool] = True
+
+    detector: Binding[Actor]
+    proxy: Binding[Actor]
+
+    def __init__(self, standing: Standing, name: str, interval: float, watch_turns: float) -> None:
+        self._standing, self._name, self._interval, self._longest = standing, name, interval, watch_turns
+        self._turns: dict[Points, tuple[Turn, float]] = {}  # with the seconds that they have taken
+        self._seen = 0.0
+
+    def on_start(self, restored: bool) -> None:
+        """Beat at once, then regularly."""
+        if self._interval > 0:
+            self._beat(Tick())
+            self.ctx.every(self._interval, Tick())
+
+    @on(Tick)
+    def _beat(self, message: Tick) -> None:
+        standing = self._standing
+        try:
+            self.detector.tell(Beat(self._name, standing.epoch))
+            if self._longest:
+                self._watch_turns()
+        except HoldfastError:
+            return  # They are between two lives.
+
+    def _watch_turns(self) -> None:
+        """Tell of a turn that takes too long; a run that is only one of several has failed then."""
+        standing = self._standing
+        now = self.ctx.cell.node.loop.time()
+        gap, self._seen = min(now - self._seen, 2 * self._interval), now  # While this process stood still, no turn ran.
+        before, self._turns = self._turns, {}
+        for server in (standing.server, *standing.shadows):
+            life = server.life
+            feed = None if life is None else life.feed
+            if life is None or feed is None or feed.kind == START:
+                continue
+            turn = standing.epoch, life, feed.id
+            known, seconds = before.get(server, (None, 0.0))
+            seconds = seconds + gap if known == turn else 0.0
+            if seconds > self._longest:
+                seconds /= 2  # It is said again then, if that has not helped.
+                if server is standing.server:
+                    self._say(Stalled(self._name, standing.epoch, feed.id), turn)
+                else:
+                    server.end_turn(feed.id, again=False)
+            self._turns[server] = turn, seconds
+
+    def _say(self, stalled: Stalled, turn: Turn) -> None:
+        link, server = self._standing.link, self._standing.server
+        if link is None:
+            self.proxy.tell(stalled)
+        else:
+            tell_over(link, self.proxy._cell, stalled, lambda: self._turns.get(server, (None, 0.0))[0] == turn)

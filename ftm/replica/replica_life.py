@@ -1,0 +1,156 @@
+"""A life of the protected actor inside a replica, and what stands in its mailbox besides its inputs."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final
+
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.envelope import Item
+from ...actors.kernel.ref import ActorRef
+from ...checkpoint.life.recorded_context import RecordedContext
+from ...checkpoint.life.recorded_inbox import STARTED, Fed, Hook
+from ...checkpoint.life.recorded_life import Life
+from ...checkpoint.method import Method
+from ...checkpoint.protocol import Answer, Feed, ToHome, TurnEnd
+
+if TYPE_CHECKING:
+    from .protected_actor import Server
+
+
+# Why the server came to rest.
+OVER, BLOCKED, ENDED, UNDONE = "over", "blocked", "ended", "undone"
+
+
+class ServerContext(RecordedContext):
+    """`self.ctx` of the protected actor: it knows itself by the address that is protected, on every replica."""
+
+    __slots__ = ("_address",)
+
+    def __init__(self, cell: Cell, address: str) -> None:
+        super().__init__(cell)
+        self._address = address
+
+    @property
+    def path(self) -> str:
+        return self._address
+
+    @property
+    def ref(self) -> ActorRef[Any]:
+        return self.cell.node.cell_at(self._address).ref
+
+    def waits_for_room(self, topic: str) -> bool:
+        """What is published leaves when the turn's result has been compared, voted on or copied, and not before."""
+        return False
+
+
+class ServerLife(Life):
+    """A life of the protected actor. What it wants released in the middle of a turn is the server's to decide."""
+
+    def __init__(self, cell: Cell, server: Server, method: Method) -> None:
+        super().__init__(cell, server, method, None)
+        self.server = server
+        self.ended: Feed | None = None  # what the last turn has handled
+        self.saves = server.has_access
+
+    def _context(self, cell: Cell) -> RecordedContext:
+        made = self._context_made = ServerContext(cell, self.server.address)
+        made.recorded = self
+        return made
+
+    def rewind(self, turn: int, stash: list[Fed]) -> None:
+        """Go on from after an earlier turn: what was run since is run again, or something else is."""
+        self.turn, self.stash = turn, stash
+        self._context_made.draw_anew()
+
+    def close_turn(self, status: str, answer: Answer) -> None:
+        self.ended = self.feed
+        super().close_turn(status, answer)
+
+    def release(self) -> None:
+        if self.feed is not None and self.outs:
+            self.server.wants_out(self)
+
+    def release_now(self) -> None:
+        """What the turn in hand has sent leaves."""
+        super().release()
+
+    def take_snapshot(self, *, is_last: bool = False) -> None:
+        """Asked for by the end in good order; others are made of points."""
+        if is_last:
+            self.server.last_snapshot()
+
+    def want_snapshot(self) -> None:
+        self.server.want_snapshot()
+
+    def pipe_back(self) -> None:
+        super().pipe_back()
+        if not self.pipes:
+            self.server.work_back()
+
+    def replaced(self) -> None:
+        self.server.forget_point()
+        super().replaced()
+
+
+class Nowhere:
+    """The way home of a life that does not count any more."""
+
+    def to_home(self, record: ToHome) -> None:
+        """Nobody hears it."""
+
+    def when_told(self, then: Callable[[], None]) -> None:
+        """There is nobody to tell."""
+
+    def closed(self) -> None:
+        """Nobody waits for it."""
+
+
+NOWHERE: Final = Nowhere()
+
+
+class PartOver(Item):
+    """Stands behind what the server was given: it has come to rest, between two turns."""
+
+    __slots__ = ("number", "server")
+
+    def __init__(self, server: Server, number: int) -> None:
+        self.server, self.number = server, number
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        item.server.part_over(item.number)
+        return None
+
+
+class Skip(Item):
+    """In place of a turn that has failed: its number is used, and it has left nothing else."""
+
+    __slots__ = ("end", "life")
+
+    def __init__(self, life: ServerLife, end: TurnEnd) -> None:
+        self.life, self.end = life, end
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        life: ServerLife = item.life
+        life.turn += 1
+        end: TurnEnd = item.end
+        life.port.to_home(TurnEnd(life.turn, end.id, end.status, [], end.answer, end.state))
+        return None
+
+
+class BeginAgain(Hook):
+    """`on_start` of a life that begins anew without its state, because nobody can save that."""
+
+    __slots__ = ()
+
+    @staticmethod
+    def run(actor: Any, item: Any) -> object:
+        item.life.enter(STARTED)
+        result = actor.on_start(False)
+        if inspect.iscoroutine(result):
+            return item.finish(result)
+        item.over()
+        return None

@@ -1,0 +1,117 @@
+"""The state manager of a replica: captures the state of the protected actor, rewinds it, takes that of another."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, Final
+
+import msgspec
+
+from ...actors.errors import DamagedValue
+from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.bindings import Binding
+from ...actors.kernel.message import Message
+from ...checkpoint.protocol import TurnEnd
+from ..bricks.brick_messages import Change, State
+from .state_images import Misfit
+
+if TYPE_CHECKING:
+    from .standing import Standing
+
+MISFIT: Final = -3
+"""In place of a turn: these differences do not fit; all of it is wanted."""
+
+
+class Captured(msgspec.Struct):
+    """A state, and what leads to it from an earlier one, if that is known and less."""
+
+    state: State
+    change: Change | None
+
+
+class Capture(Message[Captured]):
+    """The state after the last turn, and what has changed since turn `since`."""
+
+    since: int = -2
+
+
+class Apply(Message[int]):
+    """Keep this state instead of one's own, whole or not at all; a life is made of it when one is wanted (T8b).
+
+    The reply is its turn; `MISFIT` if these are differences to something else, or damaged: then nothing has changed.
+    """
+
+    state: State | Change
+
+
+class Ran(msgspec.Struct):
+    """What a run of the last part has come to: its ends, all that they sent, and the state it has left."""
+
+    ends: list[TurnEnd]
+    released: list[tuple[int, list[int]]]
+    state: State
+
+
+class LastRun(Message[Ran]):
+    """What the last part has come to, as it was handed over."""
+
+    ends: list[TurnEnd]
+
+
+class RunAgain(Message[Ran]):
+    """Rewind to where the last part began, and run it again."""
+
+
+class Undo(Message[State]):
+    """Rewind to where the last part began, for good; the reply is that state."""
+
+
+class StateManager(Actor):
+    """Between the bricks and the protected actor's state. It is asked between two parts, never while one runs."""
+
+    _is_part: ClassVar[bool] = True
+
+    server: Binding[Actor]
+
+    def __init__(self, standing: Standing) -> None:
+        self._standing = standing
+
+    @on(Capture)
+    def capture(self, message: Capture) -> Captured:
+        """Save the state."""
+        server = self._standing.server
+        state = server.capture()
+        return Captured(state, server.since(message.since))
+
+    @on(Apply)
+    async def apply(self, message: Apply) -> int:
+        """Take a state."""
+        server = self._standing.server
+        try:
+            state = server.led_to(message.state)
+        except (Misfit, DamagedValue):
+            return MISFIT
+        had_life = server.life is not None
+        if had_life:
+            await server.drop_life()
+        server.install(state)
+        if had_life:
+            await server.ensure()
+        return server.turn
+
+    @on(LastRun)
+    def last_run(self, message: LastRun) -> Ran:
+        """The last part."""
+        server = self._standing.server
+        return Ran(message.ends, sorted(server.released.items()), server.capture())
+
+    @on(RunAgain)
+    async def run_again(self, message: RunAgain) -> Ran:
+        """The last part once more."""
+        server = self._standing.server
+        ends, state = await server.again()
+        return Ran(ends, sorted(server.released.items()), state)
+
+    @on(Undo)
+    async def undo(self, message: Undo) -> State:
+        """The last part leaves no trace."""
+        return await self._standing.server.back()

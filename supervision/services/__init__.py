@@ -1,0 +1,1 @@
+"""Supervisors for a purpose: tasks, pools, partitions, registries and external programs."""

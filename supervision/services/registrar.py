@@ -1,0 +1,416 @@
+"""The actor behind a registry: who holds which key, who waits for which lock. Users reach it through `Registry`.
+
+It runs no code of its users: what they decide with functions is decided in the caller (`registry.py`). A key comes as
+its bytes, so that 1, 1.0 and True are three keys, the same from every process.
+
+The book belongs to the address, not to a life there: a registry that is restarted goes on with it, without those who
+have ended meanwhile.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from typing import Any, Literal
+
+import msgspec
+
+from ...actors.errors import ActorStopped, HoldfastError
+from ...actors.exit_reasons import ExitReason
+from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.cell import DOWN, GONE, Cell
+from ...actors.kernel.envelope import Ask, ReplyHandle
+from ...actors.kernel.links import Monitor
+from ...actors.kernel.message import Message, Refusal
+from ...actors.kernel.ref import ActorRef
+from ...actors.process.wire.peer import OutsideHost
+
+Keys = Literal["unique", "duplicate"]
+
+
+class KeyTaken(Refusal):
+    """A living actor holds this unique key."""
+
+    holder: ActorRef[Any]
+
+
+class NotAnActor(Refusal):
+    """Only an actor can hold a key, for it is freed with its holder's end: call this from a handler."""
+
+
+class NotUnique(Refusal):
+    """The registry allows many entries for one key: `order` would not know which is meant."""
+
+    order: str
+
+
+class Row(msgspec.Struct, frozen=True, array_like=True):
+    """An entry as it travels."""
+
+    number: int
+    key: bytes
+    holder: ActorRef[Any]
+    value: Any
+
+
+class Register(Message[None]):
+    """Hold a key. `life` is the sender's, 0 if it is recorded (its replay must send the same)."""
+
+    key: bytes
+    value: Any
+    life: int
+
+
+class Find(Message[list[Row]]):
+    """The entries of a key, of a holder, of both, or all."""
+
+    key: bytes | None = None
+    holder: ActorRef[Any] | None = None
+
+
+class Count(Message[int]):
+    """How many entries there are."""
+
+
+class Drop(Message[int]):
+    """Give up the sender's entries for a key: those numbered, or all. The reply is how many these were."""
+
+    key: bytes
+    numbers: list[int] | None = None
+
+
+class Replace(Message[bool]):
+    """Put another value into an entry of the sender's; False if it is gone."""
+
+    key: bytes
+    number: int
+    value: Any
+
+
+class Lock(Message[None]):
+    """Have a key's lock; the reply is that it is had."""
+
+    key: bytes
+    ticket: str
+    life: int
+
+
+class Unlock(Message[None]):
+    """Give a lock back, or up."""
+
+    key: bytes
+    ticket: str
+
+
+class PutMeta(Message[None]):
+    """Keep a value that belongs to the registry itself."""
+
+    name: str
+    value: Any
+
+
+class GetMeta(Message[list[Any]]):
+    """Such a value: a list of one, or an empty one."""
+
+    name: str
+
+
+class DeleteMeta(Message[None]):
+    """Forget such a value."""
+
+    name: str
+
+
+class KeyRegistered(Message[None]):
+    """To listeners: `holder` holds `key` from now on."""
+
+    registry: ActorRef[Any]
+    key: Any
+    holder: ActorRef[Any]
+    value: Any
+
+
+class KeyFreed(Message[None]):
+    """To listeners: `holder` holds `key` no more; `ended`: because its life is over."""
+
+    registry: ActorRef[Any]
+    key: Any
+    holder: ActorRef[Any]
+    ended: bool
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class Entry:
+    """One key, held by one life of an actor."""
+
+    number: int
+    key: bytes
+    holder: Cell
+    life: int
+    value: Any
+
+    def row(self) -> Row:
+        """As it travels."""
+        return Row(self.number, self.key, self.holder.ref, self.value)
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class Claim:
+    """Somebody who has a lock, or waits for it."""
+
+    key: bytes
+    ticket: str
+    holder: Cell | None  # None: not an actor, so only it can give the lock back
+    life: int
+    handle: ReplyHandle[Any]
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class Holdings:
+    """What one actor holds, in the order in which it came to it."""
+
+    monitor: Monitor
+    entries: dict[Entry, None] = dataclasses.field(default_factory=dict[Entry, None])
+    claims: dict[Claim, None] = dataclasses.field(default_factory=dict[Claim, None])
+
+
+@dataclasses.dataclass(slots=True, eq=False)
+class Book:
+    """All that a registry knows."""
+
+    meta: dict[str, Any]
+    number: int = 0
+    keys: dict[bytes, dict[Entry, None]] = dataclasses.field(default_factory=dict[bytes, dict[Entry, None]])
+    locks: dict[bytes, deque[Claim]] = dataclasses.field(default_factory=dict[bytes, deque[Claim]])
+    holders: dict[Cell, Holdings] = dataclasses.field(default_factory=dict[Cell, Holdings])
+
+    def given_up(self, error: ActorStopped) -> None:
+        """Nobody gets a lock here any more."""
+        for waiting in self.locks.values():
+            for claim in waiting:
+                claim.handle.fail(error)
+
+
+class RegistryActor(Actor):
+    """Keeps the book of one registry. Started by `registry(...)`, used through `Registry(ref)`."""
+
+    deterministic = False
+    _keeps_promises = True
+
+    def __init__(self, keys: Keys, listeners: tuple[str, ...], meta: dict[str, Any]) -> None:
+        self._is_unique = keys == "unique"
+        self._listeners = listeners
+        self._first_meta = meta
+
+    def on_start(self, restored: bool) -> None:
+        """Go on with the book that earlier lives at this address have kept, without those who are dead by now."""
+        cell = self.ctx.cell
+        book = cell.node.kept.get(cell)
+        if not isinstance(book, Book):
+            book = cell.node.kept[cell] = Book(dict(self._first_meta))
+        self._book = book
+        for holder, holdings in list(book.holders.items()):
+            holdings.monitor.cancel()
+            holdings.monitor = self.ctx.monitor(holder.ref)
+            self._drop_dead(holder)
+
+    # -- who holds what ---------------------------------------------------------------------------------------------
+
+    @on(Register)
+    def _register(self, message: Register) -> None:
+        """A unique key has one living holder; a later life of it may say it again."""
+        holder = self._sender()
+        if not is_living(holder, message.life):
+            return  # Its ask has outlived it.
+        if self._is_unique:
+            for entry in list(self._book.keys.get(message.key, ())):
+                if not is_living(entry.holder, entry.life):
+                    self._remove(entry, ended=True)  # Its DOWN is still on the way.
+                elif entry.holder is holder and message.life == 0:
+                    entry.value = message.value
+                    return
+                else:
+                    raise KeyTaken(entry.holder.ref)
+        self._book.number += 1
+        entry = Entry(self._book.number, message.key, holder, message.life, message.value)
+        self._book.keys.setdefault(message.key, {})[entry] = None
+        self._holdings(holder).entries[entry] = None
+        self._tell_listeners(KeyRegistered(self.ctx.ref, key_of(entry.key), holder.ref, entry.value))
+
+    @on(Find, readonly=True)
+    def _find(self, message: Find) -> list[Row]:
+        """Entries in the order in which they came, without those of the dead."""
+        book = self._book
+        if message.holder is not None:
+            holdings = book.holders.get(message.holder._cell)
+            found = [] if holdings is None else list(holdings.entries)
+            if message.key is not None:
+                found = [entry for entry in found if entry.key == message.key]
+        elif message.key is not None:
+            found = list(book.keys.get(message.key, ()))
+        else:
+            found = [entry for entries in book.keys.values() for entry in entries]
+        return [entry.row() for entry in found if is_living(entry.holder, entry.life)]
+
+    @on(Count, readonly=True)
+    def _count(self, message: Count) -> int:
+        """All entries of the living."""
+        return sum(is_living(entry.holder, entry.life) for entries in self._book.keys.values() for entry in entries)
+
+    @on(Drop)
+    def _drop(self, message: Drop) -> int:
+        """Only one's own; what is not there is no error."""
+        holdings = self._book.holders.get(self._sender())
+        mine = [entry for entry in (holdings.entries if holdings is not None else ()) if entry.key == message.key]
+        if message.numbers is not None:
+            mine = [entry for entry in mine if entry.number in message.numbers]
+        for entry in mine:
+            self._remove(entry, ended=False)
+        return len(mine)
+
+    @on(Replace)
+    def _replace(self, message: Replace) -> bool:
+        """Only one's own."""
+        if not self._is_unique:
+            raise NotUnique("update_value")
+        holder = self._sender()
+        for entry in self._book.keys.get(message.key, ()):
+            if entry.number == message.number and entry.holder is holder:
+                entry.value = message.value
+                return True
+        return False
+
+    def _remove(self, entry: Entry, *, ended: bool) -> None:
+        entries = self._book.keys[entry.key]
+        del entries[entry]
+        if not entries:
+            del self._book.keys[entry.key]
+        del self._book.holders[entry.holder].entries[entry]
+        self._let_go(entry.holder)
+        self._tell_listeners(KeyFreed(self.ctx.ref, key_of(entry.key), entry.holder.ref, ended))
+
+    # -- locks ------------------------------------------------------------------------------------------------------
+
+    @on(Lock)
+    def _lock(self, message: Lock) -> ReplyHandle[Any] | None:
+        """First come, first served."""
+        item = self.ctx.item
+        handle = self.ctx.reply_handle()
+        sender = item.sender if isinstance(item, Ask) else None
+        if sender is not None and not is_living(sender, message.life):
+            return None
+        claim = Claim(message.key, message.ticket, sender, message.life, handle)
+        waiting = self._book.locks.setdefault(message.key, deque())
+        waiting.append(claim)
+        if sender is not None:
+            self._holdings(sender).claims[claim] = None
+        if waiting[0] is claim:
+            handle.reply(None)
+        return handle
+
+    @on(Unlock)
+    def _unlock(self, message: Unlock) -> None:
+        """The ticket says whose: a claim that is no longer wanted is given up in the same way."""
+        for claim in self._book.locks.get(message.key, ()):
+            if claim.ticket == message.ticket:
+                self._give_up(claim)
+                return
+
+    def _give_up(self, claim: Claim) -> None:
+        waiting = self._book.locks[claim.key]
+        had_it = waiting[0] is claim
+        waiting.remove(claim)
+        if claim.holder is not None:
+            del self._book.holders[claim.holder].claims[claim]
+            self._let_go(claim.holder)
+        if not waiting:
+            del self._book.locks[claim.key]
+        elif had_it:
+            waiting[0].handle.reply(None)  # If it does not wait any more, its `Unlock` or DOWN is on the way.
+
+    # -- metadata ---------------------------------------------------------------------------------------------------
+
+    @on(PutMeta)
+    def _put_meta(self, message: PutMeta) -> None:
+        """Any value under a name."""
+        self._book.meta[message.name] = message.value
+
+    @on(GetMeta, readonly=True)
+    def _get_meta(self, message: GetMeta) -> list[Any]:
+        """None is a value too."""
+        meta = self._book.meta
+        return [meta[message.name]] if message.name in meta else []
+
+    @on(DeleteMeta)
+    def _delete_meta(self, message: DeleteMeta) -> None:
+        """What is not there is no error."""
+        self._book.meta.pop(message.name, None)
+
+    # -- ends -------------------------------------------------------------------------------------------------------
+
+    def on_down(self, source: ActorRef[Any], reason: ExitReason, recovering: bool) -> None:
+        """A holder's life is over, unless it is brought back with its state: then it holds what it held."""
+        if not recovering:
+            self._drop_dead(source._cell, told=True)
+
+    def _drop_dead(self, holder: Cell, *, told: bool = False) -> None:
+        """Free what the ended lives of an actor held; if it was `told`, a stand-in has ended whatever it looks like."""
+        sure = told and isinstance(holder.host, OutsideHost)
+        holdings = self._book.holders.get(holder)
+        if holdings is None:
+            return
+        for entry in list(holdings.entries):
+            if sure or not is_living(holder, entry.life):
+                self._remove(entry, ended=True)
+        for claim in list(holdings.claims):
+            if claim in holdings.claims and (sure or not is_living(holder, claim.life)):
+                self._give_up(claim)
+
+    def _sender(self) -> Cell:
+        """Whoever asks, if it is an actor."""
+        sender = self.ctx.sender
+        if sender is None:
+            raise NotAnActor
+        cell: Cell = sender._cell
+        return cell
+
+    def _holdings(self, holder: Cell) -> Holdings:
+        holdings = self._book.holders.get(holder)
+        if holdings is None:
+            holdings = self._book.holders[holder] = Holdings(self.ctx.monitor(holder.ref))
+        return holdings
+
+    def _let_go(self, holder: Cell) -> None:
+        """Who holds nothing need not be monitored."""
+        holdings = self._book.holders[holder]
+        if not holdings.entries and not holdings.claims:
+            del self._book.holders[holder]
+            holdings.monitor.cancel()
+
+    def _tell_listeners(self, message: Message[Any]) -> None:
+        node = self.ctx.cell.node
+        for name in self._listeners:
+            cell = node.find(name) if name.startswith("/") else node.names.get(name)
+            if cell is None:
+                continue  # Nobody listens at the moment.
+            try:
+                cell.ref.tell(message)
+            except HoldfastError as error:  # One's trouble is not the registry's.
+                node.dead_letter(cell, message, str(error))
+
+
+def is_living(holder: Cell, life: int) -> bool:
+    """Whether that life of an actor goes on; a recorded one (life 0) also while it is brought back."""
+    if life == 0:
+        return not holder.is_dead
+    # A stand-in in another process counts no lives: there it takes the DOWN to know.
+    return holder.state not in (DOWN, GONE) and holder.life in (0, life)
+
+
+def key_of(packed: bytes) -> Any:
+    """The key again: lists can only have been tuples."""
+    return _hashable(msgspec.msgpack.decode(packed))
+
+
+def _hashable(value: Any) -> Any:
+    return tuple(map(_hashable, value)) if isinstance(value, list) else value

@@ -1,0 +1,317 @@
+"""Moving live actors between tasks and OS processes: which moves there are, one at a time for each actor."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import weakref
+from collections.abc import Callable, Coroutine
+from typing import TYPE_CHECKING, Any, get_args
+
+from ..actors.control.orders import Ready
+from ..actors.control.orders_lane import order
+from ..actors.errors import CannotMove, SpecError
+from ..actors.events import Moved
+from ..actors.kernel.cell import Cell, Host
+from ..actors.kernel.lifecycle import LOCAL
+from ..actors.kernel.node import cell_kind
+from ..actors.kernel.ref import current
+from ..actors.migration.process_move import Move
+from ..actors.migration.to_process import ToProcess
+from ..actors.migration.to_task import ToTask
+from ..actors.process.process_host import ProcessHost
+from ..actors.process.resource_limits import Limits
+from ..actors.process.worker_pool import Workers
+from ..checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
+from ..checkpoint.home.recorded_moves import RecordedToProcess, RecordedToTask
+from ..supervision.respec import recipe_spec, replace_mechanism, replace_place
+from ..supervision.spec import ChildSpec, Isolation
+from ..supervision.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from ..actors.kernel.node import Node
+    from ..checkpoint.home.homes import Homes
+
+
+class Moves:
+    """The moves of one system."""
+
+    def __init__(self, node: Node, workers: Workers) -> None:
+        self._node, self._workers = node, workers
+        self._turns: weakref.WeakKeyDictionary[Cell, asyncio.Lock] = weakref.WeakKeyDictionary()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._under_way: dict[Cell, Move] = {}  # of mechanisms
+
+    async def move(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+        """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
+
+        Raises:
+            CannotMove, ActorStopped, AskTimeout, ProcessUnavailable.
+        """
+        caller = current.get(None)
+        if caller is not None and caller.cell is cell and caller.in_turn():
+            raise CannotMove(cell.path, "a turn of its own waits for it; call this from outside, or from a task")
+        task = self._node.loop.create_task(
+            self._in_turn(cell, isolation, limits, timeout),
+            name=f"move of {cell.path}",
+            context=self._node.base_context.copy(),
+        )
+        self._tasks.add(task)
+        task.add_done_callback(self._over)
+        await to_its_end(cell.path, task)
+
+    def _over(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if not task.cancelled():
+            task.exception()  # Seen: whoever wanted it may not wait any more.
+
+    async def close(self) -> None:
+        """Undo what is under way."""
+        for task in list(self._tasks):
+            task.cancel()
+        if self._tasks:
+            await asyncio.wait(self._tasks)
+
+    async def _in_turn(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+        lock = self._turns.setdefault(cell, asyncio.Lock())
+        async with lock:
+            origin = place_of(cell)
+            if origin == isolation:
+                return
+            spec = _spec_there(cell, isolation, limits)
+            end = self._node.loop.time() + timeout
+            while True:
+                if not cell.host.is_up(cell):
+                    await order(cell, Ready(), timeout)  # It is being restarted: its next life is moved.
+                move = self._made(cell, spec, timeout)
+                move.moved = lambda: replace_place(cell, spec)
+                try:
+                    await move.run()
+                    break
+                except CannotMove:
+                    if not move.is_late or cell.is_dead or self._node.loop.time() > end:
+                        raise
+            if self._node.watched:
+                self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
+
+    async def protect(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> None:
+        """Have a group of replicas live an actor's life.
+
+        Raises:
+            CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it goes on as it was.
+        """
+        await self._alone(cell, self._protected(cell, homes, mechanism, timeout), f"attach to {cell.path}")
+
+    async def _protected(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> None:
+        from ..ftm.events import MechanismAttached
+        from ..ftm.migration.attach import to_group
+
+        before = _spec_of(cell)
+        wanted = dataclasses.replace(before, mechanism=mechanism)
+
+        def moved() -> None:
+            replace_mechanism(cell, wanted)
+            probation = getattr(cell.host, "probation", None)
+            if probation is not None:
+                probation.detach = lambda: self.unprotect(cell, timeout)
+
+        if place_of(cell) == "process":
+            await self._settle_in(cell, "task", before.limits, timeout)
+        try:
+            move = await self._moved(
+                cell,
+                timeout,
+                lambda: to_group(cell, homes, mechanism, timeout),
+                moved,
+            )
+        except BaseException:
+            if before.isolation == "process":
+                await self._settle_in(cell, "process", before.limits, timeout)
+            raise
+        if self._node.watched:
+            names = tuple(layer.name for layer in move.host.layers)
+            self._node.emit(MechanismAttached(cell.path, names, move.gone_on_at - move.rest_at))
+
+    async def unprotect(self, cell: Cell, timeout: float) -> None:
+        """Have a protected actor live as its spec says without the mechanism.
+
+        Raises:
+            CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it stays protected.
+        """
+        await self._alone(cell, self._unprotected(cell, timeout), f"detach from {cell.path}")
+
+    async def _unprotected(self, cell: Cell, timeout: float) -> None:
+        from ..ftm.events import MechanismDetached
+        from ..ftm.mechanisms.mechanism import compose
+        from ..ftm.migration.detach import from_group
+
+        before: ChildSpec = cell.spec
+        wanted = dataclasses.replace(before, mechanism=None, isolation="task")
+        move = await self._moved(
+            cell,
+            timeout,
+            lambda: from_group(cell, self._node.host_for(wanted), timeout),
+            lambda: replace_mechanism(cell, wanted),
+        )
+        if self._node.watched:
+            names = tuple(layer.name for layer in compose(before.mechanism))
+            self._node.emit(MechanismDetached(cell.path, names, move.gone_on_at - move.rest_at))
+        if before.isolation == "process":
+            await self._settle_in(cell, "process", before.limits, timeout)
+
+    async def adapt(self, cell: Cell, mechanism: Any, timeout: float) -> None:
+        """Have a protected actor go on with another stack of mechanisms, all of it given.
+
+        Raises:
+            CannotAdapt, ActorStopped, AskTimeout: it stays as it was.
+        """
+        await self._alone(cell, self._adapted(cell, mechanism, timeout), f"adaptation of {cell.path}")
+
+    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float) -> None:
+        from ..ftm.events import MechanismChanged
+        from ..ftm.group.group_host import GroupHost
+        from ..ftm.group.reconfiguration import CannotAdapt
+
+        before: ChildSpec = cell.spec
+        wanted = dataclasses.replace(before, mechanism=mechanism)
+        end = self._node.loop.time() + timeout
+        while True:
+            if not cell.host.is_up(cell):
+                await order(cell, Ready(), timeout)  # It is being recovered: its next life is changed.
+            host = cell.host
+            if not isinstance(host, GroupHost):
+                raise CannotAdapt(cell.path, "it has no mechanism")
+            old, life = host.layers, cell.life
+            try:
+                change = await host.adapt(cell, mechanism, lambda: replace_mechanism(cell, wanted))
+                break
+            except CannotAdapt:
+                if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
+                    raise
+        if self._node.watched:
+            was, names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
+            seconds = change.gone_on_at - change.rest_at
+            self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
+
+    async def _alone(self, cell: Cell, change: Coroutine[Any, Any, None], name: str) -> None:
+        """Carry out a change of where an actor lives while no other is; it comes to its end in any case."""
+
+        async def in_turn() -> None:
+            async with self._turns.setdefault(cell, asyncio.Lock()):
+                await change
+
+        task = self._node.loop.create_task(in_turn(), name=name, context=self._node.base_context.copy())
+        self._tasks.add(task)
+        task.add_done_callback(self._over)
+        task.add_done_callback(lambda done: change.close())  # It may never have begun.
+        await to_its_end(cell.path, task)
+
+    async def _settle_in(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+        spec = _spec_there(cell, isolation, limits)
+        await self._moved(cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec))
+
+    def give_up(self, cell: Cell, why: str) -> None:
+        """What is under way there ends soon, undone, unless it is done already."""
+        move = self._under_way.get(cell)
+        if move is not None:
+            move.give_up(why)
+
+    async def _moved(self, cell: Cell, timeout: float, made: Callable[[], Move], moved: Callable[[], None]) -> Any:
+        """Carry out a move; if the life ends before it is at rest, its next life is moved."""
+        end = self._node.loop.time() + timeout
+        while True:
+            if not cell.host.is_up(cell):
+                await order(cell, Ready(), timeout)
+            move = self._under_way[cell] = made()
+            move.moved = moved
+            try:
+                await move.run()
+            except CannotMove:
+                if not move.is_late or cell.is_dead or self._node.loop.time() > end:
+                    raise
+            else:
+                return move
+            finally:
+                del self._under_way[cell]
+                ending: asyncio.Future[None] | None = getattr(move, "ending", None)
+                if ending is not None:  # The processes of replicas that are not needed.
+                    await ending
+
+    def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
+        """The move that brings the actor to where its spec says."""
+        old, new = cell.host, self._node.host_for(spec)
+        if isinstance(new, RecordedProcessHost):
+            return RecordedToProcess(cell, new, timeout, self._workers, spec.limits)
+        if isinstance(new, ProcessHost):
+            return ToProcess(cell, new, timeout, self._workers, spec.limits)
+        worker = old.worker_of(cell) if isinstance(old, ProcessHost) else None
+        if worker is None:
+            raise CannotMove(cell.path, "its process has ended")
+        if isinstance(new, TaskHost):
+            return RecordedToTask(cell, new, timeout, worker)
+        return ToTask(cell, new, timeout, worker)
+
+
+def check_isolation(isolation: object, limits: object, timeout: object) -> None:
+    """Raises SpecError: what a move is told is not valid."""
+    if isolation not in get_args(Isolation):
+        raise SpecError("set_isolation", f"isolation must be 'task' or 'process', not {isolation!r}")
+    if limits is not None and (not isinstance(limits, Limits) or isolation != "process"):
+        raise SpecError("set_isolation", f"limits must be Limits(...), of a process, or left out, not {limits!r}")
+    if not isinstance(timeout, (int, float)) or isinstance(timeout, bool) or not 0 < timeout < float("inf"):
+        raise SpecError("set_isolation", f"timeout must be a number of seconds > 0, not {timeout!r}")
+
+
+async def to_its_end(actor: str, change: asyncio.Future[None]) -> None:
+    """Wait for a change of where an actor lives, which goes on if whoever waits is cancelled.
+
+    Raises:
+        CannotMove: it was cancelled, for the system ends; nobody has cancelled whoever waits.
+        CancelledError: whoever waits was.
+    """
+    try:
+        await asyncio.shield(change)
+    except asyncio.CancelledError:
+        if change.cancelled():
+            raise CannotMove(actor, "the system ends") from None
+        raise
+
+
+def _spec_of(cell: Cell) -> ChildSpec:
+    """The spec of a child, also if its supervisor lives in another process. Raises CannotMove: it is not known."""
+    spec = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
+    if spec is None:
+        raise CannotMove(cell.path, "nobody restarts it, so nobody knows how; start it as a child of a supervisor")
+    return spec
+
+
+def place_of(cell: Cell) -> Isolation:
+    """Where an actor lives: in a process of its own, or as a task of whatever process."""
+    return "process" if isinstance(cell.host, ProcessHost) else "task"
+
+
+def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> ChildSpec:
+    """The spec of an actor that lives there.
+
+    Raises:
+        CannotMove: it cannot.
+    """
+    spec, kind = cell.spec, cell_kind(cell)
+    if kind is not None and issubclass(kind, Supervisor):
+        raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
+    if isinstance(spec, ChildSpec) and spec.mechanism is not None:
+        raise CannotMove(cell.path, "it is protected by a mechanism, whose replicas have processes: detach that first")
+    if not _is_here(cell):
+        raise CannotMove(cell.path, "its supervisor lives in another process, which cannot have processes of its own")
+    if not isinstance(spec, ChildSpec):
+        raise CannotMove(cell.path, "nobody restarts it, so nobody knows how; start it as a child of a supervisor")
+    try:
+        return dataclasses.replace(spec, isolation=isolation, limits=limits if limits is not None else spec.limits)
+    except SpecError as error:
+        raise CannotMove(cell.path, str(error)) from error
+
+
+def _is_here(cell: Cell) -> bool:
+    """Whether it is this process that begins the lives of an actor."""
+    host: Host = cell.host
+    return host is LOCAL or isinstance(host, (ProcessHost, TaskHost))

@@ -1,0 +1,61 @@
+"""The entry point of actor processes: gives a guest what only the composition root knows."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import socket
+from typing import Any, cast
+
+from ..actors.kernel.cell import Cell, Host
+from ..actors.process import worker_node
+from ..actors.process.wire import frames
+from ..checkpoint.life.worker_lives import GuestKeeper, RecordedGuest
+from ..checkpoint.protocol import Carried, Handover
+from ..checkpoint.recovery_file import RecoveryFile
+from ..supervision.respec import respec
+
+
+def main(sock: socket.socket, page_fd: int) -> int:
+    """Called by the fork server in each child."""
+    return worker_node.main(sock, page_fd, launch, prepare)
+
+
+def prepare(host: worker_node.Guest) -> None:
+    """Before the root's first frame: a recorded life may get its state before it is launched."""
+    host.recovery = RecordedGuest(host)
+    host.node.respec = respec
+    host.recovery.on_handover = functools.partial(handed_over, host)
+    host.node.host_for = functools.partial(host_for, host)
+
+
+def host_for(host: worker_node.Guest, spec: Any) -> Host:
+    """Where a child below this process's supervisor is lived."""
+    if spec.mechanism is None:
+        return cast("Host", host.recovery.host_for(spec))
+    from ..ftm.migration.protected_stand_ins import InnerGroupHost  # Most processes protect nobody.
+
+    return InnerGroupHost(host, spec, host.recovery.port_of)
+
+
+def handed_over(host: worker_node.Guest, path: str, record: Handover | Carried) -> None:
+    """A live child of this process's supervisor gets a mechanism, or loses it."""
+    from ..ftm.migration import protected_stand_ins, unrecorded_in_worker
+
+    if isinstance(record, Carried):
+        unrecorded_in_worker.hear(host, path, record)
+    else:
+        protected_stand_ins.take(host, path, record)
+
+
+def launch(host: worker_node.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:
+    """Begin the life that the root asks for."""
+    options = frame.options
+    host.node.keeper = GuestKeeper(host, options.get("kept", {}), options.get("known", []))
+    if "recovery_file" in options:
+        host.node.complete = RecoveryFile(**options["recovery_file"]).complete
+    recorded = options.get("recorded")
+    if recorded is None:
+        return cell.host.start(cell)
+    host.recovery.start(cell, recorded)
+    return None
