@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..errors import CannotMove, StartFailed
@@ -38,7 +38,6 @@ class Move:
         self.is_done = False
         self.is_late = False  # its life has ended before it was at rest
         self.moved: Callable[[], None] = lambda: None  # called at once when the new life is the one
-        self._start = cell.extra().start
         self._hearing = contextlib.ExitStack()
 
     async def run(self) -> None:
@@ -124,6 +123,17 @@ class Move:
         """The old life handles nothing any more."""
         self.transit = Transit(self.cell.host, self.give_up)
         self.cell.host = self.transit
+
+    @contextlib.contextmanager
+    def commit(self) -> Iterator[None]:
+        """Within this the new life becomes the one: there is no way back from here on."""
+        self.is_done = True
+        tap = self.cell.extra().tap
+        if tap is not None:
+            tap.detach()
+        yield
+        if tap is not None:
+            tap.attach()
 
     def reason(self) -> ExitReason:
         """What the old life's `on_stop` is told."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 import time
+from collections import deque
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
@@ -226,6 +227,15 @@ def settle(twin: Cell, cell: Cell) -> None:
         child.parent = cell
         cell.children = {**(cell.children or {}), child.name: child}
     _forward(twin)
+
+
+def settle_with_queue(twin: Cell, cell: Cell) -> None:
+    """As `settle`, of a recorded life: what is in its queue comes along, for its home has fed it."""
+    queue, its = twin.queue, twin.extra()
+    urgent, suspended = its.urgent, its.suspended
+    settle(twin, cell)
+    more = cell.extra()
+    cell.queue, more.urgent, more.suspended = deque(queue or ()), urgent, suspended
 
 
 def _forward(twin: Cell) -> None:

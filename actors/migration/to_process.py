@@ -8,15 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 from ..control.orders_lane import Call
 from ..errors import BadMessage, CannotMove
-from ..kernel import lifecycle, mailbox
+from ..kernel import mailbox
 from ..kernel.cell import Cell
 from ..kernel.lifecycle import Stop
 from ..kernel.links import Monitor
 from ..process.process_host import Outlet, ProcessHost, RemoteBound, admit_remote, admit_remote_bounded, undelivered
 from ..process.wire.start_codec import pack_recipe
+from .here import Departure
 from .luggage import check_sendable, pack_rest
 from .process_move import Move
-from .quiesce import Take, Transit, farewell, now, obey_commands, part, resume, sorted_out
+from .quiesce import Transit, farewell, now, obey_commands, part, resume, sorted_out
 from .worker_moves import send_luggage
 
 if TYPE_CHECKING:
@@ -39,9 +40,8 @@ class ToProcess(Move):
         self.workers, self.limits = workers, limits
         self.worker: Worker | None = None
         self.recipe = b""
-        self._take: Take | None = None
+        self._departure = Departure(self, lambda ask: self._expecting().expect(ask), self._pack)
         self._luggage: dict[str, Any] = {}
-        self._taken: asyncio.Future[None] = self.node.loop.create_future()
         self._began: asyncio.Future[float] = self.node.loop.create_future()
         self._topics: set[str] = set()
         self._links: set[Cell] = set()
@@ -64,23 +64,15 @@ class ToProcess(Move):
             self._began.set_result(float(data["at"]))
 
     async def take(self) -> None:
-        worker = self.worker
-        assert worker is not None
-        take = self._take = Take(worker.expect, self._at_rest, self.give_up)
-        lifecycle.urge(self.cell, take)
-        await self.within(self._taken, self.timeout, lambda: f"{take.why}, and that did not change")
+        await self._departure.quiesce()
 
-    def _at_rest(self, actor: Actor, state: bytes) -> None:
-        """Called in its place between two turns; if this raises, the actor goes on."""
-        if self.given_up.done():
-            raise CannotMove(self.cell.path, self.given_up.result())
-        if self.cell.extra().start is not self._start:
-            raise CannotMove(self.cell.path, "its code was replaced meanwhile; try again")
-        self.rest_at = now()
+    def _expecting(self) -> Worker:
+        assert self.worker is not None
+        return self.worker
+
+    def _pack(self, actor: Actor, state: bytes) -> None:
         self.remember()
         self.pack(actor, state)
-        self.at_rest()
-        self._taken.set_result(None)
 
     def pack(self, actor: Actor, state: bytes) -> None:
         """Pack what the actor takes along."""
@@ -115,27 +107,22 @@ class ToProcess(Move):
         cell, host, more = self.cell, self.host, self.cell.extra()
         assert isinstance(host, ProcessHost)
         assert self.transit is not None
-        self.is_done = True
-        suspended, stash = more.suspended, list(more.stash or ())
-        old = part(cell)
-        items, commands = sorted_out(cell)
-        tap = more.tap
-        if tap is not None:
-            tap.detach()
-        outlet = more.outlet = Outlet(cell.path)
-        cell.admit = admit_remote
-        if more.bound is not None:
-            more.bound = RemoteBound(more.bound).inherit(more.bound)
-            cell.admit = admit_remote_bounded
-        worker.adopt(cell, None, host.died)
-        self._unpack_there(worker, stash, suspended=suspended)
-        outlet.worker = worker
-        calls = [item for item in items if isinstance(item, Call)]
-        cell.queue = deque(item for item in items if not isinstance(item, Call))
-        send_queue(cell)
-        worker.connection.flush()
-        if tap is not None:
-            tap.attach()
+        with self.commit():
+            suspended, stash = more.suspended, list(more.stash or ())
+            old = part(cell)
+            items, commands = sorted_out(cell)
+            outlet = more.outlet = Outlet(cell.path)
+            cell.admit = admit_remote
+            if more.bound is not None:
+                more.bound = RemoteBound(more.bound).inherit(more.bound)
+                cell.admit = admit_remote_bounded
+            worker.adopt(cell, None, host.died)
+            self._unpack_there(worker, stash, suspended=suspended)
+            outlet.worker = worker
+            calls = [item for item in items if isinstance(item, Call)]
+            cell.queue = deque(item for item in items if not isinstance(item, Call))
+            send_queue(cell)
+            worker.connection.flush()
         self.transit.over(cell, host)
         obey_commands(cell, [*commands, *calls])
         farewell(old, Stop(self.reason()))
@@ -152,8 +139,7 @@ class ToProcess(Move):
 
     def undo(self) -> None:
         cell, worker = self.cell, self.worker
-        if self._take is not None:
-            self._take.is_void = True
+        self._departure.call_off()
         if worker is not None:
             worker.give_back()
         transit = self.transit

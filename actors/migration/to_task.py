@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from ..control.orders_lane import OrderAsk
-from ..errors import AskFailed, StartFailed, error_text
+from ..errors import AskFailed, error_text
 from ..exit_reasons import KILLED, ExitReason
 from ..kernel import lifecycle, mailbox
-from ..kernel.cell import RUNNING, Cell, Host
-from ..kernel.context import ActorContext
+from ..kernel.cell import Cell, Host
 from ..kernel.envelope import Ask
 from ..kernel.links import Monitor
 from ..kernel.stopping import PATIENCE
 from ..process.process_host import Outlet, ProcessHost
+from .here import Arrival
 from .luggage import unpack, unpack_items
 from .process_move import Move
-from .quiesce import decoded, now, obey_commands, settle, sorted_out, twin
+from .quiesce import now, obey_commands, sorted_out
 from .to_process import let_in, send_queue
-from .worker_moves import Luggage, await_up
+from .worker_moves import Luggage
 
 if TYPE_CHECKING:
+    from ..kernel.actor import Actor
     from ..process.worker_pool import Worker
 
 
@@ -109,7 +109,7 @@ class ToTask(FromProcess):
         self._queued: list[Any] = []
         self._stash: list[Any] = []
         self._asks: dict[int, Ask] = {}
-        self._twin: Cell | None = None
+        self._arrival: Arrival | None = None
         self._left_behind: tuple[list[Any], list[Any]] = [], []
 
     def left(self) -> None:
@@ -146,59 +146,32 @@ class ToTask(FromProcess):
         super().old_died(cell, reason)
 
     async def carry(self) -> None:
-        cell, start = self.cell, self.cell.extra().start
+        start, rest = self.cell.extra().start, self._luggage["rest"]
         assert start is not None
-        other = self._twin = twin(cell)
-        other.table = start.kind._table
-        its = other.extra()
-        its.bindings = cell.extra().bindings
-        lifecycle.build(other, start, ActorContext)
-        actor, rest = other.actor, self._luggage["rest"]
-        assert actor is not None
-        try:
+
+        def restore(actor: Actor) -> None:
             unpack(actor, self._luggage["state"], rest, self._asks.__getitem__, self._watched)
-        except BaseException as error:
-            raise StartFailed(cell.path, f"its state could not be restored: {error_text(error)}") from error
-        gone = other.ended()
-        settled = await_up(other, start)
-        gone.add_done_callback(lambda done: _fail(settled, cell, done.result()))
-        await self.within(settled, self.timeout, lambda: "its new life was not up")
-        self._commit(other)
+
+        arrival = self._arrival = Arrival(self.cell)
+        await arrival.is_up(self, arrival.begin(start, restore))
+        self._commit(arrival)
 
     def _watched(self, path: str, for_good: bool) -> Monitor:
         watching: dict[Monitor, None] = self.cell.extra().watching
         return next(watch for watch in watching if watch.target.path == path and watch.for_good is for_good)
 
-    def _commit(self, other: Cell) -> None:
+    def _commit(self, arrival: Arrival) -> None:
         """From here on the new life is the one."""
         cell, more = self.cell, self.cell.extra()
         assert self.transit is not None
-        self.is_done = True
-        tap = more.tap
-        if tap is not None:
-            tap.detach()
-        held, commands = sorted_out(cell)
-        own, own_commands = sorted_out(other, ticks=True)
-        settle(other, cell)
-        more.outlet = None
-        cell.admit = mailbox.admit_first
-        if more.bound is not None:
-            bound, more.bound = more.bound, mailbox.Bound(more.bound.capacity, more.bound.overflow).inherit(more.bound)
-            assert bound is not more.bound
-            cell.admit = mailbox.admit_bounded
-        queue = mailbox.queue_of(cell)
-        items = (decoded(cell, item) for item in (*own, *self._queued, *held))
-        queue.extend(item for item in items if item is not None)
-        if more.bound is not None:
-            more.bound.count = sum(map(mailbox.counts, queue))
-            let_in(cell, more.bound)
-        stash = [kept for item in self._stash if (kept := decoded(cell, item)) is not None]
-        more.stash = deque(stash) if stash else None
-        if self.suspended:
-            more.suspended = True
-            mailbox.hold(cell)
-        if tap is not None:
-            tap.attach()
+        with self.commit():
+            held, commands = sorted_out(cell)
+            old = more.bound
+            bound = None if old is None else mailbox.Bound(old.capacity, old.overflow).inherit(old)
+            queue = (*self._queued, *held)
+            own_commands = arrival.take_over(queue, self._stash, bound, suspended=self.suspended)
+            if bound is not None:
+                let_in(cell, bound)
         self.worker.take_pending() if self.dead is not None else self._keep_orders()
         self.transit.over(cell, self.host)
         self.leave()
@@ -216,8 +189,8 @@ class ToTask(FromProcess):
 
     def undo(self) -> None:
         cell, worker, transit = self.cell, self.worker, self.transit
-        if self._twin is not None:
-            dispose(self._twin)
+        if self._arrival is not None:
+            self._arrival.discard()
         if transit is None:
             self.tell_old("back")
             return
@@ -239,20 +212,3 @@ class ToTask(FromProcess):
         cell.host = host
         host.died(cell, self.dead)
         transit.over(cell, host)
-
-
-def _fail(settled: asyncio.Future[None], cell: Cell, reason: ExitReason) -> None:
-    """The new life has ended before it was the one."""
-    if not settled.done():
-        settled.set_exception(StartFailed(cell.path, str(reason)))
-        settled.exception()
-
-
-def dispose(other: Cell) -> None:
-    """End a new life that is not to be."""
-    if other.state is not RUNNING or other.actor is None:
-        return
-    if other.more is not None and other.more.turn is not None:
-        other.kill()
-    else:
-        lifecycle.killed(other)

@@ -8,15 +8,26 @@ goes on with the old one, and feeds it what has come since.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
 from typing import TYPE_CHECKING
 
 from ...actors.errors import CannotMove, StartFailed
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.cell import Cell
-from ...actors.migration.quiesce import Settle, Transit, farewell, now, obey_commands, part, settle, sorted_out, twin
+from ...actors.kernel.envelope import Item
+from ...actors.migration.here import Arrival
+from ...actors.migration.quiesce import (
+    Settle,
+    Transit,
+    farewell,
+    now,
+    obey_commands,
+    part,
+    settle_with_queue,
+    sorted_out,
+)
 from ...actors.migration.to_process import ToProcess
-from ...actors.migration.to_task import FromProcess, dispose
+from ...actors.migration.to_task import FromProcess
 from ...actors.process.resource_limits import Limits
 from ...actors.process.worker_pool import Worker, Workers
 from ..life.recorded_inbox import StopRecorded
@@ -66,6 +77,20 @@ def refuse_unsaved(cell: Cell, home: Switch | None) -> None:
     """
     if home is not None and not home.method.replays and home.turns:
         raise CannotMove(cell.path, "its last snapshot could not be kept, and it is not replayed")
+
+
+def leave_task(cell: Cell, host: TaskHost, reason: ExitReason) -> tuple[Cell, StopRecorded, list[Item]]:
+    """A recorded life that is at rest here is its address's no more.
+
+    Returns: where it is now, what is to end it there, and the commands that are for the new life.
+    """
+    life = host.life
+    assert life is not None
+    life.port.shut()  # type: ignore[attr-defined]  # in this process it is a LocalHome
+    old = part(cell)
+    _, commands = sorted_out(cell)
+    life.cell = old
+    return old, StopRecorded(life, reason), commands
 
 
 class RecordedToProcess(ToProcess):
@@ -120,26 +145,17 @@ class RecordedToProcess(ToProcess):
         """From here on the new life is the one."""
         cell, host, old_host = self.cell, self.host, self._old
         assert self.transit is not None
-        assert old_host.life is not None
-        self.is_done = True
-        old_host.life.port.shut()  # type: ignore[attr-defined]  # in this process it is a LocalHome
-        old = part(cell)
-        _, commands = sorted_out(cell)
-        old_host.life.cell = old
-        tap = cell.extra().tap
-        if tap is not None:
-            tap.detach()
-        worker.adopt(cell, None, host.died)
-        host.clock = None
-        if tap is not None:
-            tap.attach()
+        with self.commit():
+            old, stop, commands = leave_task(cell, old_host, self.reason())
+            worker.adopt(cell, None, host.died)
+            host.clock = None
         self._up.set_result(None)
         switch.from_life(live)  # What waits is fed.
         worker.connection.flush()
         self.gone_on_at = now()
         self.transit.over(cell, host)
         obey_commands(cell, commands)
-        farewell(old, StopRecorded(old_host.life, self.reason()))
+        farewell(old, stop)
         self.moved()
 
     def stay(self, transit: Transit) -> None:
@@ -156,7 +172,7 @@ class RecordedToTask(FromProcess):
     def __init__(self, cell: Cell, host: TaskHost, timeout: float, worker: Worker) -> None:
         super().__init__(cell, host, timeout, worker)
         self._home: Detached | None = None
-        self._twin: Cell | None = None
+        self._arrival: RecordedArrival | None = None
 
     def left(self) -> None:
         old = self.transit.old if self.transit is not None else None
@@ -166,56 +182,26 @@ class RecordedToTask(FromProcess):
         self.taken.set_result(None)
 
     async def carry(self) -> None:
-        cell, host, start = self.cell, self.host, self.cell.extra().start
-        assert start is not None
-        other = self._twin = twin(cell)
-        other.life -= 1  # Counted up by the life that begins; it is no other one.
-        other.extra().bindings = cell.extra().bindings
-        other.extra().trap_exits = self.trap_exits
         old = self.transit.old if self.transit is not None else None
-        refuse_unsaved(cell, getattr(old, "switch", None))
-        switch, live, _ = host.open(cell)
-        settled: asyncio.Future[None] = self.node.loop.create_future()
-        home = ArrivingHome(host, cell, other, settled)
-        host.page = host.homes.page(switch)
-        life = Life(other, home, host.method, host.page)
-        life.begins_suspended = self.suspended
-        for record in switch.restore_records():
-            life.from_home(record)
-        other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
-        life.begin(start, switch.state_turn, switch.stash)
-        switch.attach(LocalLife(life))
-        live.add_done_callback(lambda done: None if done.cancelled() else home.fail(done.exception()))
-        await self.within(settled, self.timeout, lambda: "its new life was not up")
-        self._switch_over(other, life, home)
+        refuse_unsaved(self.cell, old.switch if isinstance(old, RecordedProcessHost) else None)
+        arrival = self._arrival = RecordedArrival(self.cell, self.host)
+        await arrival.is_up(self, arrival.begin_recorded(suspended=self.suspended, trap_exits=self.trap_exits))
+        self._commit(arrival)
 
-    def _switch_over(self, other: Cell, life: Life, home: ArrivingHome) -> None:
-        """From here on the new life is the one."""
-        cell, host, more = self.cell, self.host, self.cell.extra()
+    def _commit(self, arrival: RecordedArrival) -> None:
         assert self.transit is not None
-        self.is_done = True
-        tap = more.tap
-        if tap is not None:
-            tap.detach()
-        queue, its = other.queue, other.extra()
-        urgent, suspended = its.urgent, its.suspended
-        settle(other, cell)
-        life.cell = cell
-        cell.queue, more.urgent, more.suspended = deque(queue or ()), urgent, suspended
-        host.life, host.clock = life, None
-        if tap is not None:
-            tap.attach()
-        self.transit.over(cell, host)
-        lifecycle.up(cell)
-        home.open()  # Now it is live: its home feeds it what waits.
+        with self.commit():
+            arrival.take_place()
+        self.transit.over(self.cell, self.host)
+        arrival.go_on()
         self.gone_on_at = now()
         self.leave()
         self.moved()
 
     def undo(self) -> None:
         cell, worker, transit, home = self.cell, self.worker, self.transit, self._home
-        if self._twin is not None:
-            dispose(self._twin)
+        if self._arrival is not None:
+            self._arrival.discard()
         if self.dead is None:
             self.tell_old("back")
         if transit is None or home is None:
@@ -231,6 +217,50 @@ class RecordedToTask(FromProcess):
         old.over(cell, -1, str(self.dead), ordered=False, noticed=worker.noticed_at, reason=self.dead)
         lifecycle.ended(cell, self.dead)
         transit.over(cell, old)
+
+
+class RecordedArrival(Arrival):
+    """A recorded life that begins as a task beside its address, from its last snapshot and what is behind it."""
+
+    def __init__(self, cell: Cell, host: TaskHost) -> None:
+        super().__init__(cell)
+        self._host = host
+        self.other.life -= 1  # Counted up by the life that begins; it is no other one.
+        self._life: Life | None = None
+        self._home: ArrivingHome | None = None
+
+    def begin_recorded(self, *, suspended: bool, trap_exits: bool = False) -> asyncio.Future[None]:
+        """Restore and replay; the future ends when the life is live."""
+        cell, host, start = self.cell, self._host, self.cell.extra().start
+        assert start is not None
+        self.other.extra().trap_exits = trap_exits
+        switch, live, _ = host.open(cell)
+        up: asyncio.Future[None] = cell.node.loop.create_future()
+        home = self._home = ArrivingHome(host, cell, self.other, up)
+        host.page = host.homes.page(switch)
+        life = self._life = Life(self.other, home, host.method, host.page)
+        life.begins_suspended = suspended
+        for record in switch.restore_records():
+            life.from_home(record)
+        self.other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
+        life.begin(start, switch.state_turn, switch.stash)
+        switch.attach(LocalLife(life))
+        live.add_done_callback(lambda done: None if done.cancelled() else home.fail(done.exception()))
+        return up
+
+    def take_place(self) -> None:
+        """From here on the new life is the one."""
+        life, host = self._life, self._host
+        assert life is not None
+        settle_with_queue(self.other, self.cell)
+        life.cell = self.cell
+        host.life, host.clock = life, None
+
+    def go_on(self) -> None:
+        """Now it is live: its home feeds it what waits."""
+        assert self._home is not None
+        lifecycle.up(self.cell)
+        self._home.open()
 
 
 class ArrivingHome(LocalHome):

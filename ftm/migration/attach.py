@@ -14,21 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import CannotMove, HoldfastError, StartFailed
 from ...actors.exit_reasons import ExitReason, Shutdown
-from ...actors.kernel import lifecycle
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.lifecycle import LOCAL, Stop
 from ...actors.kernel.mailbox import Bound
 from ...actors.kernel.message import message_name
+from ...actors.migration.here import Departure
 from ...actors.migration.luggage import Stays, check_sendable, pack_rest
 from ...actors.migration.process_move import Move
-from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
+from ...actors.migration.quiesce import farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.process.wire.peer import OutsideHost
 from ...checkpoint.home.recorded_hosts import TaskHost
-from ...checkpoint.home.recorded_moves import Detached, refuse_unsaved
+from ...checkpoint.home.recorded_moves import Detached, leave_task, refuse_unsaved
 from ...checkpoint.home.subtree_homes import SubtreeHome
 from ...checkpoint.home.switch import Switch
-from ...checkpoint.life.recorded_inbox import StopRecorded
 from ...checkpoint.protocol import MESSAGE, TICK, Live
 from ...checkpoint.snapshot.key_variables import save_state
 from ...checkpoint.snapshot.snapshot_record import meta_now
@@ -53,8 +52,7 @@ class ToGroup(Move):
         super().__init__(cell, host, timeout)
         self.host: GroupHost = host
         self._old = cell.host
-        self._take: Take | None = None
-        self._taken: asyncio.Future[None] = self.node.loop.create_future()
+        self._departure: Departure | None = None
         self._live: asyncio.Future[Live] = self.node.loop.create_future()
         self._joined: asyncio.Future[None] = self.node.loop.create_future()
         self._group: Group | None = None
@@ -97,30 +95,21 @@ class ToGroup(Move):
             self._joined.set_result(None)
 
     async def take(self) -> None:
-        take = self._take = Take(self._owe, self._at_rest, self.give_up, ignored=("ftm",))
-        lifecycle.urge(self.cell, take)
-        await self.within(self._taken, self.timeout, lambda: f"{take.why}, and that did not change")
+        self._departure = Departure(self, self._owe, self._pack, ignored=("ftm",))
+        await self._departure.quiesce()
 
     def _owe(self, ask: Any) -> int:
         raise Stays("an ask waits for its reply, which it could not give from another place")
 
-    def _at_rest(self, actor: Actor, state: bytes) -> None:
-        """Called in its place between two turns; if this raises, the actor goes on."""
-        cell, switch = self.cell, self._switch
+    def _pack(self, actor: Actor, state: bytes) -> None:
+        switch = self._switch
         assert switch is not None
-        if self.given_up.done():
-            raise CannotMove(cell.path, self.given_up.result())
-        if cell.extra().start is not self._start:
-            raise CannotMove(cell.path, "its code was replaced meanwhile; try again")
-        self.rest_at = now()
         if self.is_recorded:
             self._home = Detached(switch)
         else:
-            check_sendable(cell)
+            check_sendable(self.cell)
             data, self._rest = save_state(actor), pack_rest(actor)
             self._plant(switch, data)
-        self.at_rest()
-        self._taken.set_result(None)
 
     def _plant(self, switch: Switch, data: bytes) -> None:
         """The home of an actor that had none begins with its state, and with what it has put aside."""
@@ -169,21 +158,16 @@ class ToGroup(Move):
         if tap is not None:
             tap.detach()
         suspended = more.suspended
-        ends: Any
+        stop: Item
         old_host = self._old
         if isinstance(old_host, TaskHost):
-            assert old_host.life is not None
-            old_host.life.port.shut()  # type: ignore[attr-defined]  # in this process it is a LocalHome
-            old = part(cell)
-            items, commands = sorted_out(cell)
-            old_host.life.cell = old
-            ends = StopRecorded(old_host.life, self.reason())
+            old, stop, commands = leave_task(cell, old_host, self.reason())
         else:
             topics, bound = list(more.topics), more.bound
             old = part(cell)
             items, commands = sorted_out(cell)
             self._move_in(switch, items, topics, bound)
-            ends = Stop(self.reason())
+            stop = Stop(self.reason())
         host.take_over(cell, group)
         self.transit.over(cell, host)
         if suspended:
@@ -193,7 +177,7 @@ class ToGroup(Move):
         group.go_on()
         self.gone_on_at = now()
         obey_commands(cell, commands)
-        farewell(old, ends)
+        farewell(old, stop)
         self.moved()
 
     def _move_in(self, switch: Switch, items: list[Any], topics: list[str], bound: Bound | None) -> None:
@@ -229,8 +213,8 @@ class ToGroup(Move):
 
     def undo(self) -> None:
         cell = self.cell
-        if self._take is not None:
-            self._take.is_void = True
+        if self._departure is not None:
+            self._departure.call_off()
         self.ending = asyncio.ensure_future(self.host.dismantle(cell))
         if self._live.done() and not self._live.cancelled():
             self._live.exception()

@@ -7,28 +7,24 @@ one. If it does not come so far, the group goes on as if nothing had been.
 from __future__ import annotations
 
 import asyncio
-from collections import deque
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
-from ...actors.errors import AskTimeout, CannotMove, HoldfastError, StartFailed
-from ...actors.exit_reasons import ExitReason, unpack_exit
-from ...actors.kernel import lifecycle, mailbox
+from ...actors.errors import AskTimeout, CannotMove, HoldfastError
+from ...actors.exit_reasons import unpack_exit
+from ...actors.kernel import lifecycle
 from ...actors.kernel.cell import Cell, Host
-from ...actors.kernel.context import ActorContext
 from ...actors.kernel.envelope import Envelope
 from ...actors.kernel.lifecycle import LOCAL
 from ...actors.kernel.links import Down, Exit, Monitor
 from ...actors.kernel.mailbox import Bound, Overflow
 from ...actors.kernel.timers import Timer
+from ...actors.migration.here import Arrival
 from ...actors.migration.process_move import Move
-from ...actors.migration.quiesce import decoded, now, obey_commands, settle, sorted_out, twin
-from ...actors.migration.to_task import dispose
-from ...actors.migration.worker_moves import await_up
+from ...actors.migration.quiesce import now, obey_commands
 from ...checkpoint.home.capacity import HomeBound
-from ...checkpoint.home.recorded_hosts import LocalLife, TaskHost
-from ...checkpoint.home.recorded_moves import ArrivingHome, Detached, refuse_unsaved
+from ...checkpoint.home.recorded_hosts import TaskHost
+from ...checkpoint.home.recorded_moves import Detached, RecordedArrival, refuse_unsaved
 from ...checkpoint.home.switch import Switch
-from ...checkpoint.life.recorded_life import Life
 from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK
 from ...checkpoint.snapshot.key_variables import restore_state
 from ..group.group_host import GroupHost
@@ -36,6 +32,9 @@ from ..group.steering import AGAIN_AFTER
 from ..group.transient_homes import is_unkept
 from ..replica.replica_orders import Export
 from .subtree_groups import SubtreeGroup
+
+if TYPE_CHECKING:
+    from ...actors.kernel.actor import Actor
 
 EXPORTED_WITHIN = 5.0
 """Seconds until whoever leads is asked again for the state: it may have died with the question."""
@@ -54,7 +53,7 @@ class FromGroup(Move):
             raise CannotMove(cell.path, "it is being recovered; try again")
         self._old, self._group, self._switch = old, old.group, old.switch
         self._home: Detached | None = None
-        self._twin: Cell | None = None
+        self._arrival: Arrival | None = None
         self._over = self._group.on_over
         self._has_fallen = False
         self.ending: asyncio.Future[None] | None = None  # that of the replicas
@@ -116,8 +115,8 @@ class FromGroup(Move):
 
     def undo(self) -> None:
         cell = self.cell
-        if self._twin is not None:
-            dispose(self._twin)
+        if self._arrival is not None:
+            self._arrival.discard()
         self._group.is_stopping = False
         transit = self.transit
         if transit is not None:
@@ -145,47 +144,16 @@ class ToRecordedTask(FromGroup):
             await self.within(self._switch.due.wish(), end - now(), lambda: "its state was not saved")
 
     async def carry(self) -> None:
-        cell, host, start = self.cell, self.host, self.cell.extra().start
-        assert start is not None
-        refuse_unsaved(cell, self._switch)
-        other = self._twin = twin(cell)
-        other.life -= 1  # Counted up by the life that begins; it is no other one.
-        other.extra().bindings = cell.extra().bindings
-        switch, live, _ = host.open(cell)
-        settled: asyncio.Future[None] = self.node.loop.create_future()
-        home = ArrivingHome(host, cell, other, settled)
-        host.page = host.homes.page(switch)
-        life = Life(other, home, host.method, host.page)
-        life.begins_suspended = self._group.is_suspended
-        for record in switch.restore_records():
-            life.from_home(record)
-        other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
-        life.begin(start, switch.state_turn, switch.stash)
-        switch.attach(LocalLife(life))
-        live.add_done_callback(lambda done: None if done.cancelled() else home.fail(done.exception()))
-        await self.within(settled, self.timeout, lambda: "its new life was not up")
-        self._switch_over(other, life, home)
-
-    def _switch_over(self, other: Cell, life: Life, home: ArrivingHome) -> None:
-        """From here on the new life is the one."""
-        cell, host, more = self.cell, self.host, self.cell.extra()
+        refuse_unsaved(self.cell, self._switch)
+        arrival = RecordedArrival(self.cell, self.host)
+        self._arrival = arrival
+        await arrival.is_up(self, arrival.begin_recorded(suspended=self._group.is_suspended))
         assert self.transit is not None
-        self.is_done = True
-        tap = more.tap
-        if tap is not None:
-            tap.detach()
-        queue, its = other.queue, other.extra()
-        urgent, suspended = its.urgent, its.suspended
-        settle(other, cell)
-        life.cell = cell
-        cell.queue, more.urgent, more.suspended = deque(queue or ()), urgent, suspended
-        host.life, host.clock = life, None
-        if tap is not None:
-            tap.attach()
-        self.transit.over(cell, host)
+        with self.commit():
+            arrival.take_place()
+        self.transit.over(self.cell, self.host)
         self.dismantled()
-        lifecycle.up(cell)
-        home.open()  # Now it is live: its home feeds it what waits.
+        arrival.go_on()
         self.gone_on_at = now()
         self.moved()
 
@@ -217,77 +185,44 @@ class ToPlainTask(FromGroup):
             self._data, self._stash, self._traps = exported.data, list(exported.stash), exported.traps
 
     async def carry(self) -> None:
-        cell, start = self.cell, self.cell.extra().start
+        start = self.cell.extra().start
         assert start is not None
-        other = self._twin = twin(cell)
-        other.table = start.kind._table
-        other.extra().bindings = cell.extra().bindings
-        lifecycle.build(other, start, ActorContext)
-        other.extra().trap_exits = self._traps
-        actor = other.actor
-        assert actor is not None
-        try:
-            restore_state(actor, self._data)
-        except Exception as error:
-            raise StartFailed(cell.path, f"its state could not be restored: {error}") from error
-        gone, settled = other.ended(), await_up(other, start)
-        gone.add_done_callback(lambda done: self._ended_early(settled, done.result()))
-        await self.within(settled, self.timeout, lambda: "its new life was not up")
-        self._switch_over(other)
 
-    def _switch_over(self, other: Cell) -> None:
+        def restore(actor: Actor) -> None:
+            restore_state(actor, self._data)
+
+        arrival = self._arrival = Arrival(self.cell)
+        await arrival.is_up(self, arrival.begin(start, restore, trap_exits=self._traps))
+        self._commit(arrival)
+
+    def _commit(self, arrival: Arrival) -> None:
         """From here on the new life is the one."""
-        cell, more, switch = self.cell, self.cell.extra(), self._switch
+        cell, switch = self.cell, self._switch
         assert self.transit is not None
-        self.is_done = True
-        tap = more.tap
-        if tap is not None:
-            tap.detach()
-        own, commands = sorted_out(other, ticks=True)
-        settle(other, cell)
-        stash, items = self._moved_out(switch)
-        more.outlet = None
-        cell.admit = mailbox.admit_first
-        homed, switch.bound = switch.bound, None
-        self._old.homes.released(cell.path)
-        if homed is not None and homed.capacity:
-            more.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
-            cell.admit = mailbox.admit_bounded
-        cell.queue = None  # All is at the home; the queue of a bounded mailbox is another one.
-        queue = mailbox.queue_of(cell)
-        taken = (decoded(cell, item) for item in (*own, *items))
-        queue.extend(item for item in taken if item is not None)
-        if more.bound is not None:
-            more.bound.count = sum(map(mailbox.counts, queue))
-        kept = [one for item in stash if (one := decoded(cell, item)) is not None]
-        more.stash = deque(kept) if kept else None
-        for name, body, left, interval in switch.timers.saved().values():
-            message = cell.node.codec.decode(cell.table.kind_named(name), body)
-            Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
-        switch.timers.replace({})
-        for ask, name, body, sender in getattr(homed, "waiting", ()):
-            del name, body, sender
-            cell.admit(cell, ask)
-        if isinstance(homed, HomeBound):
-            homed.senders.release()
-        if self._group.is_suspended:
-            more.suspended = True
-            mailbox.hold(cell)
-        else:
-            more.suspended = False
-        if tap is not None:
-            tap.attach()
+        with self.commit():
+            stash, items = self._moved_out(switch)
+            homed, switch.bound = switch.bound, None
+            self._old.homes.released(cell.path)
+            bound = (
+                Bound(homed.capacity, cast("Overflow", homed.overflow))
+                if homed is not None and homed.capacity
+                else None
+            )
+            commands = arrival.take_over(items, stash, bound, suspended=self._group.is_suspended)
+            for name, body, left, interval in switch.timers.saved().values():
+                message = cell.node.codec.decode(cell.table.kind_named(name), body)
+                Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
+            switch.timers.replace({})
+            for ask, _, _, _ in getattr(homed, "waiting", ()):
+                cell.admit(cell, ask)
+            if isinstance(homed, HomeBound):
+                homed.senders.release()
         self.transit.over(cell, LOCAL)
         self.dismantled()
         obey_commands(cell, commands)
         lifecycle.up(cell)
         self.gone_on_at = now()
         self.moved()
-
-    def _ended_early(self, settled: asyncio.Future[None], reason: ExitReason) -> None:
-        if not settled.done():
-            settled.set_exception(StartFailed(self.cell.path, str(reason)))
-            settled.exception()
 
     def _moved_out(self, switch: Switch) -> tuple[list[Any], list[Any]]:
         """What waits at the home: what the actor has put aside, and its messages, as a mailbox has them."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,8 +22,8 @@ from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.mailbox import Bounded
 from ...actors.kernel.message import message_name
-from ...actors.migration.quiesce import farewell, obey_commands, part, settle, sorted_out, twin
-from ...actors.migration.to_task import dispose
+from ...actors.migration.here import dispose
+from ...actors.migration.quiesce import farewell, obey_commands, part, settle_with_queue, sorted_out, twin
 from ...actors.process.wire.peer import send_signal
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.life.recorded_inbox import StopRecorded
@@ -277,12 +276,8 @@ def _returning(guest: Guest, cell: Cell, port: Port, record: Returning) -> None:
 
 def _returned(cell: Cell, arriving: Arriving) -> None:
     """From here on the new life is the one."""
-    other, more = arriving.other, cell.extra()
-    queue, its = other.queue, other.extra()
-    urgent, suspended = its.urgent, its.suspended
-    settle(other, cell)
+    settle_with_queue(arriving.other, cell)
     arriving.life.cell = cell
-    cell.queue, more.urgent, more.suspended = deque(queue or ()), urgent, suspended
     arriving.host.take_up(cell, arriving.life, arriving.number)
     respec(cell, [])
     lifecycle.up(cell)

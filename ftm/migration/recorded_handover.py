@@ -51,6 +51,7 @@ class OutOfSubtree(ToGroup):
         self._new_host = host
         self._place, self._spec, self._worker = place, spec, worker_of(place, cell)
         self._switch = place.switch
+        self._taken: asyncio.Future[None] = self.node.loop.create_future()
 
     @property
     def is_recorded(self) -> bool:

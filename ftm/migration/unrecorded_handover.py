@@ -75,6 +75,7 @@ class OutOfProcess(ToGroup):
         self._incoming = Incoming(imports=False)
         self._admit: Admit = cell.admit
         self._held: list[Any] = []  # what has been sent to it here meanwhile
+        self._taken: asyncio.Future[None] = self.node.loop.create_future()
         self._left: asyncio.Future[None] = self.node.loop.create_future()
         self._is_leaving = False  # there is no way back
         self._state: Live | None = None

@@ -10,20 +10,18 @@ import asyncio
 from collections import deque
 from typing import TYPE_CHECKING, Any
 
-from ...actors.errors import HoldfastError, StartFailed, error_text
+from ...actors.errors import HoldfastError, StartFailed
 from ...actors.exit_reasons import Shutdown
-from ...actors.kernel import lifecycle, links, mailbox
+from ...actors.kernel import lifecycle, links
 from ...actors.kernel.cell import RUNNING, Cell
-from ...actors.kernel.context import ActorContext
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.lifecycle import Stop
 from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.timers import Timer
 from ...actors.kernel.topics import Topics
+from ...actors.migration.here import Arrival
 from ...actors.migration.luggage import Stays, check_sendable, pack_rest
-from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, settle, sorted_out, twin
-from ...actors.migration.to_task import dispose
-from ...actors.migration.worker_moves import await_up
+from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.process.worker_node import GuestHost, InnerHost
 from ...checkpoint.life.worker_lives import GuestKeeper
 from ...checkpoint.snapshot.key_variables import restore_state, save_state
@@ -56,7 +54,7 @@ class Carrier:
         self._attempt, self._incoming = -1, Incoming(imports=True)
         self._take: Take | None = None
         self._cell: Cell | None = None  # where a life is at rest, or comes back to
-        self._other: Cell | None = None  # beside it: the life that comes back
+        self._arrival: Arrival | None = None  # beside it: the life that comes back
         self._held: list[Any] | None = None  # what has been sent to it here meanwhile
 
     def hear(self, record: Carried) -> None:
@@ -161,35 +159,31 @@ class Carrier:
             return
         start = cell.extra().start
         assert start is not None
-        self._cell, self._other = cell, twin(cell)
-        other = self._other
-        other.table = start.kind._table
-        other.extra().bindings = cell.extra().bindings
-        try:
-            lifecycle.build(other, start, ActorContext)
-            other.extra().trap_exits = told["traps"]
-            assert other.actor is not None
-            restore_state(other.actor, told["state"])
-        except StartFailed as error:
-            self._fail(other, error.reason)
-        except Exception as error:  # What a class of the state raises when it is read.
-            self._fail(other, f"its state could not be restored: {error_text(error)}")
-        else:
-            settled = await_up(other, start)
-            settled.add_done_callback(lambda done: self._is_up(other, done))
-            other.ended().add_done_callback(lambda done: self._fail(other, str(done.result())))
+        arrival = Arrival(cell)
+        self._cell, self._arrival = cell, arrival
 
-    def _fail(self, other: Cell, why: str) -> None:
-        if self._other is other and self._held is None:  # Else it is the one already, as far as the root knows.
-            self._other = None
-            dispose(other)
+        def restore(actor: Actor) -> None:
+            restore_state(actor, told["state"])
+
+        try:
+            up = arrival.begin(start, restore, trap_exits=told["traps"])
+        except StartFailed as error:
+            self._fail(arrival, error.reason)
+            return
+        up.add_done_callback(lambda done: self._is_up(arrival, done))
+        arrival.other.ended().add_done_callback(lambda done: self._fail(arrival, str(done.result())))
+
+    def _fail(self, arrival: Arrival, why: str) -> None:
+        if self._arrival is arrival and self._held is None:  # Else it is the one already, as far as the root knows.
+            self._arrival = None
+            arrival.discard()
             self._say("failed", why=why)
 
-    def _is_up(self, other: Cell, done: asyncio.Future[None]) -> None:
+    def _is_up(self, arrival: Arrival, done: asyncio.Future[None]) -> None:
         error = None if done.cancelled() else done.exception()
         if error is not None:
-            self._fail(other, error.reason if isinstance(error, StartFailed) else str(error))
-        elif self._other is other and self._cell is not None:
+            self._fail(arrival, error.reason if isinstance(error, StartFailed) else str(error))
+        elif self._arrival is arrival and self._cell is not None:
             self._held, self._cell.admit = [], self._hold  # All that was sent before is ahead of what is said now.
             self._say("up")
 
@@ -202,10 +196,10 @@ class Carrier:
 
     def _stay(self) -> None:
         """The group goes on."""
-        cell, other, held = self._cell, self._other, self._held or []
-        self._other = self._held = None
-        if other is not None:
-            dispose(other)
+        cell, arrival, held = self._cell, self._arrival, self._held or []
+        self._arrival = self._held = None
+        if arrival is not None:
+            arrival.discard()
         if cell is None or not isinstance(cell.host, InnerGroupHost):
             return
         if cell.admit == self._hold:
@@ -215,35 +209,23 @@ class Carrier:
 
     def _settle_in(self, told: dict[str, Any]) -> None:
         """From here on the new life is the one."""
-        guest, cell, other, held = self._guest, self._cell, self._other, self._held or []
-        self._other = self._held = None
+        guest, cell, arrival, held = self._guest, self._cell, self._arrival, self._held or []
+        self._arrival = self._held = None
         assert cell is not None
-        assert other is not None
-        more, host = cell.extra(), cell.host
+        assert arrival is not None
+        host = cell.host
         assert isinstance(host, InnerGroupHost)
-        own, commands = sorted_out(other, ticks=True)
-        has_ended = other.state is not RUNNING  # by its background work
-        if not has_ended:
-            settle(other, cell)
+        has_ended = arrival.other.state is not RUNNING  # by its background work
         self._port.on_group = None
-        cell.host, cell.admit, cell.queue = guest.node.here, mailbox.admit_first, None
-        if host.bound is not None:
-            more.bound = Bound(host.bound.capacity, host.bound.overflow)
-            cell.admit = mailbox.admit_bounded
-        queue = mailbox.queue_of(cell)
-        queue.extend((*own, *unpack(guest, cell, told["queue"])))
-        if more.bound is not None:
-            more.bound.count = sum(map(mailbox.counts, queue))
-        stash = unpack(guest, cell, told["stash"])
-        more.stash = deque(stash) if stash else None
+        cell.host = guest.node.here
+        bound = None if host.bound is None else Bound(host.bound.capacity, host.bound.overflow)
+        queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])
+        commands = arrival.take_over(queue, stash, bound, suspended=bool(told["is_suspended"]))
         for name, body, left, interval in told["timers"] if not has_ended else ():
             message = cell.node.codec.decode(cell.table.kind_named(name), body)
             Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
         self._take_ties_over(cell, told)
         respec(cell, [])
-        more.suspended = bool(told["is_suspended"])
-        if more.suspended:
-            mailbox.hold(cell)
         for item in held:
             try:
                 cell.admit(cell, item)
@@ -251,7 +233,7 @@ class Carrier:
                 refuse(cell, item, error)
         obey_commands(cell, commands)
         if has_ended:
-            lifecycle.ended(cell, other.extra().reason)
+            lifecycle.ended(cell, arrival.other.extra().reason)
         else:
             lifecycle.up(cell)
 
