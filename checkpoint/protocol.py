@@ -177,46 +177,7 @@ class Respec(msgspec.Struct, array_like=True, tag=10):
     layers: list[Any]
 
 
-class Attached(msgspec.Struct, array_like=True, tag=31):
-    """The life, which is at rest, is lived by replicas at the root from now on, as the one wanted as `number`."""
-
-    number: int
-    layers: list[Any]
-
-
-class Returning(msgspec.Struct, array_like=True, tag=32):
-    """The life that replicas have lived comes back here, with the state that came before: begin it beside the address.
-
-    `turn`, `stash`, `slot`: as of `Begin`.
-    """
-
-    number: int
-    turn: int
-    stash: list[int]
-    slot: int
-    is_suspended: bool
-
-
-class Returned(msgspec.Struct, array_like=True, tag=33):
-    """The life that was begun beside the address is the one, or (not `is_kept`) is not to be."""
-
-    is_kept: bool
-
-
-class Carried(msgspec.Struct, array_like=True, tag=34):
-    """A step of handing over a life that is not recorded, and a piece of what is told with it. In both directions.
-
-    `attempt`: at which handing over; what an earlier one has left on its way counts for nothing.
-    """
-
-    attempt: int
-    step: str
-    data: bytes
-    is_last: bool
-
-
-Handover = Attached | Returning | Returned
-ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec | Handover | Carried
+ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec
 
 
 # -- life to home ----------------------------------------------------------------------------------------------------
@@ -344,9 +305,7 @@ class Ignored(msgspec.Struct, array_like=True, tag=19):
     why: str
 
 
-ToHome = (
-    Ignored | Released | TurnEnd | Hooked | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked | Carried
-)
+ToHome = Ignored | Released | TurnEnd | Hooked | Live | Snapshot | PipeDone | Unsaved | Wanted | Closed | Marked
 
 
 class LifePort(Protocol):

@@ -8,10 +8,10 @@ import socket
 from typing import Any, cast
 
 from ..actors.kernel.cell import Cell, Host
+from ..actors.migration.worker_moves import Attempt
 from ..actors.process import worker_node
 from ..actors.process.wire import frames
 from ..checkpoint.life.worker_lives import GuestKeeper, RecordedGuest
-from ..checkpoint.protocol import Carried, Handover
 from ..checkpoint.recovery_file import RecoveryFile
 from ..supervision.respec import respec
 
@@ -25,7 +25,7 @@ def prepare(host: worker_node.Guest) -> None:
     """Before the root's first frame: a recorded life may get its state before it is launched."""
     host.recovery = RecordedGuest(host)
     host.node.respec = respec
-    host.recovery.on_handover = functools.partial(handed_over, host)
+    host.moves.of_child = functools.partial(child_attempt, host)
     host.node.host_for = functools.partial(host_for, host)
 
 
@@ -38,14 +38,15 @@ def host_for(host: worker_node.Guest, spec: Any) -> Host:
     return InnerGroupHost(host, spec, host.recovery.port_of)
 
 
-def handed_over(host: worker_node.Guest, path: str, record: Handover | Carried) -> None:
-    """A live child of this process's supervisor gets a mechanism, or loses it."""
-    from ..ftm.migration import protected_stand_ins, unrecorded_in_worker
+def child_attempt(host: worker_node.Guest, path: str, number: int) -> Attempt:
+    """An attempt to give a live child of this process's supervisor a mechanism, or to take it away."""
+    from ..ftm.migration.protected_stand_ins import RecordedChild
+    from ..ftm.migration.unrecorded_in_worker import PlainChild
 
-    if isinstance(record, Carried):
-        unrecorded_in_worker.hear(host, path, record)
-    else:
-        protected_stand_ins.take(host, path, record)
+    cell = host.node.find(path)
+    recovery = None if cell is None or cell.spec is None else cell.spec.recovery
+    kind = PlainChild if recovery is None or not recovery.records else RecordedChild
+    return kind(host, path, number)
 
 
 def launch(host: worker_node.Guest, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:

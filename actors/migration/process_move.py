@@ -15,9 +15,10 @@ from ..errors import CannotMove, StartFailed
 from ..exit_reasons import ExitReason, Shutdown
 from ..kernel.cell import Cell, Host
 from .quiesce import ATTEMPTS, Transit
-from .worker_moves import send_step
+from .words import Incoming, say
 
 if TYPE_CHECKING:
+    from ..process.wire.frames import Migrate
     from ..process.worker_pool import Worker
 
 T = TypeVar("T")
@@ -109,14 +110,21 @@ class Move:
 
     def say(self, worker: Worker, step: str, **told: Any) -> None:
         """Tell the process at the other end of the move, which begins or gives up the life."""
-        send_step(worker.connection, self.cell.path, self.attempt, step, **told)
+        say(worker.connection, self.cell.path, self.attempt, step, **told)
 
     def hear(self, worker: Worker) -> None:
         """Have what the process says of this attempt told to `heard`, until the move is over."""
-        worker.movers[self.attempt] = self.heard
+        incoming = Incoming(imports=False)
+
+        def taken(frame: Migrate) -> None:
+            told = incoming.take(frame)
+            if told is not None:
+                self.heard(frame.step, told)
+
+        worker.movers[self.attempt] = taken
         self._hearing.callback(worker.movers.pop, self.attempt, None)
 
-    def heard(self, data: dict[str, Any]) -> None:
+    def heard(self, step: str, told: dict[str, Any]) -> None:
         """A word of the process."""
 
     def at_rest(self) -> None:

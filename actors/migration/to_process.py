@@ -18,7 +18,6 @@ from .here import Departure
 from .luggage import check_sendable, pack_rest
 from .process_move import Move
 from .quiesce import Transit, farewell, now, obey_commands, part, resume, sorted_out
-from .worker_moves import send_luggage
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor
@@ -59,9 +58,9 @@ class ToProcess(Move):
         self.hear(worker)
         await self.within(worker.prepare(self.cell, self.recipe), READY_WITHIN, lambda: "the new process was not ready")
 
-    def heard(self, data: dict[str, Any]) -> None:
-        if data.get("step") == "began" and not self._began.done():
-            self._began.set_result(float(data["at"]))
+    def heard(self, step: str, told: dict[str, Any]) -> None:
+        if step == "began" and not self._began.done():
+            self._began.set_result(float(told["at"]))
 
     async def take(self) -> None:
         await self._departure.quiesce()
@@ -82,7 +81,7 @@ class ToProcess(Move):
     async def carry(self) -> None:
         cell, worker, more = self.cell, self.worker, self.cell.extra()
         assert worker is not None
-        send_luggage(worker.connection, cell.path, self.attempt, "luggage", self._luggage)
+        self.say(worker, "luggage", **self._luggage)
         launched = worker.launch(cell, self.recipe, {"bounded": more.bound is not None, "moved": True})
         await self.within(launched, self.timeout, lambda: "its new life was not up")
         if not worker.is_alive():

@@ -19,7 +19,6 @@ from .luggage import unpack, unpack_items
 from .process_move import Move
 from .quiesce import now, obey_commands, sorted_out
 from .to_process import let_in, send_queue
-from .worker_moves import Luggage
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor
@@ -50,20 +49,20 @@ class FromProcess(Move):
         self.say(self.worker, step)
         self.worker.connection.flush()
 
-    def heard(self, data: dict[str, Any]) -> None:
-        match data.get("step"):
+    def heard(self, step: str, told: dict[str, Any]) -> None:
+        match step:
             case "refused":
-                self.give_up(str(data["why"]))
+                self.give_up(str(told["why"]))
             case "taken" if self.worker.is_killed:
                 self.give_up("it is killed")
             case "taken" if not self.given_up.done():
-                self.rest_at = float(data["at"])
-                self.trap_exits, self.suspended = bool(data["trap_exits"]), bool(data["suspended"])
+                self.rest_at = float(told["at"])
+                self.trap_exits, self.suspended = bool(told["trap_exits"]), bool(told["suspended"])
                 self.at_rest()
                 self.worker.on_death(self.old_died)
                 self.left()
             case "packed":
-                self.packed(data)
+                self.packed(told)
             case _:
                 pass
 
@@ -71,8 +70,8 @@ class FromProcess(Move):
         """The old life is at rest, and the root knows it."""
         raise NotImplementedError
 
-    def packed(self, data: dict[str, Any]) -> None:
-        """A piece of what it takes along has come."""
+    def packed(self, luggage: dict[str, Any]) -> None:
+        """What it takes along has come."""
 
     def old_died(self, cell: Cell, reason: ExitReason) -> None:
         """The old process ends while its actor is being carried over: that matters only if it was to stay."""
@@ -104,7 +103,6 @@ class ToTask(FromProcess):
 
     def __init__(self, cell: Cell, host: Host, timeout: float, worker: Worker) -> None:
         super().__init__(cell, host, timeout, worker)
-        self._incoming = Luggage(imports=False)
         self._luggage: dict[str, Any] = {}
         self._queued: list[Any] = []
         self._stash: list[Any] = []
@@ -117,11 +115,8 @@ class ToTask(FromProcess):
         outlet.worker = None  # Messages wait here from now on.
         self.tell_old("pack")  # Behind everything that was sent: all that is there is packed.
 
-    def packed(self, data: dict[str, Any]) -> None:
+    def packed(self, luggage: dict[str, Any]) -> None:
         try:
-            luggage = self._incoming.take(data)
-            if luggage is None:
-                return
             cell, outlet = self.cell, self.cell.extra().outlet
             numbers, self._asks = dict(outlet.flight), dict(self.worker.pending)
 

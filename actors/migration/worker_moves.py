@@ -5,66 +5,35 @@ from __future__ import annotations
 import asyncio
 from collections import deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import HoldfastError, error_text
-from ..exit_reasons import unpack_exit
+from ..exit_reasons import ExitReason, unpack_exit
 from ..kernel import lifecycle, mailbox
 from ..kernel.actor import Actor, Start
 from ..kernel.cell import RUNNING, Cell
 from ..kernel.context import ActorContext
 from ..kernel.envelope import Ask, Item
 from ..kernel.links import Monitor
-from ..process.wire import frames
-from ..process.wire.connection import BadFrame, Connection
+from ..process.wire.connection import BadFrame
 from ..process.wire.peer import Arrived, RelayedAsk
 from ..process.wire.start_codec import unpack_recipe
-from ..values import decode_value, encode_value
 from .luggage import pack_items, pack_rest, unpack
 from .quiesce import Settle, Take, now, resume
+from .words import Incoming, say
 
 if TYPE_CHECKING:
     from ..kernel.cell import Admit
+    from ..process.wire.frames import Migrate
     from ..process.worker_node import Guest
 
-PIECE = 4 * 1024 * 1024
-"""Bytes of luggage per frame: it may be larger than a frame can be."""
 
+class Attempt(Protocol):
+    """One attempt to move one actor into this process or out of it, or to hand it over to the root."""
 
-def send_step(connection: Connection, path: str, attempt: int, step: str, **told: Any) -> None:
-    """Send one word of a move. It carries the number of its attempt, both ways: words of an earlier one are void."""
-    data = {"step": step, "attempt": attempt, **told}
-    connection.send(frames.Command(connection.name_out(path), "move", data), path)
-
-
-def send_luggage(connection: Connection, path: str, attempt: int, step: str, luggage: dict[str, Any]) -> None:
-    """Send what an actor takes along, in pieces."""
-    data = encode_value(luggage, where=path)
-    for at in range(0, len(data), PIECE):
-        is_last = at + PIECE >= len(data)
-        connection.send(frames.Piece(connection.name_out(path), attempt, step, data[at : at + PIECE], is_last), path)
-
-
-def word_of(piece: frames.Piece) -> dict[str, Any]:
-    """A piece as a word of its move."""
-    return {"step": piece.step, "attempt": piece.attempt, "part": piece.part, "is_last": piece.is_last}
-
-
-class Luggage:
-    """What comes in pieces; `imports`: from the root, which may have modules imported."""
-
-    def __init__(self, *, imports: bool) -> None:
-        self._imports = imports
-        self._parts: list[bytes] = []
-
-    def take(self, data: dict[str, Any]) -> dict[str, Any] | None:
-        """One more piece; the whole if it was the last."""
-        self._parts.append(data["part"])
-        if not data["is_last"]:
-            return None
-        whole = b"".join(self._parts)
-        self._parts.clear()
-        return cast("dict[str, Any]", decode_value(whole, imports=self._imports))
+    def obey(self, step: str, told: dict[str, Any]) -> None:
+        """Do the next step. Raises BadFrame: there is no such step."""
+        ...
 
 
 class GuestMoves:
@@ -72,25 +41,28 @@ class GuestMoves:
 
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
-        self._attempts: dict[str, GuestMove] = {}  # by address: the actor that arrives has no cell yet
+        self._attempts: dict[str, tuple[int, Incoming, Attempt]] = {}  # by address: who arrives has no cell yet
+        self.of_child: Callable[[str, int], Attempt] | None = None  # makes one of a child of the process's supervisor
 
-    def obey(self, cell: Cell, data: dict[str, Any]) -> None:
+    def hear(self, path: str, frame: Migrate) -> None:
         """Do the next step of a move. The words of the root come in order: a new number ends an earlier attempt.
 
         Raises:
             BadFrame: there is no such step.
         """
-        step, number = data.get("step"), data.get("attempt")
-        if step == "leave":  # It follows no attempt: the actor lives elsewhere, for good.
-            self._attempts.pop(cell.path, None)
-            _leave(cell, data)
-            return
-        if not isinstance(number, int):
-            raise BadFrame(f"step {step!r} of a move has no attempt")
-        attempt = self._attempts.get(cell.path)
-        if attempt is None or attempt.number != number:
-            attempt = self._attempts[cell.path] = GuestMove(self._guest, number)
-        attempt.obey(cell, data)
+        number, incoming, attempt = self._attempts.get(path) or self._made(path, frame.attempt)
+        if number != frame.attempt:
+            _, incoming, attempt = self._made(path, frame.attempt)
+        told = incoming.take(frame)
+        if told is not None:
+            attempt.obey(frame.step, told)
+
+    def _made(self, path: str, number: int) -> tuple[int, Incoming, Attempt]:
+        root, attempt = self._guest.node.root, None
+        if self.of_child is not None and root is not None and path != root.path:
+            attempt = self.of_child(path, number)
+        made = self._attempts[path] = number, Incoming(imports=True), attempt or GuestMove(self._guest, path, number)
+        return made
 
     @staticmethod
     def prepare(recipe: bytes) -> None:
@@ -107,8 +79,8 @@ class GuestMoves:
         Raises:
             HoldfastError, or what `set_state` raises.
         """
-        attempt = self._attempts.get(cell.path)
-        if attempt is None:
+        _, _, attempt = self._attempts.get(cell.path, (0, None, None))
+        if not isinstance(attempt, GuestMove):
             raise BadFrame("an actor came without its state")
         return attempt.begin(cell, start)
 
@@ -116,10 +88,8 @@ class GuestMoves:
 class GuestMove:
     """One attempt to move one actor into this process or out of it."""
 
-    def __init__(self, guest: Guest, number: int) -> None:
-        self._guest = guest
-        self.number = number
-        self._incoming = Luggage(imports=True)
+    def __init__(self, guest: Guest, path: str, number: int) -> None:
+        self._guest, self._path, self._number = guest, path, number
         self._luggage: dict[str, Any] | None = None
         self._take: Take | None = None
         self._state = b""
@@ -127,23 +97,18 @@ class GuestMove:
         self._admit: Admit | None = None
 
     def _say(self, step: str, **told: Any) -> None:
-        root = self._guest.node.root
-        assert root is not None
-        send_step(self._guest.connection, root.path, self.number, step, **told)
+        say(self._guest.connection, self._path, self._number, step, **told)
 
-    def obey(self, cell: Cell, data: dict[str, Any]) -> None:
-        """Do the next step.
-
-        Raises:
-            BadFrame: there is no such step.
-        """
-        match data.get("step"):
-            case "luggage":
-                self._luggage = self._incoming.take(data)
+    def obey(self, step: str, told: dict[str, Any]) -> None:
+        if step == "luggage":  # It has no cell yet.
+            self._luggage = told
+            return
+        cell = self._guest.node.cell_at(self._path)
+        match step:
             case "stash":
                 self._admit, cell.admit = cell.admit, self._put_aside
             case "go":
-                self._go(cell, suspended=bool(data["suspended"]))
+                self._go(cell, suspended=bool(told["suspended"]))
             case "take":
                 self._take = Take(_number, self._taken, lambda why: self._say("refused", why=why))
                 if cell.state is RUNNING:
@@ -152,7 +117,9 @@ class GuestMove:
                 self._pack(cell)
             case "back":
                 self._back(cell)
-            case step:
+            case "leave":
+                _leave(cell, unpack_exit(told["reason"]))
+            case _:
                 raise BadFrame(f"a move has no step {step!r}")
 
     def _put_aside(self, cell: Cell, item: Any) -> None:
@@ -232,7 +199,7 @@ class GuestMove:
                 "stash": pack_items(cell, cell.extra().stash or (), entry),
                 "queue": pack_items(cell, cell.queue or (), entry),
             }
-            send_luggage(self._guest.connection, cell.path, self.number, "packed", luggage)
+            self._say("packed", **luggage)
         except Exception as error:  # Whatever a message of the actor's own raises while it is encoded.
             why = str(error) if isinstance(error, HoldfastError) else error_text(error)
             self._say("refused", why=why)
@@ -247,7 +214,7 @@ class GuestMove:
             resume(cell)
 
 
-def _leave(cell: Cell, data: dict[str, Any]) -> None:
+def _leave(cell: Cell, reason: ExitReason) -> None:
     """The actor lives elsewhere: what is left here ends, and tells nobody."""
     more = cell.extra()
     for kept in (more.links, more.topics, more.monitors):
@@ -257,7 +224,7 @@ def _leave(cell: Cell, data: dict[str, Any]) -> None:
     more.urgent = more.stash = None
     if cell.ctx is not None:
         cell.ctx.hand_on_promises()
-    cell.request_stop(unpack_exit(data["reason"]))
+    cell.request_stop(reason)
     lifecycle.up(cell)
 
 
@@ -292,7 +259,3 @@ def _number(ask: Ask) -> int:
 
 def _found(watches: list[Monitor], path: str, for_good: bool) -> Monitor:
     return next(watch for watch in watches if watch.target.path == path and watch.for_good is for_good)
-
-
-Answered = Callable[[dict[str, Any]], None]
-"""Who hears at the root what a process says of a move."""

@@ -19,7 +19,6 @@ from ..kernel import lifecycle, links, mailbox
 from ..kernel.cell import DOWN, GONE, RUNNING, Cell
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item
-from ..migration.worker_moves import word_of
 from ..persistence import child_key
 from .resource_limits import Limits
 from .wire import frames
@@ -461,8 +460,8 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
             worker.on_note(frame)
         case frames.Record():
             worker.on_record(frame)
-        case frames.Piece():
-            worker.on_move(word_of(frame))
+        case frames.Migrate():
+            worker.on_migrate(frame)
         case frames.Forget():
             worker.on_forget(frame)
         case frames.Launch() | frames.Run():
@@ -473,8 +472,6 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
     """What an actor process wants done to an address, or tells of its own."""
     cell = node.cell_at(worker.connection.name_in(frame.to))
     match frame.verb:
-        case "move":
-            worker.on_move(frame.data)
         case "subscribe":
             node.topics.subscribe(frame.data["topic"], cell)
         case "unsubscribe":

@@ -27,7 +27,7 @@ from ..kernel.message import Message, Order, message_name
 from ..kernel.node import Node
 from ..kernel.ref import current
 from ..kernel.topics import Topics
-from ..migration.worker_moves import GuestMoves, word_of
+from ..migration.worker_moves import GuestMoves
 from .wire import frames
 from .wire.connection import BadFrame, Connection
 from .wire.peer import Arrived, OutsideHost, Peer, RelayedAsk, named, obey
@@ -180,7 +180,7 @@ class Guest(Peer):
             frames.Launch: self._launch,
             frames.Command: lambda frame: self._command(self._target(frame.to), frame),
             frames.Record: self.on_record,
-            frames.Piece: lambda frame: self.moves.obey(self._target(frame.to), word_of(frame)),
+            frames.Migrate: lambda frame: self.moves.hear(self.connection.name_in(frame.to), frame),
             frames.Forget: self.on_forget,
         }
 
@@ -388,8 +388,6 @@ class Guest(Peer):
             cell.extra().bindings[str(frame.data["port"])] = named(self.node, frame, "target")
         elif frame.verb == "control":
             obey_order(self, cell, frame)
-        elif frame.verb == "move":
-            self.moves.obey(cell, frame.data)
         else:
             obey(self.node, cell, frame)
 

@@ -18,6 +18,7 @@ from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
 from ..exit_reasons import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, pack_exit, unpack_exit
 from ..kernel.cell import Cell
 from ..kernel.envelope import Ask
+from ..migration.words import NO_ATTEMPT, say
 from .fork.fork_server import ForkServer
 from .fork.forked_process import Forked, check_can_watch, has_ended
 from .fork.launch import keep_large_memory, why_not_importable
@@ -66,7 +67,7 @@ class Worker(Peer):
         self._oom_before = oom_kills()
         self._watch: Watch | None = None
         self._outputs: list[OutputReader] = []
-        self.movers: dict[int, Callable[[dict[str, Any]], None]] = {}  # who hears of which attempt to move an actor
+        self.movers: dict[int, Callable[[frames.Migrate], None]] = {}  # who hears of which attempt to move an actor
 
     # -- its life ---------------------------------------------------------------------------------------------------
 
@@ -196,8 +197,7 @@ class Worker(Peer):
         if self._buried:
             return
         connection = self.connection
-        data = {"step": "leave", "reason": pack_exit(reason)}
-        connection.send(frames.Command(connection.name_out(cell.path), "move", data))
+        say(connection, cell.path, NO_ATTEMPT, "leave", reason=pack_exit(reason))
         connection.flush()
         late = self.node.loop.call_later(seconds, self.kill, KILLED)
         self._grave.add_done_callback(lambda _: late.cancel())
@@ -271,11 +271,11 @@ class Worker(Peer):
         if cell is not None and bound is not None:
             bound.moved(cell)
 
-    def on_move(self, data: dict[str, Any]) -> None:
+    def on_migrate(self, frame: frames.Migrate) -> None:
         """A word of an attempt to move an actor; if that one is over, it is void."""
-        heard = self.movers.get(data.get("attempt", 0))
+        heard = self.movers.get(frame.attempt)
         if heard is not None:
-            heard(data)
+            heard(frame)
 
     def on_note(self, frame: frames.Note) -> None:
         """An event of the process."""

@@ -33,7 +33,6 @@ from ..protocol import (
     STASHED,
     TICK,
     Answer,
-    Carried,
     Closed,
     Go,
     Hooked,
@@ -444,7 +443,7 @@ class Switch:
                 case Ignored():
                     if self.live is not None and not self.live.done():
                         self.live.set_exception(StartIgnored(self.path, record.why))
-                case Wanted() | Closed() | Carried():
+                case Wanted() | Closed():
                     pass  # for whoever begins lives, or hands them over
         except ReplayDiverged as error:
             self.diverged = error

@@ -22,16 +22,11 @@ from ...actors.process.wire import frames
 from ...actors.process.wire.peer import send_signal
 from ..method import Method
 from ..protocol import (
-    Attached,
     Begin,
-    Carried,
     Closed,
-    Handover,
     Over,
     Respec,
     Restore,
-    Returned,
-    Returning,
     Started,
     ToHome,
     ToLife,
@@ -52,7 +47,6 @@ class RecordedGuest:
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
         self._ports: dict[str, Port] = {}
-        self.on_handover: Callable[[str, Handover | Carried], None] = lambda path, record: None
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
@@ -173,8 +167,6 @@ class Port:
             case Over() | Respec():
                 if self.on_group is not None:
                     self.on_group(record)
-            case Attached() | Returning() | Returned() | Carried():
-                self._guest.recovery.on_handover(self._path, record)
             case _:
                 if self.life is not None:
                     self.life.from_home(record)

@@ -24,6 +24,8 @@ from ...actors.kernel.mailbox import Bounded
 from ...actors.kernel.message import message_name
 from ...actors.migration.here import dispose
 from ...actors.migration.quiesce import farewell, obey_commands, part, settle_with_queue, sorted_out, twin
+from ...actors.migration.worker_moves import GuestMove
+from ...actors.process.wire.connection import BadFrame
 from ...actors.process.wire.peer import send_signal
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.life.recorded_inbox import StopRecorded
@@ -31,14 +33,10 @@ from ...checkpoint.life.recorded_life import Life
 from ...checkpoint.life.worker_lives import GuestKeeper, InnerLifeHost, Port
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import (
-    Attached,
     Closed,
-    Handover,
     Over,
     Protected,
     Respec,
-    Returned,
-    Returning,
     Started,
     Wanted,
 )
@@ -200,6 +198,86 @@ def respec(cell: Cell, described: list[Any]) -> None:
 # -- lives that are handed over while they are lived -----------------------------------------------------------------
 
 
+class RecordedChild:
+    """One attempt to hand the life of a recorded child over to a group at the root, or to take it back."""
+
+    def __init__(self, guest: Guest, path: str, attempt: int) -> None:
+        self._guest, self._path = guest, path
+        self._life_here = GuestMove(guest, path, attempt)  # comes to rest as that of any recorded actor
+        self._arriving: Arriving | None = None
+
+    def obey(self, step: str, told: dict[str, Any]) -> None:
+        cell = self._guest.node.find(self._path)
+        if cell is None or cell.state is not RUNNING:
+            return  # It has ended meanwhile: the root has heard so, or will.
+        match step:
+            case "take" | "back":
+                self._life_here.obey(step, told)
+            case "leave":
+                self._leave(cell, told)
+            case "come":
+                self._come(cell, told)
+            case "settle" | "stay":
+                arriving, self._arriving = self._arriving, None
+                if arriving is not None:
+                    self._settle(cell, arriving) if step == "settle" else self._stay(arriving)
+            case _:
+                raise BadFrame(f"the handing over of a child has no step {step!r}")
+
+    def _leave(self, cell: Cell, told: dict[str, Any]) -> None:
+        """The life that is at rest here is over; nobody hears of that but the actor itself."""
+        old_host = cell.host
+        assert isinstance(old_host, InnerLifeHost)
+        life = old_host.let_go()
+        life.port = NOWHERE
+        old = part(cell)
+        _, commands = sorted_out(cell)  # What it was fed is at its home.
+        life.cell = old
+        respec(cell, told["layers"])
+        InnerGroupHost(self._guest, cell.spec, self._guest.recovery.port_of).take_up(cell, told["number"])
+        obey_commands(cell, commands)
+        farewell(old, StopRecorded(life, exit_reasons.Shutdown("moved into a group of replicas")))
+
+    def _come(self, cell: Cell, told: dict[str, Any]) -> None:
+        """Begin the life that comes back; it handles nothing yet."""
+        guest, number, slot = self._guest, told["number"], told["slot"]
+        port = guest.recovery.port_of(self._path)
+        start, recovery = cell.extra().start, cell.spec.recovery
+        assert start is not None
+        other = twin(cell)
+        other.life -= 1  # Counted up by the life that begins; it is no other one.
+        other.extra().start, other.extra().bindings = start, cell.extra().bindings
+        life = Life(other, port, recovery, guest.page[slot : slot + 1], may_fork=True)
+        life.begins_suspended = told["is_suspended"]
+        self._arriving = Arriving(InnerLifeHost(guest, recovery, guest.recovery.port_of), other, life, number)
+
+        def ended_early(done: asyncio.Future[ExitReason]) -> None:
+            if self._arriving is not None and self._arriving.other is other:
+                port.to_home(Closed(number, pack_exit(done.result())))
+
+        try:
+            port.begin(life, told["turn"], told["stash"])
+        except StartFailed:
+            port.life = None
+            port.to_home(Closed(number, pack_exit(other.extra().reason)))
+        else:
+            other.ended().add_done_callback(ended_early)
+
+    def _stay(self, arriving: Arriving) -> None:
+        """The new life is not to be."""
+        self._guest.recovery.port_of(self._path).life, arriving.life.port = None, NOWHERE
+        dispose(arriving.other)
+
+    @staticmethod
+    def _settle(cell: Cell, arriving: Arriving) -> None:
+        """From here on the new life is the one."""
+        settle_with_queue(arriving.other, cell)
+        arriving.life.cell = cell
+        arriving.host.take_up(cell, arriving.life, arriving.number)
+        respec(cell, [])
+        lifecycle.up(cell)
+
+
 class Arriving(NamedTuple):
     """A life that was begun beside its address, and is not the one yet."""
 
@@ -207,77 +285,3 @@ class Arriving(NamedTuple):
     other: Cell
     life: Life
     number: int
-
-
-ARRIVING: dict[str, Arriving] = {}
-"""By address: a process has one guest."""
-
-
-def take(guest: Guest, path: str, record: Handover) -> None:
-    """What the root says of a child that is handed over."""
-    cell, port_of = guest.node.find(path), guest.recovery.port_of
-    if cell is None or cell.state is not RUNNING:
-        return  # It has ended meanwhile: the root has heard so, or will.
-    match record:
-        case Attached():
-            _attached(guest, cell, record)
-        case Returning():
-            _returning(guest, cell, port_of(path), record)
-        case Returned():
-            arriving = ARRIVING.pop(path, None)
-            if arriving is None:
-                return
-            if record.is_kept:
-                _returned(cell, arriving)
-            else:
-                port_of(path).life, arriving.life.port = None, NOWHERE
-                dispose(arriving.other)
-
-
-def _attached(guest: Guest, cell: Cell, record: Attached) -> None:
-    """The life that is at rest here is over; nobody hears of that but the actor itself."""
-    old_host = cell.host
-    assert isinstance(old_host, InnerLifeHost)
-    life = old_host.let_go()
-    life.port = NOWHERE
-    old = part(cell)
-    _, commands = sorted_out(cell)  # What it was fed is at its home.
-    life.cell = old
-    respec(cell, record.layers)
-    InnerGroupHost(guest, cell.spec, guest.recovery.port_of).take_up(cell, record.number)
-    obey_commands(cell, commands)
-    farewell(old, StopRecorded(life, exit_reasons.Shutdown("moved into a group of replicas")))
-
-
-def _returning(guest: Guest, cell: Cell, port: Port, record: Returning) -> None:
-    """Begin the life that comes back; it handles nothing yet."""
-    start, recovery = cell.extra().start, cell.spec.recovery
-    assert start is not None
-    other = twin(cell)
-    other.life -= 1  # Counted up by the life that begins; it is no other one.
-    other.extra().start, other.extra().bindings = start, cell.extra().bindings
-    life = Life(other, port, recovery, guest.page[record.slot : record.slot + 1], may_fork=True)
-    life.begins_suspended = record.is_suspended
-    ARRIVING[cell.path] = Arriving(InnerLifeHost(guest, recovery, guest.recovery.port_of), other, life, record.number)
-
-    def ended_early(done: asyncio.Future[ExitReason]) -> None:
-        arriving = ARRIVING.get(cell.path)
-        if arriving is not None and arriving.other is other:
-            port.to_home(Closed(record.number, pack_exit(done.result())))
-
-    try:
-        port.begin(life, record.turn, record.stash)
-    except StartFailed:
-        port.life = None
-        port.to_home(Closed(record.number, pack_exit(other.extra().reason)))
-    else:
-        other.ended().add_done_callback(ended_early)
-
-
-def _returned(cell: Cell, arriving: Arriving) -> None:
-    """From here on the new life is the one."""
-    settle_with_queue(arriving.other, cell)
-    arriving.life.cell = cell
-    arriving.host.take_up(cell, arriving.life, arriving.number)
-    respec(cell, [])
-    lifecycle.up(cell)

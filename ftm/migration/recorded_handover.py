@@ -19,7 +19,7 @@ from ...actors.migration.quiesce import Transit, now
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.home.recorded_hosts import RemoteLife
 from ...checkpoint.home.recorded_moves import Detached, refuse_unsaved
-from ...checkpoint.protocol import Closed, Live, Protected, Returned, Returning, ToHome
+from ...checkpoint.protocol import Closed, Live, Protected, ToHome
 from ...supervision.respec import recipe_spec
 from ..mechanisms.mechanism import compose
 from .attach import ToGroup
@@ -69,18 +69,18 @@ class OutOfSubtree(ToGroup):
             self._taken, self.timeout, lambda: "it did not come to rest: a turn or background work goes on"
         )
 
-    def _say(self, step: str) -> None:
-        self.say(self._worker, step)
+    def _say(self, step: str, **told: Any) -> None:
+        self.say(self._worker, step, **told)
         self._worker.connection.flush()
 
-    def heard(self, data: dict[str, Any]) -> None:
-        if data.get("step") == "refused":
-            self.give_up(str(data["why"]))
-        elif data.get("step") == "taken" and not self.given_up.done():
+    def heard(self, step: str, told: dict[str, Any]) -> None:
+        if step == "refused":
+            self.give_up(str(told["why"]))
+        elif step == "taken" and not self.given_up.done():
             assert self._switch is not None
             more = self.cell.extra()
-            self.rest_at = float(data["at"])
-            more.trap_exits, more.suspended = bool(data["trap_exits"]), bool(data["suspended"])
+            self.rest_at = float(told["at"])
+            more.trap_exits, more.suspended = bool(told["trap_exits"]), bool(told["suspended"])
             self._home = Detached(self._switch)
             self.at_rest()
             self._taken.set_result(None)
@@ -97,7 +97,8 @@ class OutOfSubtree(ToGroup):
         self.is_done = True
         wanted = self._place.hand_over(host)
         protected = Protected(b"", [], {})  # What it is made of is known.
-        host.take_up(cell, msgspec.structs.replace(wanted, protected=protected), RemoteLife(cell.path, self._worker))
+        host.found(msgspec.structs.replace(wanted, protected=protected), RemoteLife(cell.path, self._worker))
+        self._say("leave", number=wanted.number, layers=host.described())
         host.take_over(cell, group)
         more.trap_exits = False  # Its replicas know.
         self.transit.over(cell, host)
@@ -136,6 +137,10 @@ class IntoSubtree(ToRecordedTask):
         self._port = RemoteLife(cell.path, self._worker)
         self._up: asyncio.Future[None] = self.node.loop.create_future()
 
+    def _say(self, step: str, **told: Any) -> None:
+        self.say(self._worker, step, **told)
+        self._worker.connection.flush()
+
     async def carry(self) -> None:
         cell, place = self.cell, self._place
         refuse_unsaved(cell, self._switch)
@@ -145,7 +150,8 @@ class IntoSubtree(ToRecordedTask):
         for record in switch.restore_records():
             self._port.to_life(record)
         number, suspended = self._group_host.number, self._group.is_suspended
-        self._port.to_life(Returning(number, switch.state_turn, switch.stash, place.slot, suspended))
+        told = {"number": number, "turn": switch.state_turn, "stash": switch.stash, "slot": place.slot}
+        self._say("come", is_suspended=suspended, **told)
         switch.attach(self._port)
         live.add_done_callback(lambda done: None if done.cancelled() else self._fail(done.exception()))
         await self.within(self._up, self.timeout, lambda: "its new life was not up")
@@ -171,7 +177,7 @@ class IntoSubtree(ToRecordedTask):
         self.is_done = True
         place.arriving = None
         wanted = msgspec.structs.replace(self._group_host.hand_over(), protected=None)
-        self._port.to_life(Returned(is_kept=True))
+        self._say("settle")
         self.transit.over(cell, place)
         for port, target in cell.extra().bindings.items():
             place.told(cell, "bind", {"port": port, "target": target.path})
@@ -188,7 +194,7 @@ class IntoSubtree(ToRecordedTask):
             settle_in(self.cell, self.transit)
             return
         if self.transit is not None:
-            self._port.to_life(Returned(is_kept=False))
+            self._say("stay")
         super().undo()
 
 

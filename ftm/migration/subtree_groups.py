@@ -22,7 +22,7 @@ from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.home.homes import seen
-from ...checkpoint.protocol import Attached, Closed, Over, Respec, Started, Wanted
+from ...checkpoint.protocol import Closed, Over, Respec, Started, Wanted
 from ...supervision.respec import recipe_spec
 from ..group.group_host import GroupHost
 from ..group.reconfiguration import REST_WITHIN, Reconfiguration
@@ -92,11 +92,6 @@ class SubtreeGroup(GroupHost):
     def prepare(self, recipe: bytes, topics: list[str]) -> None:
         """A life is to be handed over, of an actor that begins so."""
         self._recipe, self._topics = recipe, topics
-
-    def take_up(self, cell: Cell, wanted: Wanted, port: RemoteLife) -> None:
-        """A life that was lived in the process is lived here from now on; its supervisor wants it as before."""
-        self.found(wanted, port)
-        port.to_life(Attached(wanted.number, self.described()))
 
     def found(self, wanted: Wanted, port: RemoteLife) -> None:
         """The life that is lived here already is the one that is wanted."""

@@ -26,7 +26,7 @@ from ...checkpoint.home.capacity import HomeBound
 from ...checkpoint.home.recorded_hosts import RemoteLife
 from ...checkpoint.home.subtree_homes import SubtreeHome, SubtreeHost
 from ...checkpoint.home.switch import Switch
-from ...checkpoint.protocol import DOWN, EXIT, Carried, Closed, Live, Protected, ToHome, Wanted
+from ...checkpoint.protocol import DOWN, EXIT, Closed, Live, Protected, ToHome, Wanted
 from ...checkpoint.recovery.held_messages import inlet
 from ...supervision.respec import recipe_spec
 from ..group.transient_homes import UNKEPT
@@ -35,7 +35,7 @@ from .attach import ToGroup
 from .detach import ToPlainTask
 from .recorded_handover import settle_in, worker_of
 from .subtree_groups import SubtreeGroup
-from .unrecorded_luggage import Incoming, carry, pack_ask, refuse, unpack
+from .unrecorded_luggage import pack_ask, refuse, unpack
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Admit
@@ -72,7 +72,6 @@ class OutOfProcess(ToGroup):
         super().__init__(cell, host, timeout)
         self._new_host, self._place, self._spec, self._worker = host, place, spec, worker_of(place, cell)
         self._port = RemoteLife(cell.path, self._worker)
-        self._incoming = Incoming(imports=False)
         self._admit: Admit = cell.admit
         self._held: list[Any] = []  # what has been sent to it here meanwhile
         self._taken: asyncio.Future[None] = self.node.loop.create_future()
@@ -87,23 +86,19 @@ class OutOfProcess(ToGroup):
         await super().prepare()
 
     async def take(self) -> None:
-        self._place.arriving, self._place.on_lost = self._said, self._lost
+        self._place.arriving, self._place.on_lost = lambda record: None, self._lost
+        self.hear(self._worker)
         self._say("take")
         await self.within(
             self._taken, self.timeout, lambda: "it did not come to rest: a turn or background work goes on"
         )
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_life, self.cell.path, self.attempt, step, **told)
+        self.say(self._worker, step, **told)
         self._worker.connection.flush()
 
-    def _said(self, record: ToHome) -> None:
-        if not isinstance(record, Carried) or record.attempt != self.attempt:
-            return
-        told = self._incoming.take(record)
-        if told is None:
-            return
-        match record.step:
+    def heard(self, step: str, told: dict[str, Any]) -> None:
+        match step:
             case "refused":
                 self.give_up(str(told["why"]))
             case "taken" if not self.given_up.done():
@@ -233,30 +228,28 @@ class IntoProcess(ToPlainTask):
         assert isinstance(old, SubtreeGroup)
         super().__init__(cell, old.place, timeout)
         self._group_host, self._place, self._worker = old, old.place, worker_of(old.place, cell)
-        self._port = RemoteLife(cell.path, self._worker)
-        self._incoming = Incoming(imports=False)
         self._up: asyncio.Future[None] = self.node.loop.create_future()
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_life, self.cell.path, self.attempt, step, **told)
+        self.say(self._worker, step, **told)
         self._worker.connection.flush()
 
     async def carry(self) -> None:
         self._place.arriving = self._said
+        self.hear(self._worker)
         self._say("come", state=self._data, traps=self._traps)
         await self.within(self._up, self.timeout, lambda: "its new life was not up")
 
     def _said(self, record: ToHome) -> None:
         if isinstance(record, Closed):
             self._fail(str(unpack_exit(record.reason)))
-        if not isinstance(record, Carried) or record.attempt != self.attempt:
+
+    def heard(self, step: str, told: dict[str, Any]) -> None:
+        if self._up.done() or self.given_up.done():
             return
-        told = self._incoming.take(record)
-        if told is None or self._up.done() or self.given_up.done():
-            return
-        if record.step == "failed":
+        if step == "failed":
             self._fail(str(told["why"]))
-        elif record.step == "up":
+        elif step == "up":
             self._return()
 
     def _fail(self, why: str) -> None:

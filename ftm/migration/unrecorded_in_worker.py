@@ -22,48 +22,31 @@ from ...actors.kernel.topics import Topics
 from ...actors.migration.here import Arrival
 from ...actors.migration.luggage import Stays, check_sendable, pack_rest
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
+from ...actors.migration.words import say
+from ...actors.process.wire.connection import BadFrame
 from ...actors.process.worker_node import GuestHost, InnerHost
 from ...checkpoint.life.worker_lives import GuestKeeper
 from ...checkpoint.snapshot.key_variables import restore_state, save_state
 from .protected_stand_ins import InnerGroupHost, respec
-from .unrecorded_luggage import Incoming, carry, pack, refuse, unpack
+from .unrecorded_luggage import pack, refuse, unpack
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
     from ...actors.process.worker_node import Guest
-    from ...checkpoint.protocol import Carried
-
-LIVES: dict[str, Carrier] = {}
-"""By address: a process has one guest."""
 
 
-def hear(guest: Guest, path: str, record: Carried) -> None:
-    """What the root says of a life that is handed over."""
-    one = LIVES.get(path)
-    if one is None:
-        one = LIVES[path] = Carrier(guest, path)
-    one.hear(record)
+class PlainChild:
+    """One attempt to hand the life at an address over, or to take it back."""
 
-
-class Carrier:
-    """The handing over of the lives at one address."""
-
-    def __init__(self, guest: Guest, path: str) -> None:
-        self._guest, self._path = guest, path
-        self._port = guest.recovery.port_of(path)
-        self._attempt, self._incoming = -1, Incoming(imports=True)
+    def __init__(self, guest: Guest, path: str, attempt: int) -> None:
+        self._guest, self._path, self._attempt = guest, path, attempt
         self._take: Take | None = None
         self._cell: Cell | None = None  # where a life is at rest, or comes back to
         self._arrival: Arrival | None = None  # beside it: the life that comes back
         self._held: list[Any] | None = None  # what has been sent to it here meanwhile
 
-    def hear(self, record: Carried) -> None:
-        if record.attempt != self._attempt:
-            self._attempt, self._incoming = record.attempt, Incoming(imports=True)
-        told = self._incoming.take(record)
-        if told is None:
-            return
-        match record.step:
+    def obey(self, step: str, told: dict[str, Any]) -> None:
+        match step:
             case "take":
                 self._come_to_rest()
             case "back":
@@ -74,11 +57,13 @@ class Carrier:
                 self._come(told)
             case "stay":
                 self._stay()
-            case _:
+            case "settle":
                 self._settle_in(told)
+            case _:
+                raise BadFrame(f"the handing over of a child has no step {step!r}")
 
     def _say(self, step: str, **told: Any) -> None:
-        carry(self._port.to_home, self._path, self._attempt, step, **told)
+        say(self._guest.connection, self._path, self._attempt, step, **told)
 
     # -- leaving ----------------------------------------------------------------------------------------------------
 
@@ -216,7 +201,7 @@ class Carrier:
         host = cell.host
         assert isinstance(host, InnerGroupHost)
         has_ended = arrival.other.state is not RUNNING  # by its background work
-        self._port.on_group = None
+        guest.recovery.port_of(self._path).on_group = None
         cell.host = guest.node.here
         bound = None if host.bound is None else Bound(host.bound.capacity, host.bound.overflow)
         queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])

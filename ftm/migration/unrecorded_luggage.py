@@ -5,7 +5,7 @@ Whoever waits for a reply is answered over the connection, wherever the asked ac
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError
@@ -13,36 +13,10 @@ from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.message import message_name
 from ...actors.migration.luggage import pack_items, unpack_items
-from ...actors.migration.worker_moves import Luggage
 from ...actors.process.wire.peer import Peer, RelayedAsk
-from ...actors.values import encode_value
-from ...checkpoint.protocol import Carried, pieces
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
-
-
-def carry(say: Callable[[Carried], None], path: str, attempt: int, step: str, **told: Any) -> None:
-    """Say a step, and what is told with it, in pieces.
-
-    Raises:
-        UnsavableValue: something in it cannot be sent.
-    """
-    *parts, last = pieces(encode_value(told, where=path))
-    for part in parts:
-        say(Carried(attempt, step, part, is_last=False))
-    say(Carried(attempt, step, last, is_last=True))
-
-
-class Incoming:
-    """What comes in pieces; `imports`: from the root, which may have modules imported."""
-
-    def __init__(self, *, imports: bool) -> None:
-        self._luggage = Luggage(imports=imports)
-
-    def take(self, record: Carried) -> dict[str, Any] | None:
-        """One more piece; all that was told if it was the last."""
-        return self._luggage.take({"part": record.data, "is_last": record.is_last})
 
 
 def pack_ask(peer: Peer, ask: Ask, name: str, body: bytes) -> list[Any]:

@@ -24,9 +24,9 @@ from .frames import (
     Forget,
     Frame,
     Launch,
+    Migrate,
     Name,
     Offer,
-    Piece,
     Publish,
     Record,
     Reply,
@@ -53,7 +53,7 @@ MOST_NAMES = 4096
 """Names after which a sender forgets all that it has given: whoever was written to once is not remembered for ever."""
 SMALL_BYTES = 1024 * 1024
 """The largest frame of a kind that carries no payload: what is in it may be anything, and takes many times the room."""
-_CARRIERS: frozenset[type[Frame]] = frozenset((Tell, Ask, Reply, Failure, Offer, Publish, Record, Piece))
+_CARRIERS: frozenset[type[Frame]] = frozenset((Tell, Ask, Reply, Failure, Offer, Publish, Record, Migrate))
 _FROM_ROOT: frozenset[type[Frame]] = _CARRIERS | {Launch, Run, Command}
 _CARRIER_TAGS, _FROM_ROOT_TAGS = (frozenset(tagged(kind)[1] for kind in kinds) for kinds in (_CARRIERS, _FROM_ROOT))
 FRAMES_PER_TICK = 128

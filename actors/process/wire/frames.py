@@ -158,8 +158,11 @@ class Forget(Frame, tag=16):
     """All names that the sender has given so far are forgotten; their numbers begin again."""
 
 
-class Piece(Frame, tag=17):
-    """A piece of what an actor takes along when it is moved."""
+class Migrate(Frame, tag=17):
+    """A word of the migration of one actor, or a piece of it. In both directions; see `migration/words.py`.
+
+    `attempt`: which one it is about; what an earlier one has left on its way is void.
+    """
 
     to: Name
     attempt: int
@@ -192,5 +195,5 @@ AnyFrame = (
     | Moved
     | Run
     | Forget
-    | Piece
+    | Migrate
 )

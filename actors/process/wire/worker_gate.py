@@ -193,7 +193,7 @@ class Gate:
         start = None if cell is None or cell.more is None else cell.more.start
         return () if start is None else start.kind._speaks_for(start)
 
-    def of_own(self, frame: frames.Record | frames.Piece) -> None:
+    def of_own(self, frame: frames.Record | frames.Migrate) -> None:
         """It is of one of its actors."""
         to = frame.to
         if to in self._own:
@@ -340,13 +340,12 @@ RULES: Final[dict[type[frames.Frame], Rule]] = {
     frames.Ended: Gate.ended,
     frames.Note: Gate.note,
     frames.Record: Gate.of_own,
-    frames.Piece: Gate.of_own,
+    frames.Migrate: Gate.of_own,
     frames.Command: Gate.command,
 }
 """What has no row (`Launch`, `Run`) only the root sends. `Forget` is the connection's own."""
 
 COMMANDS: Final[dict[str, Callable[[Gate, str, frames.Command], None]]] = {
-    "move": _home,
     "subscribe": _topic,
     "unsubscribe": _topic,
     "born": _born,
