@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 PIECE = 4 * 1024 * 1024
 """Bytes per frame of what is told: it may be larger than a frame can be."""
+MOST = 2**32
+"""Bytes that can be told with one word: more cannot be written as one value either."""
 NO_ATTEMPT = 0
 """Instead of a number: the actor lives elsewhere for good, whatever was attempted."""
 
@@ -44,17 +46,21 @@ class Incoming:
     def __init__(self, *, imports: bool) -> None:
         self._imports = imports
         self._parts: list[bytes] = []
+        self._size = 0
 
     def take(self, frame: Migrate) -> dict[str, Any] | None:
         """One more piece; all that was told if it was the last.
 
         Raises:
-            BadFrame: it cannot be read.
+            BadFrame: it cannot be read, or has no end.
         """
         self._parts.append(frame.part)
+        self._size += len(frame.part)
+        if self._size > MOST:
+            raise BadFrame(f"what is told with {frame.step!r} of a migration has more than {MOST} bytes")
         if not frame.is_last:
             return None
-        whole = b"".join(self._parts)
+        whole, self._size = b"".join(self._parts), 0
         self._parts.clear()
         try:
             told = decode_value(whole, imports=self._imports)
