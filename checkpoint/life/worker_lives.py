@@ -9,29 +9,25 @@ from typing import TYPE_CHECKING, Any, cast
 
 import msgspec
 
-from ...actors import exit_reasons
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
-from ...actors.exit_reasons import ExitReason, pack_exit
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, links
 from ...actors.kernel.cell import DOWN, RUNNING, Cell, Host
-from ...actors.kernel.envelope import Envelope, Item
-from ...actors.kernel.mailbox import Bounded, Senders
-from ...actors.kernel.message import message_name
+from ...actors.kernel.envelope import Item
 from ...actors.persistence import child_key
 from ...actors.process.wire import frames
 from ...actors.process.wire.peer import send_signal
 from ..method import Method
 from ..protocol import (
     Begin,
-    Closed,
     Over,
     Respec,
     Restore,
     Started,
     ToHome,
     ToLife,
-    Wanted,
 )
+from .child_stub import ChildStub
 from .recorded_inbox import StopRecorded
 from .recorded_life import Life
 
@@ -58,6 +54,12 @@ class RecordedGuest:
         if port is None:
             port = self._ports[path] = Port(self._guest, path)
         return port
+
+    def begins(self, path: str) -> None:
+        """A life is about to begin at an address."""
+        keeper = self._guest.node.keeper
+        if isinstance(keeper, GuestKeeper):
+            keeper.begins(path)
 
     def vacated(self, path: str) -> None:
         """Nobody lives at an address any more: whoever does so again is given a new way."""
@@ -223,72 +225,18 @@ class OwnHost(LifeHost):
         self._guest.report_end(cell, cell.extra().reason)
 
 
-class Homeward:
-    """The room at an actor whose home is at the root: as many messages may be on the way as its mailbox holds."""
-
-    def __init__(self, loop: asyncio.AbstractEventLoop, capacity: int) -> None:
-        self._loop, self._capacity = loop, capacity
-        self._on_way = 0
-        self._senders = Senders()
-
-    def left(self, accepted: asyncio.Future[None]) -> None:
-        """A message has left, whose sender waits until it is accepted."""
-        self._on_way += 1
-        accepted.add_done_callback(self._arrived)
-
-    def _arrived(self, accepted: asyncio.Future[None]) -> None:
-        self._on_way -= 1
-        self._senders.wake(lambda: self.has_room)
-
-    @property
-    def has_room(self) -> bool:
-        """Whether one more may leave."""
-        return self._on_way < self._capacity
-
-    def room(self) -> asyncio.Future[None] | None:
-        """None if so; else a future that ends when it is worth trying again."""
-        return None if self.has_room else self._senders.wait(self._loop)
-
-
-class InnerLifeHost(LifeHost):
-    """The host of a recorded child of a supervisor in this process: everything sent to it goes home first."""
-
-    takes_parcels = True
+class InnerLifeHost(ChildStub, LifeHost):
+    """The host of a recorded child of a supervisor in this process, whose lives are lived here."""
 
     def __init__(self, guest: Guest, method: Method, port_of: Callable[[str], Port]) -> None:
-        self._guest, self._method, self._port_of = guest, method, port_of
+        super().__init__(guest, method, port_of)
         self._life = None
-        self._port: Port | None = None
-        self._bound: Bounded | None = None
-        self._homeward: Homeward | None = None
-        self._number = 0
-        self._up: asyncio.Future[None] | None = None
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the home to bring the actor back."""
-        more = cell.extra()
-        start = more.start
-        assert start is not None
-        if self._method.hooks is not None:
-            why = "recovery hooks run in the root process: give them to ActorSystem(recovery_hooks=...)"
-            raise StartFailed(cell.path, why)
-        if isinstance(cell.node.keeper, GuestKeeper):
-            cell.node.keeper.begins(cell.path)
-        cell.table = start.kind._table
-        cell.admit = self._admit
-        if more.bound is not None:  # The home counts.
-            self._bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
-            if self._bound.overflow == "block":
-                more.outlet = self._homeward = Homeward(cell.node.loop, self._bound.capacity)
-        self._number += 1
-        self._up = cell.node.loop.create_future()
-        port = self._port = self._joined(cell)
-        kind = message_name(start.kind)
-        port.to_home(Wanted(self._number, kind, list(start.kind._topics), self._with_ports(cell), self._bound))
-        return self._up
+        return self.ask_for_life(cell, self._with_ports(cell))
 
-    def _joined(self, cell: Cell) -> Port:
-        """The way home, on which we hear of lives here from now on."""
+    def joined(self, cell: Cell) -> Port:
         port = self._port_of(cell.path)
         port.on_begin = lambda record: self._begin(cell, record)
         port.on_started = lambda record: self._started(cell, record)
@@ -303,8 +251,8 @@ class InnerLifeHost(LifeHost):
 
     def take_up(self, cell: Cell, life: Life, number: int) -> None:
         """A life that has come back here is that of the address, as if it had been wanted as `number`."""
-        self._life, self._number, self._port = life, number, self._joined(cell)
-        cell.host, cell.admit = self, self._admit
+        self._life, self._number, self._port = life, number, self.joined(cell)
+        cell.host, cell.admit = self, self.way_home
 
     def let_go(self) -> Life:
         """The life that is lived here, which is at rest, is not the address's any more; its home hears no more."""
@@ -323,8 +271,8 @@ class InnerLifeHost(LifeHost):
         return dataclasses.replace(self._method, safe_state=dataclasses.replace(state, ports=ports))
 
     def _begin(self, cell: Cell, record: Begin) -> None:
-        port, up = self._port, self._up
-        if record.number != self._number or up is None or up.done() or cell.state is not DOWN:
+        port = self._port
+        if not self.is_starting(record.number) or cell.state is not DOWN:
             return
         assert port is not None
         cell.life = record.life - 1
@@ -336,75 +284,40 @@ class InnerLifeHost(LifeHost):
             port.on_closed = lambda: self._closed(cell)
         except StartFailed as error:
             port.life = self._life = None
-            self._fail(cell, error)
-            self._say_closed(cell)
+            self.fail(error)
+            self.say_closed(cell, cell.extra().reason)
 
     def _started(self, cell: Cell, record: Started) -> None:
-        if record.number != self._number or self._up is None or self._up.done():
+        if not self.is_starting(record.number):
             return
         if not record.problem:
-            self._up.set_result(None)
+            self._came_up()
         elif cell.state is DOWN:
-            self._fail(cell, StartFailed(cell.path, record.problem))
+            self.fail(StartFailed(cell.path, record.problem))
         else:  # Its replay diverged: the next life begins when this one is over.
-            cell.ended().add_done_callback(lambda _: self._fail(cell, StartFailed(cell.path, record.problem)))
+            cell.ended().add_done_callback(lambda _: self.fail(StartFailed(cell.path, record.problem)))
             cell.kill()
 
-    def _fail(self, cell: Cell, error: StartFailed) -> None:
+    def _came_up(self) -> None:
         if self._up is not None and not self._up.done():
-            self._up.set_exception(error)
-            self._up.exception()  # Nobody may be left to look.
+            self._up.set_result(None)
 
     def _closed(self, cell: Cell) -> None:
         life, self._life = self._life, None
-        self._say_closed(cell)
+        self.say_closed(cell, cell.extra().reason)
         if life is not None and life.ignored_why is not None:
-            self._fail(cell, StartIgnored(cell.path, life.ignored_why))
-        elif life is not None and life.is_live and self._up is not None and not self._up.done():
-            self._up.set_result(None)  # It was up, and has ended in a turn before its home could say so.
+            self.fail(StartIgnored(cell.path, life.ignored_why))
+        elif life is not None and life.is_live:
+            self._came_up()  # It was up, and has ended in a turn before its home could say so.
         else:
-            self._fail(cell, StartFailed(cell.path, str(cell.extra().reason)))
-
-    def _say_closed(self, cell: Cell) -> None:
-        assert self._port is not None
-        reason = cell.extra().reason
-        recovers = self.recovers(reason) and cell.spec is not None and cell.spec.restarts(reason)
-        self._port.to_home(Closed(self._number, pack_exit(reason), recovers))
+            self.fail(StartFailed(cell.path, str(cell.extra().reason)))
 
     def kill(self, cell: Cell) -> None:
-        if cell.state is DOWN and self._up is not None and not self._up.done():
-            cell.extra().reason = exit_reasons.KILLED
-            self._say_closed(cell)
-            self._number += 1
-            self._fail(cell, StartFailed(cell.path, "it was stopped while it started"))
-        else:
+        if not self.gave_up_start(cell):
             super().kill(cell)
-
-    def retired(self, cell: Cell) -> None:
-        if cell.queue:
-            cell.queue.clear()  # Its home has these.
-        self._guest.tell_gone(cell)
-        self._guest.recovery.vacated(cell.path)
-
-    def _admit(self, cell: Cell, item: Any) -> None:
-        """Stands in `cell.admit`: the home numbers and journals, and feeds it back."""
-        if not isinstance(item, Item) and type(item) not in cell.table:
-            cell.require(item)
-        self._guest.send_item(cell, cell.path, item, 0)
-
-    def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
-        message, sender = (item.message, item.sender) if isinstance(item, Envelope) else (item, None)
-        accepted = self._guest.offer(cell.path, message, sender)
-        if self._homeward is not None:
-            self._homeward.left(accepted)
-        return accepted
 
     def push(self, cell: Cell, item: Item) -> None:
         if isinstance(item, (links.Exit, links.Down)):
             send_signal(self._guest, cell.path, item)
         else:
             super().push(cell, item)
-
-    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        if verb in ("link", "unlink"):  # Its links are kept at home; what watches it from here is told here.
-            self._guest.command(cell, verb, data)

@@ -18,27 +18,24 @@ from ...actors.control.orders_lane import Call
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
-from ...actors.kernel.cell import DOWN, RUNNING, Cell
-from ...actors.kernel.envelope import Ask, Envelope, Item
-from ...actors.kernel.mailbox import Bounded
-from ...actors.kernel.message import message_name
+from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.envelope import Item
 from ...actors.migration.here import dispose
 from ...actors.migration.quiesce import farewell, obey_commands, part, settle_with_queue, sorted_out, twin
 from ...actors.migration.worker_moves import GuestMove
 from ...actors.process.wire.connection import BadFrame
 from ...actors.process.wire.peer import send_signal
 from ...actors.process.wire.start_codec import pack_recipe
+from ...checkpoint.life.child_stub import ChildStub
 from ...checkpoint.life.recorded_inbox import StopRecorded
 from ...checkpoint.life.recorded_life import Life
-from ...checkpoint.life.worker_lives import GuestKeeper, InnerLifeHost, Port
-from ...checkpoint.method import Method
+from ...checkpoint.life.worker_lives import InnerLifeHost, Port
 from ...checkpoint.protocol import (
     Closed,
     Over,
     Protected,
     Respec,
     Started,
-    Wanted,
 )
 from ...supervision.respec import replace_mechanism
 from ..group.transient_homes import UNKEPT
@@ -50,48 +47,22 @@ if TYPE_CHECKING:
     from ...supervision.spec import ChildSpec
 
 
-class InnerGroupHost:
+class InnerGroupHost(ChildStub):
     """The host of such a child's stand-in."""
 
-    takes_parcels = True
-
     def __init__(self, guest: Guest, spec: ChildSpec, port_of: Callable[[str], Port]) -> None:
-        self._guest, self._port_of = guest, port_of
         recovery = spec.recovery
-        self._method: Method = recovery if recovery is not None and recovery.records else UNKEPT
-        self._port: Port | None = None
-        self.bound: Bounded | None = None
-        self._number = 0
-        self._up: asyncio.Future[None] | None = None
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        return True
+        super().__init__(guest, recovery if recovery is not None and recovery.records else UNKEPT, port_of)
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the root for replicas."""
         more = cell.extra()
-        start, node = more.start, cell.node
-        assert start is not None
-        if self._method.hooks is not None:
-            why = "recovery hooks run in the root process: give them to ActorSystem(recovery_hooks=...)"
-            raise StartFailed(cell.path, why)
-        if isinstance(node.keeper, GuestKeeper):
-            node.keeper.begins(cell.path)
-        cell.table, cell.admit = start.kind._table, self.way_home
-        if more.bound is not None:  # The home counts.
-            self.bound, more.bound = Bounded(more.bound.capacity, more.bound.overflow), None
-        self._number += 1
-        self._up = node.loop.create_future()
-        port = self._port = self._joined(cell)
+        assert more.start is not None
         layers = [msgspec.to_builtins(layer.describe()) for layer in compose(cell.spec.mechanism)]
         bindings = {name: target.path for name, target in more.bindings.items()}
-        made = Protected(pack_recipe(start, cell.path), layers, bindings)
-        kind, topics = message_name(start.kind), list(start.kind._topics)
-        port.to_home(Wanted(self._number, kind, topics, self._method, self.bound, made))
-        return self._up
+        return self.ask_for_life(cell, self._method, Protected(pack_recipe(more.start, cell.path), layers, bindings))
 
-    def _joined(self, cell: Cell) -> Port:
-        """The way home, on which we hear of lives at the root from now on."""
+    def joined(self, cell: Cell) -> Port:
         port = self._port_of(cell.path)
         port.on_started = lambda record: self._started(cell, record)
         port.on_group = lambda record: self._told_by_group(cell, record)
@@ -99,37 +70,28 @@ class InnerGroupHost:
 
     def take_up(self, cell: Cell, number: int) -> None:
         """A life that was lived here goes on at the root, as that which was wanted as `number`."""
-        self._number, self._port = number, self._joined(cell)
+        self._number, self._port = number, self.joined(cell)
         cell.host, cell.admit = self, self.way_home
 
     def _started(self, cell: Cell, record: Started) -> None:
-        if record.number != self._number or self._up is None or self._up.done():
+        if not self.is_starting(record.number):
             return
         if record.problem or record.is_ignored:
             kind = StartIgnored if record.is_ignored else StartFailed
-            self._fail(kind(cell.path, record.problem))
+            self.fail(kind(cell.path, record.problem))
             return
         cell.life += 1
         cell.state = RUNNING
+        assert self._up is not None
         self._up.set_result(None)
-
-    def _fail(self, error: StartFailed) -> None:
-        if self._up is not None and not self._up.done():
-            self._up.set_exception(error)
-            self._up.exception()  # Nobody may be left to look.
 
     def _told_by_group(self, cell: Cell, record: Over | Respec) -> None:
         if isinstance(record, Respec):
             respec(cell, record.layers)
         elif record.number == self._number and cell.state is RUNNING:
             reason = unpack_exit(record.reason)
-            self._say_closed(cell, reason)
+            self.say_closed(cell, reason)
             lifecycle.ended(cell, reason)
-
-    def _say_closed(self, cell: Cell, reason: ExitReason) -> None:
-        assert self._port is not None
-        recovers = self.recovers(reason) and cell.spec is not None and cell.spec.restarts(reason)
-        self._port.to_home(Closed(self._number, pack_exit(reason), recovers))
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         if cell.state is RUNNING:
@@ -138,34 +100,11 @@ class InnerGroupHost:
     def kill(self, cell: Cell) -> None:
         if cell.state is RUNNING:
             self._guest.command(cell, "kill", {})
-        elif cell.state is DOWN and self._up is not None and not self._up.done():
-            cell.extra().reason = exit_reasons.KILLED
-            self._say_closed(cell, exit_reasons.KILLED)
-            self._number += 1
-            self._fail(StartFailed(cell.path, "it was stopped while it started"))
-
-    def retired(self, cell: Cell) -> None:
-        if cell.queue:
-            cell.queue.clear()  # Its home has these.
-        self._guest.tell_gone(cell)
-        self._guest.recovery.vacated(cell.path)
+        else:
+            self.gave_up_start(cell)
 
     def progress(self, cell: Cell) -> object:
         return object()  # It waits for the root.
-
-    def recovers(self, reason: ExitReason) -> bool:
-        """Whether an end for this reason is followed by a recovery."""
-        return not reason.is_clean
-
-    def way_home(self, cell: Cell, item: Any) -> None:
-        """Stands in `cell.admit`: the home numbers, and feeds the replicas."""
-        if not isinstance(item, Item) and type(item) not in cell.table:
-            cell.require(item)
-        self._guest.send_item(cell, cell.path, item, 0)
-
-    def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
-        message, sender = (item.message, item.sender) if isinstance(item, Envelope) else (item, None)
-        return self._guest.offer(cell.path, message, sender)
 
     def push(self, cell: Cell, item: Item) -> None:
         send_signal(self._guest, cell.path, item)
@@ -182,10 +121,6 @@ class InnerGroupHost:
 
     def load(self, cell: Cell) -> int:
         return 0
-
-    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        if verb in ("link", "unlink"):  # Its links are kept at home; what watches it from here is told here.
-            self._guest.command(cell, verb, data)
 
 
 def respec(cell: Cell, described: list[Any]) -> None:

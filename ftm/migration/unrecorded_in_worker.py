@@ -25,7 +25,6 @@ from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part
 from ...actors.migration.words import say
 from ...actors.process.wire.connection import BadFrame
 from ...actors.process.worker_node import GuestHost, InnerHost
-from ...checkpoint.life.worker_lives import GuestKeeper
 from ...checkpoint.snapshot.key_variables import restore_state, save_state
 from .protected_stand_ins import InnerGroupHost, respec
 from .unrecorded_luggage import pack, refuse, unpack
@@ -111,8 +110,7 @@ class PlainChild:
         self._hand_ties_over(cell)
         self._say("left", queue=queue, bound=None if bound is None else [bound.capacity, bound.overflow])
         respec(cell, told["layers"])
-        if isinstance(cell.node.keeper, GuestKeeper):
-            cell.node.keeper.begins(cell.path)
+        guest.recovery.begins(cell.path)
         host = InnerGroupHost(guest, cell.spec, guest.recovery.port_of)
         host.bound = None if bound is None else Bounded(bound.capacity, bound.overflow)
         more.bound = None
