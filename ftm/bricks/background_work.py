@@ -17,15 +17,18 @@ class Background:
     def __init__(self, group: Group) -> None:
         self._group = group
         self._out: set[tuple[int, int]] = set()  # by turn and output
+        self._told: set[tuple[int, int]] = set()  # said to be lost; a follower may have begun it too
 
     def note(self, turn: int, outs: list[Out]) -> None:
         """A turn has begun some."""
         done = self._group.switch.pipes_done.get(turn, ())
         self._out.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
 
-    def back(self, record: PipeDone) -> None:
-        """It has an outcome."""
-        self._out.discard((record.turn, record.k))
+    def back(self, record: PipeDone) -> bool:
+        """It has an outcome. Does that count? What was said to be lost does not come."""
+        one = record.turn, record.k
+        self._out.discard(one)
+        return not record.k or one not in self._told
 
     def is_lost(self, turn: int | None = None) -> bool:
         """What turns up to this one (None: all) have begun has ended without an outcome.
@@ -36,5 +39,6 @@ class Background:
         self._out -= lost
         if not lost or self._group.switch.method.replays:
             return bool(lost)
+        self._told |= lost
         self._group.node.emit(BackgroundWorkLost(self._group.path, self._group.epoch, len(lost)))
         return False

@@ -72,6 +72,8 @@ class ReplyEvicted(Refusal):
     number: int
 
 
+MOST_REQUESTS = 512
+"""Of one batch; no other one is on its way meanwhile."""
 FORWARDED = -(1 << 40)
 """A batch with this number or a lower one came from a leader, and home knows nothing of it here.
 
@@ -149,8 +151,8 @@ Beside = PipeDone | Snapshot | Unsaved | Closed | Ignored | Hooked | Strayed | W
 class Done(Message[Taken]):
     """Outcomes on their way out, in turn order: all of a batch, or a part of it. Asked by Proceed, told to the Proxy.
 
-    `more` goes home behind the ends, `live` behind all. `part` counts what Proceed hands over; with `wait` it waits
-    for `Ended` of it.
+    `more` goes home behind the ends, and behind all turns up to `behind`; `live` goes behind all. `part` counts what
+    Proceed hands over; with `wait` it waits for `Ended` of it.
     """
 
     epoch: int
@@ -162,6 +164,7 @@ class Done(Message[Taken]):
     more: list[Beside] = []  # noqa: RUF012  # a struct copies it
     part: int = 0
     wait: bool = False
+    behind: int = -1
 
 
 class Inward(Message):
@@ -225,13 +228,15 @@ class Lead(Message[int]):
     """Be primary (leader) from now on; the reply is the turn of the state it goes on from.
 
     `turn`: the last one that home knows of. Those that are lost (which only a mechanism that does not wait for its
-    backup admits) are not numbered anew. `peer`: a replica that stays a member under this leader.
+    backup admits) are not numbered anew. `peer`: a replica that stays a member under this leader. `known`: the turn
+    up to which home has the background work that was begun, and has given it up.
     """
 
     epoch: int
     config: int
     turn: int = -1
     peer: str | None = None
+    known: int = -1
 
 
 class Follow(Message[int]):

@@ -280,7 +280,9 @@ class Proceed(Brick):
                     more = server.take_more()
                     if not more:
                         break  # A snapshot that has to wait.
-                    await self._pass(Done(self.epoch, self._standing.config, self._number, [], False, None, more))
+                    behind, config = server.last_ended, self._standing.config
+                    done = Done(self.epoch, config, self._number, [], False, None, more, behind=behind)
+                    await self._pass(done)
                 else:
                     break
         finally:
@@ -317,12 +319,13 @@ class Proceed(Brick):
     async def _hand(self, ends: list[TurnEnd], *, is_last: bool, live: Live | None, wait: bool) -> None:
         server, standing = self._standing.server, self._standing
         server.handed = part = server.handed + 1
-        more = server.take_more()
+        more, behind = server.take_more(), server.last_ended
         while len(more) > 1 and any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more):
             first, more = more[:1], more[1:]
-            await self._pass(Done(standing.epoch, standing.config, self._number, ends, False, None, first))
+            head = Done(standing.epoch, standing.config, self._number, ends, False, None, first, behind=behind)
+            await self._pass(head)
             ends = []
-        done = Done(standing.epoch, standing.config, self._number, ends, is_last, live, more, part, wait)
+        done = Done(standing.epoch, standing.config, self._number, ends, is_last, live, more, part, wait, behind)
         if wait:
             self._at_home = standing.node.loop.create_future()
         await self._pass(done)

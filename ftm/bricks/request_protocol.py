@@ -1,7 +1,7 @@
 """RequestProtocol: the entry of a replica. One batch at a time inside, duplicates from the reply log, epochs checked.
 
 Everything the root says to a replica comes here. Between two batches, with nothing inside, another replica is brought
-to our state, or the state is given out.
+to our state, or the state is given out (`transfer`).
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, message_name
 from ...checkpoint.protocol import DROPPED, Answer, TurnEnd
-from ...checkpoint.snapshot.key_variables import save_state
 from ..alarms import RequestsDropped
+from ..group.behind import is_still_due
 from ..replica.replica_orders import (
     Abort,
     Commit,
@@ -29,7 +29,6 @@ from ..replica.replica_orders import (
     Doing,
     EndTurn,
     Export,
-    Exported,
     Finish,
     Install,
     Join,
@@ -41,6 +40,7 @@ from ..replica.replica_orders import (
 )
 from ..replica.state_images import image_from
 from .brick_messages import (
+    MOST_REQUESTS,
     CannotLead,
     ConfigMismatch,
     Done,
@@ -54,6 +54,7 @@ from .brick_messages import (
     State,
     Taken,
     Work,
+    WorkLost,
     marker_of,
 )
 from .bricks import FOREVER, Brick, Flush, Proceed, Settle
@@ -102,7 +103,8 @@ class RequestProtocol(Transfer):
         self._marker: int | None = None  # what the last leader gave us to compute is over when this comes back
         self._least = -1  # the turn after which we go on, if those up to it have left nothing here
         self._wanted: int | None = None  # part of Proceed that waits, meanwhile, for home to have all before it
-        self._later: list[Any] = []  # what goes home behind that
+        self._later: list[Any] = []  # what goes home behind that, and of a follower what it would have to say
+        self._behind_turn = -1  # the last turn before that
         self._turn = -1  # the last one before the batch that is inside
         self._came_out = 0  # turns of it that have come out of the bricks
         self._copies = False  # home gets the state behind it
@@ -140,7 +142,8 @@ class RequestProtocol(Transfer):
             more, self._later = self._later, []
             if work.copy and not goes_in:
                 more += self._standing.server.copied()
-            self.next.tell(Done(work.epoch, work.config, work.number, known, not goes_in, None, more))
+            done = Done(work.epoch, work.config, work.number, known, not goes_in, None, more)
+            self.next.tell(msgspec.structs.replace(done, behind=self._behind_turn))
         if goes_in:
             self._standing.inside.update((one.feed.id, one) for one in left)
             self._current, self._copies = work.number, work.copy
@@ -181,6 +184,8 @@ class RequestProtocol(Transfer):
                 done = msgspec.structs.replace(done, epoch=standing.epoch)
             self._came_out += len({end.turn for end in done.ends if end.turn > self._turn})
             self._leave(done)
+        else:
+            self._keep(done)
         if done.is_last and done.number == self._current:
             self._current = None
             if standing.leads and done.number >= 0 and not standing.server.is_over:
@@ -217,12 +222,19 @@ class RequestProtocol(Transfer):
     def _drained(self, done: Done) -> None:
         """An outcome of what the last leader gave us: home gets it, in its order, when it asks for it again."""
         self._later += done.more
+        self._behind_turn = max(self._behind_turn, done.behind)
         if done.number == self._marker:
             self._marker = self._wanted = None
             if self._standing.server.turn < self._least:
                 self._standing.server.skip_to(self._least)
         elif done.wait:
             self._flush_known(done.part)
+
+    def _keep(self, done: Done) -> None:
+        """While another one leads: if that dies, nobody else can say it of turns that home does not have then."""
+        more, turn = [*self._later, *done.more], self._standing.server.turn
+        self._later = [one for one in more if is_still_due(one, turn - MOST_REQUESTS)]
+        self._behind_turn = max(self._behind_turn, done.behind)
 
     def _flush_known(self, part: int) -> None:
         """A turn waits until home has all that came before it: that is what home asks for again and we know."""
@@ -320,6 +332,10 @@ class RequestProtocol(Transfer):
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
         self._current = self._marker = marker = marker_of(epoch)
         self._least = order.turn
+        if not standing.leads:
+            self._later = [one for one in self._later if is_still_due(one, order.known)]
+            if server.life is None and server.turn >= 0:  # What has led to our state has begun its work elsewhere.
+                self._later, self._behind_turn = [WorkLost(server.turn)], server.turn
         await self._order(Assume(True))
         standing.leading = epoch
         self.before.tell(Work(epoch, standing.config, marker, []))
@@ -337,6 +353,7 @@ class RequestProtocol(Transfer):
         standing.is_fenced, standing.leading, standing.follows = False, -1, True
         self._held.clear()
         self._current = self._marker = self._wanted = None
+        self._later, self._behind_turn = [], -1
         standing.inside.clear()
         standing.unready()
         await self._order(Assume(False))
@@ -383,30 +400,6 @@ class RequestProtocol(Transfer):
         self._standing.server.end_turn(message.number, again=message.again)
 
     # -- the state --------------------------------------------------------------------------------------------------
-
-    @on(Export)
-    def _export(self, message: Export) -> Any:
-        self._check(message.epoch)
-        return self._answer(self._give_out())
-
-    async def _give_out(self) -> Exported:
-        epoch = self._standing.epoch
-        self._holds += 1
-        try:
-            await self._quiet()
-            self._standing.check(epoch)
-            server = self._standing.server
-            await server.ensure()
-            await server.until_work_is_back()
-            await self.proceed.ask(Flush(), timeout=FOREVER)  # What has come of it goes home first.
-            life = server.life
-            assert life is not None
-            assert life.cell.actor is not None
-            stash = [fed.feed.id for fed in life.stash]
-            return Exported(life.turn, save_state(life.cell.actor), stash, life.cell.extra().trap_exits)
-        finally:
-            self._holds -= 1
-            self._go_on()
 
     @on(Quiesce)
     def _quiesce(self, message: Quiesce) -> Any:

@@ -332,9 +332,7 @@ class Deciding(After):
         if found is first:
             return done
         ends = await self._take(before, requests, found, first)
-        return Done(
-            done.epoch, done.config, done.number, ends, done.is_last, done.live, done.more, done.part, done.wait
-        )
+        return msgspec.structs.replace(done, ends=ends)
 
     def _last_run(self, before: State, ends: list[TurnEnd]) -> Run:
         server = self._standing.server

@@ -1,6 +1,7 @@
 """State transfer: another replica is brought to the state of the one that leads, between two batches (T8c).
 
-The two RequestProtocols do it: the leader's captures and sends, the follower's takes, and may ask for it again.
+The two RequestProtocols do it: the leader's captures and sends, the follower's takes, and may ask for it again. The
+leader's gives it out, too, when the actor is to live without a mechanism.
 """
 
 from __future__ import annotations
@@ -10,15 +11,16 @@ import contextlib
 from collections.abc import Coroutine
 from typing import TYPE_CHECKING, Any
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import ActorStopped, AskTimeout, HoldfastError
 from ...actors.kernel.actor import on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message
-from ..replica.replica_orders import Join, Peer
+from ...checkpoint.snapshot.key_variables import save_state
+from ..replica.replica_orders import Export, Exported, Join, Peer
 from ..replica.standing import PeerLost
 from .brick_messages import CannotJoin, ConfigMismatch, Done, Logged, StaleEpoch, State, Strayed
-from .bricks import FOREVER, Abandon, Brick
+from .bricks import FOREVER, Abandon, Brick, Flush
 from .sealed_gate import Gate
 
 if TYPE_CHECKING:
@@ -192,3 +194,55 @@ class Transfer(Gate):
             await server.ensure()
         standing.ready()
         return server.turn
+
+    # -- out of the group ---------------------------------------------------------------------------------------------
+
+    @on(Export)
+    def _export(self, message: Export) -> Any:
+        self._check(message.epoch)
+        handle = self.ctx.reply_handle()
+        self.ctx.create_task(self._exported(handle, message))
+        return handle
+
+    async def _exported(self, handle: ReplyHandle[Any], message: Export) -> None:
+        """Give out the state when no background work is out, which may take as long as it likes.
+
+        Neither requests nor other orders wait for that: whoever has asked may have given it up since.
+        """
+        server = self._standing.server
+        try:
+            async with asyncio.timeout(message.seconds):
+                while True:
+                    await server.until_work_is_back()
+                    async with self._lock:
+                        exported = await self._give_out(message.epoch)
+                    if exported is not None:
+                        handle.reply(exported)
+                        return
+        except TimeoutError:
+            handle.fail(AskTimeout(self._standing.path, message.seconds, True))
+        except HoldfastError as error:
+            handle.fail(error)
+        except BaseException:
+            handle.fail(ActorStopped(self._standing.path))  # We end: nobody must wait for us.
+            raise
+
+    async def _give_out(self, epoch: int) -> Exported | None:
+        """The state between two batches; None if background work is out again."""
+        self._holds += 1
+        try:
+            await self._quiet()
+            self._standing.check(epoch)
+            server = self._standing.server
+            await server.ensure()
+            life = server.life
+            if life is None or life.cell.actor is None:
+                raise ActorStopped(server.address)
+            if life.pipes:
+                return None
+            await self.proceed.ask(Flush(), timeout=FOREVER)  # What has come of it goes home first.
+            stash = [fed.feed.id for fed in life.stash]
+            return Exported(life.turn, save_state(life.cell.actor), stash, life.cell.extra().trap_exits)
+        finally:
+            self._holds -= 1
+            self._go_on()

@@ -123,6 +123,7 @@ class FailoverManager(Actor):
             self._step("epoch")
             group.epoch += 1
             group.forget_answers()
+            group.behind.drop()
             group.leading = left[0]
             return True
         for name, life in list(group.condemned.items()):
@@ -134,7 +135,8 @@ class FailoverManager(Actor):
             return True
         self._step("lead")
         try:
-            order = Lead(group.epoch, group.config, group.least_turn(), group.peer_of(leading))
+            known = group.switch.turn
+            order = Lead(group.epoch, group.config, group.least_turn(), group.peer_of(leading), known)
             await group.protocol(leading).ask(order, ANSWERED_WITHIN)
         except AskTimeout:
             return True

@@ -34,7 +34,8 @@ from ...checkpoint.protocol import (
 )  # fmt: skip
 from ...checkpoint.snapshot.snapshot_record import Meta, meta_now, put
 from ..bricks.background_work import Background
-from ..bricks.brick_messages import Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
+from ..bricks.brick_messages import MOST_REQUESTS, Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
+from .behind import Behind
 from .detector import Detection
 from .diverged import Strays
 from .hold import Hold
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
     from ...checkpoint.home.switch import Switch
     from .reconfiguration import Reconfiguration
 
-MOST_REQUESTS, MOST_BYTES = 512, 1_000_000
+MOST_BYTES = 1_000_000
 """Of one batch."""
 KEPT_TURNS = 256
 """Ended turns after which those of an actor that keeps none are forgotten."""
@@ -97,6 +98,7 @@ class Group(Members):
         self.is_poked = False
         self.stale = self.doubled = 0  # messages of earlier epochs, outcomes that were known
         self.background = Background(self)
+        self.behind = Behind()
         self._quiet: list[asyncio.Future[None]] = []
         # Whom to tell.
         self.on_live: Callable[[Live], None] = switch.from_life
@@ -274,21 +276,9 @@ class Group(Members):
             self._end(end)
         if self.is_over:
             return
-        for record in done.more:
-            if isinstance(record, Closed):
-                self.on_ended(record.reason)
-            elif isinstance(record, Strayed):
-                self.strays.told(record.path)
-            elif isinstance(record, Snapshot) and not self.switch.method.snapshots:
-                self.take_copy([record])
-            elif isinstance(record, WorkLost):
-                if self.background.is_lost(record.turn):
-                    self._give_up("a turn has failed with background work (pipe_to_self) out")
-                    return
-            else:
-                if isinstance(record, PipeDone):
-                    self.background.back(record)
-                self.switch.from_life(record)
+        self.behind.put(done.behind, done.more)
+        if not self._take_beside(self.switch.turn if self.is_live else None):
+            return
         if done.live is not None and not self.is_live:
             self.is_live = True
             self.on_live(done.live)
@@ -304,8 +294,28 @@ class Group(Members):
             self.careful -= ended
             self._ended(ended)
             self._forget_turns()
+        # With nothing in hand any more, turns that have not come until now do not come at all.
+        if self.out is None and not self.inside and not self._take_beside(None):
+            return
         if done.wait:
             self.finished.append(Ended(self.epoch, done.part))
+
+    def _take_beside(self, turn: int | None) -> bool:
+        """What stands behind turns up to this one (None: any). False: the life is over by that."""
+        for record in self.behind.due(turn):
+            if isinstance(record, Closed):
+                self.on_ended(record.reason)
+            elif isinstance(record, Strayed):
+                self.strays.told(record.path)
+            elif isinstance(record, Snapshot) and not self.switch.method.snapshots:
+                self.take_copy([record])
+            elif isinstance(record, WorkLost):
+                if self.background.is_lost(record.turn):
+                    self._give_up("a turn has failed with background work (pipe_to_self) out")
+                    return False
+            elif not isinstance(record, PipeDone) or self.background.back(record):
+                self.switch.from_life(record)
+        return True
 
     def take_copy(self, records: list[Snapshot]) -> None:
         """The state of an actor that is not recorded, with what has led to it."""

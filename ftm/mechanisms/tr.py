@@ -15,6 +15,8 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, ClassVar
 
+import msgspec
+
 from ...checkpoint.protocol import FAILED, Answer, TurnEnd
 from ..alarms import Masked
 from ..bricks.brick_messages import Done
@@ -85,7 +87,7 @@ def is_ask(standing: Any, number: int) -> bool:
 
 def with_ends(done: Done, ends: list[TurnEnd]) -> Done:
     """The same message with other ends."""
-    return Done(done.epoch, done.config, done.number, ends, done.is_last, done.live, done.more, done.part, done.wait)
+    return msgspec.structs.replace(done, ends=ends)
 
 
 def differing(*runs: Ran) -> list[int]:

@@ -30,14 +30,12 @@ from ...checkpoint.snapshot.key_variables import restore_state
 from ..group.group_host import GroupHost
 from ..group.steering import AGAIN_AFTER
 from ..group.transient_homes import is_unkept
-from ..replica.replica_orders import Export
+from ..replica.replica_orders import EXPORTED_WITHIN, Export
 from .subtree_groups import SubtreeGroup
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
 
-EXPORTED_WITHIN = 5.0
-"""Seconds until whoever leads is asked again for the state: it may have died with the question."""
 FAILED_OVER_WITHIN = 1.0
 
 
@@ -168,19 +166,16 @@ class ToPlainTask(FromGroup):
         self._traps = False  # `ctx.trap_exits`
 
     async def take(self) -> None:
-        switch = self._switch
         await super().take()
-        if switch.later:
-            raise CannotMove(
-                self.cell.path, f"{len(switch.later)} asks wait for replies that only its handles can give"
-            )
         self.rested()
 
     async def collect(self, epoch: int, end: float) -> None:
-        group = self._group
+        group, promised = self._group, self._switch.later
+        if promised:  # Nothing is handled any more: they will not become fewer.
+            raise CannotMove(self.cell.path, f"{len(promised)} asks wait for replies that only its handles can give")
         primary = group.primary
         if primary is not None:
-            ask = group.protocol(primary).ask(Export(epoch), EXPORTED_WITHIN)
+            ask = group.protocol(primary).ask(Export(epoch, EXPORTED_WITHIN), EXPORTED_WITHIN)
             exported = await self.within(ask, end - now(), lambda: "its state did not come")
             self._data, self._stash, self._traps = exported.data, list(exported.stash), exported.traps
 

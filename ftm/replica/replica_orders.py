@@ -179,7 +179,15 @@ class Exported(msgspec.Struct, array_like=True):
     traps: bool  # `ctx.trap_exits`
 
 
+EXPORTED_WITHIN = 5.0
+"""Seconds until whoever leads is asked again for the state: it may have died with the question."""
+
+
 class Export(Message[Exported]):
-    """Give out the state between two batches: the actor is to live without a mechanism."""
+    """Give out the state between two batches, when no background work is out: the actor is to live without a mechanism.
+
+    After `seconds` nobody waits for it any more.
+    """
 
     epoch: int
+    seconds: float = EXPORTED_WITHIN

@@ -141,6 +141,12 @@ class Points(lifecycle.LocalHost):
             return self.life.turn
         return -1 if self.point is None else self.point.turn
 
+    @property
+    def last_ended(self) -> int:
+        """The last turn that is over."""
+        life = self.life
+        return self.turn if life is None or life.feed is None else life.turn - 1
+
     async def ensure(self) -> None:
         """See to it that there is a life, and that it has begun.
 

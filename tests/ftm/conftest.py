@@ -34,8 +34,8 @@ async def secured(system: hf.ActorSystem) -> hf.ActorSystem:
 
 # These start real processes; what they are about does not depend on the root's loop, and once takes long enough.
 ON_ONE_LOOP = {
-    "test_ad", "test_attach", "test_author_bricks", "test_campaign", "test_composed",
-    "test_drawn_values", "test_failover",
+    "test_ad", "test_attach", "test_author_bricks", "test_background_order", "test_campaign", "test_composed",
+    "test_detach_undone", "test_drawn_values", "test_failover",
     "test_failover_turns", "test_images", "test_unhandled_asks",
     "test_in_processes", "test_lfr", "test_lfr_differences", "test_nvp", "test_pbr", "test_pbr_joining", "test_post",
     "test_rb", "test_sec",

@@ -146,6 +146,36 @@ CHECKS = {
         JOINING,
         "test_a_backup_counts_only_when",
     ),
+    "what background work brings comes home behind the turns before it": Check(
+        "ftm/group/behind.py",
+        "        while self._waiting and (turn is None or self._waiting[0][0] <= turn):\n",
+        "        while self._waiting:\n",
+        "tests/ftm/test_background_order.py",
+        "test_it_comes_home_behind",
+    ),
+    "a follower keeps what the leader may not have said": Check(
+        "ftm/bricks/request_protocol.py",
+        "        else:\n            self._keep(done)\n",
+        "",
+        "tests/ftm/test_background_order.py",
+        "test_it_comes_home_behind",
+    ),
+    "who only has the state has not begun its background work": Check(
+        "ftm/bricks/request_protocol.py",
+        "            if server.life is None and server.turn >= 0:  # What has led",
+        "            if False:  # What has led",
+        "tests/ftm/test_background_order.py",
+        "test_work_of_a_turn_that_only",
+    ),
+    "who waits for background work keeps no requests waiting": Check(
+        "ftm/bricks/state_transfer.py",
+        "                    await server.until_work_is_back()\n",
+        "                    self._holds += 1\n"
+        "                    await server.until_work_is_back()\n"
+        "                    self._holds -= 1\n",
+        "tests/ftm/test_detach_undone.py",
+        "test_the_stack_is_in_force and plain-work",
+    ),
     "a life at an address that is known is brought to the state": Check(
         "ftm/bricks/state_transfer.py",
         "        if standing.peer == path:  # It follows anew",

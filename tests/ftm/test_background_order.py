@@ -1,0 +1,224 @@
+"""What background work brings reaches home behind the turns that it stood behind, whoever has died in between."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.checkpoint.home.switch import Switch
+from holdfast.checkpoint.protocol import PipeDone
+from holdfast.ftm.bricks.brick_messages import Done
+from holdfast.ftm.group.group import Group
+from holdfast.ftm.group.group_host import GroupHost
+from holdfast.ftm.mechanisms.lfr import LFR
+from holdfast.ftm.mechanisms.pbr import PBR
+from tests.ftm.accounts import Add, Counter, Tags
+from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
+
+BROUGHT = 1_000
+
+
+class Begin(hf.Message[int]):
+    """Have something done in the background, as long as there is a file `work`; `done` is there when it is over."""
+
+    folder: str
+
+
+class Halt(hf.Message[int]):
+    """A turn that never ends in one process, and lasts as long as there is a file `gate` in all others."""
+
+    folder: str
+    pid: int
+
+
+class Mark(hf.Message[int]):
+    """Make a file `computed`, in all processes but one."""
+
+    folder: str
+    pid: int
+
+
+class Worker(Counter):
+    @hf.on(Begin)
+    def begin(self, message: Begin) -> int:
+        self.ctx.pipe_to_self(work(Path(message.folder)), lambda _: Add(BROUGHT))
+        return self.total
+
+    @hf.on(Halt)
+    async def halt(self, message: Halt) -> int:
+        if os.getpid() == message.pid:
+            await asyncio.Event().wait()
+        await until_gone(Path(message.folder, "gate"))
+        return self.total
+
+    @hf.on(Mark)
+    def mark(self, message: Mark) -> int:
+        if os.getpid() != message.pid:
+            Path(message.folder, "computed").touch()
+        return self.total
+
+
+async def work(folder: Path) -> None:
+    await until_gone(folder / "work")
+    (folder / "done").touch()
+
+
+async def until_gone(path: Path) -> None:
+    while path.exists():
+        await asyncio.sleep(0.002)
+
+
+async def until_there(path: Path) -> None:
+    async with asyncio.timeout(30):
+        while not path.exists():
+            await asyncio.sleep(0.002)
+
+
+def watched(switch: Switch) -> list[str]:
+    """What comes home ahead of the turn that has begun it."""
+    early: list[str] = []
+    take: Any = switch.from_life
+
+    def seen(record: Any) -> None:
+        if isinstance(record, PipeDone) and record.turn > switch.turn:
+            early.append(f"the outcome of work of turn {record.turn}, after turn {switch.turn}")
+        take(record)
+
+    switch.from_life = seen  # type: ignore[method-assign]
+    return early
+
+
+def deafen(group: Group) -> None:
+    """What whoever leads says from now on is lost when it dies: home has not heard of any of it."""
+    epoch, take = group.epoch, group.take_done
+
+    def heard(done: Done) -> None:
+        if done.epoch > epoch:
+            take(done)
+
+    group.take_done = heard  # type: ignore[method-assign]
+
+
+STEPS = ["before", "depose", "epoch", "kill", "lead", "bind", "drained"]
+
+
+@pytest.mark.parametrize("recovery", [hf.hybrid(interval=3600.0), None], ids=["recorded", "plain"])
+@pytest.mark.parametrize("step", STEPS)
+async def test_it_comes_home_behind_the_turns_before_it(
+    system: hf.ActorSystem, tmp_path: Path, step: str, recovery: Any
+) -> None:
+    """The leader dies with requests in hand that its follower has handled; the work ends at some step of the failover.
+
+    All of the requests are answered once, and what the work has brought comes once, too.
+    """
+    draw = random.Random(f"{SEED} {step}")
+    before, between, behind = (draw.randrange(1, 20) for _ in range(3))
+    print(f"seed {SEED}: {before} {between} {behind}")
+    for name in ("work", "gate"):
+        (tmp_path / name).touch()
+    ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=LFR(), recovery=recovery))
+    await two_again(ref)
+    group, host = group_of(ref), ref._cell.host
+    assert isinstance(host, GroupHost)
+    assert group.primary is not None
+    pid = pid_of(system, ref, group.primary)
+    early = watched(group.switch)
+    deafen(group)
+    folder = str(tmp_path)
+    first = [Add(tag) for tag in range(before)]
+    second = [Add(tag) for tag in range(before, before + between)]
+    third = [Add(tag) for tag in range(before + between, before + between + behind)]
+    messages: list[hf.Message[int]] = [*first, Begin(folder), *second, Mark(folder, pid), Halt(folder, pid), *third]
+    asked = [asyncio.ensure_future(ref.ask(one, timeout=60.0)) for one in messages]
+    await until_there(tmp_path / "computed")
+    if step != "drained":
+        (tmp_path / "gate").unlink()
+    ending: list[asyncio.Task[None]] = []
+
+    async def end() -> None:
+        (tmp_path / "work").unlink()
+        await until_there(tmp_path / "done")
+        (tmp_path / "gate").unlink(missing_ok=True)
+
+    def struck(name: str) -> None:
+        if name == ("bind" if step == "drained" else step) and not ending:
+            ending.append(asyncio.create_task(end()))
+
+    host.on_step = struck
+    if step == "before":
+        await end()
+    os.kill(pid, signal.SIGKILL)
+    await asyncio.gather(*asked)
+    await asyncio.gather(*ending)
+    async with asyncio.timeout(20):
+        while BROUGHT not in (tags := await ref.ask(Tags())):
+            await asyncio.sleep(0.005)
+    assert early == []
+    assert sorted(tags) == [*range(before + between + behind), BROUGHT]
+    assert [tag for tag in tags if tag != BROUGHT] == list(range(before + between + behind))
+
+
+@pytest.mark.parametrize("recovery", [hf.hybrid(interval=3600.0), None], ids=["recorded", "plain"])
+async def test_work_of_a_turn_that_only_the_backup_has_is_begun_again_or_said_to_be_lost(
+    system: hf.ActorSystem, tmp_path: Path, recovery: Any
+) -> None:
+    """The primary dies when its backup has the turn that has begun the work, and home has not heard of it."""
+    (tmp_path / "work").touch()
+    ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=PBR(), recovery=recovery))
+    await two_again(ref)
+    events, group = system.events(), group_of(ref)
+    assert group.primary is not None
+    pid, take = pid_of(system, ref, group.primary), group.take_done
+
+    def dies(done: Done) -> None:
+        if done.epoch > 1 or not done.ends:
+            take(done)
+        else:
+            os.kill(pid, signal.SIGKILL)
+
+    assert group.epoch == 1
+    group.take_done = dies  # type: ignore[method-assign]
+    asked = [ref.ask(one, timeout=60.0) for one in (Add(0), Begin(str(tmp_path)), Add(1))]
+    assert await asyncio.gather(*asked) == [1, 1, 2]
+    (tmp_path / "work").unlink()
+    if recovery is not None:
+        async with asyncio.timeout(20):
+            while BROUGHT not in await ref.ask(Tags(), timeout=20.0):
+                await asyncio.sleep(0.005)
+    tags, lost = await ref.ask(Tags()), [one for one in events.take() if isinstance(one, hf.BackgroundWorkLost)]
+    events.close()
+    assert tags == ([0, 1, BROUGHT] if recovery is not None else [0, 1])
+    assert [one.count for one in lost] == ([] if recovery is not None else [1])
+
+
+async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tmp_path: Path) -> None:
+    """A follower that computes has begun the work as well, but nobody counts on that any more."""
+    (tmp_path / "work").touch()
+    ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=LFR()))
+    await two_again(ref)
+    events, group, said = system.events(), group_of(ref), asyncio.Event()
+    take = group.take_done
+
+    def taken(done: Done) -> None:
+        take(done)
+        if any(isinstance(one, PipeDone) for one in done.more):
+            said.set()
+
+    group.take_done = taken  # type: ignore[method-assign]
+    assert [await ref.ask(one) for one in (Begin(str(tmp_path)), Add(0))] == [0, 1]
+    assert group.primary is not None
+    os.kill(pid_of(system, ref, group.primary), signal.SIGKILL)
+    assert await ref.ask(Add(1), timeout=60.0) == 2
+    assert [one.count for one in events.take() if isinstance(one, hf.BackgroundWorkLost)] == [1]
+    events.close()
+    (tmp_path / "work").unlink()
+    async with asyncio.timeout(30):
+        await said.wait()
+    assert await ref.ask(Tags()) == [0, 1]
