@@ -95,16 +95,31 @@ def _target(link: Path) -> str:
 def children() -> list[psutil.Process]:
     """Our living descendants.
 
-    The kernel's own list of children is looked at first: psutil reads every process of the machine, which is too slow
-    to be done twice for each test.
+    By the kernel's own lists of children, where it keeps them: psutil reads every process of the machine, which is too
+    slow to be done twice for each test.
     """
-    try:
-        own = [path.read_text() for path in Path("/proc/self/task").glob("*/children")]
-    except OSError:  # a thread ended meanwhile
-        own = []
-    if own and not any(own):
-        return []
-    return [child for child in psutil.Process().children(recursive=True) if is_of_test(child)]
+    if not any(Path("/proc/self/task").glob("*/children")):
+        return [child for child in psutil.Process().children(recursive=True) if is_of_test(child)]
+    found = _children_of("self")
+    for pid in found:  # It grows meanwhile.
+        found += _children_of(str(pid))
+    living: list[psutil.Process] = []
+    for pid in found:
+        try:
+            living.append(psutil.Process(pid))
+        except psutil.Error:
+            pass
+    return [child for child in living if is_of_test(child)]
+
+
+def _children_of(pid: str) -> list[int]:
+    found: list[int] = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        try:
+            found += map(int, path.read_text().split())
+        except OSError:  # a thread, or all of it, ended meanwhile
+            pass
+    return found
 
 
 def is_of_test(child: psutil.Process) -> bool:

@@ -7,6 +7,9 @@ under both with `loop_factories=["uvloop", "asyncio"]`, and one that is about ti
 `loop_factories=["virtual"]` (`holdfast.testing.clock`). The loops are named in pyproject.toml (`holdfast_loops`) and
 made by our own plugin.
 
+Of a test that is marked with `pairs` some rows run, in which each pair of values of two parameters occurs; the loop
+is one of these parameters where a test runs under both. `HOLDFAST_CROSSED=1` runs all.
+
 What Hypothesis draws depends on the test alone, so a run today finds what it found yesterday, on every machine;
 `HOLDFAST_RANDOM=1` draws anew, and `HOLDFAST_RANDOM=N` repeats the run that printed this number.
 """
@@ -28,8 +31,11 @@ import pytest
 import pytest_asyncio
 
 from holdfast.actors.kernel.loop import RunLoop
+from holdfast.actors.process.fork import fork_server, launch
 from holdfast.testing.leaks import Leaks, end_processes, is_of_test
+from tests.pairs import covering
 from tests.waits import Waits
+from tests.warm import WarmServers
 
 # Installed, the plugin comes by its entry point; in a checkout whose metadata is older it is named here. Not both:
 # pytest refuses to register it under two names.
@@ -58,6 +64,7 @@ MARK = "HOLDFAST_TEST_RUN"
 @pytest.hookimpl(tryfirst=True)  # Before Hypothesis looks at its option.
 def pytest_configure(config: pytest.Config) -> None:
     """Choose the seed of a random run; the other processes of the run inherit it."""
+    config.addinivalue_line("markers", "pairs: each pair of values of two parameters is enough (tests/pairs.py)")
     if RANDOM == "1":
         os.environ["HOLDFAST_RANDOM"] = str(random.SystemRandom().randrange(2, 2**32))
     if RANDOM and config.getoption("hypothesis_seed") is None:
@@ -81,9 +88,41 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 @pytest.hookimpl(trylast=True)  # Behind -k and -m: what these have left of a test is run.
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave each test the loops that it shall run under."""
-    if os.environ.get("HOLDFAST_LOOPS") == "both":
-        return
+    """Leave each test the parameters and the loops that it shall run under."""
+    dropped: set[pytest.Item] = set()
+    if "HOLDFAST_CROSSED" not in os.environ:
+        dropped |= _beyond_pairs(items)
+    if os.environ.get("HOLDFAST_LOOPS") != "both":
+        dropped |= _of_other_loops([item for item in items if item not in dropped])
+    if dropped:
+        config.hook.pytest_deselected(items=list(dropped))
+        items[:] = [item for item in items if item not in dropped]
+
+
+def _beyond_pairs(items: list[pytest.Item]) -> set[pytest.Item]:
+    """Rows of tests marked with `pairs` all of whose pairs other rows have (`tests/pairs.py`)."""
+    places = Places()
+    rows: dict[str, dict[tuple[int, ...], list[pytest.Item]]] = {}
+    for item in items:
+        callspec = getattr(item, "callspec", None)
+        if callspec is not None and item.get_closest_marker("pairs"):
+            params = dict(callspec.params)
+            test = item.nodeid.partition("[")[0]
+            if not _chooses_loops(item):
+                params.pop(LOOP, None)  # One of them is chosen for each row.
+            row = tuple(
+                places.of(test, name, value) for name, value in sorted(params.items(), key=lambda pair: pair[0])
+            )
+            rows.setdefault(test, {}).setdefault(row, []).append(item)
+    dropped: set[pytest.Item] = set()
+    for of_test in rows.values():
+        kept = set(covering(list(of_test)))
+        dropped.update(item for number, some in enumerate(of_test.values()) if number not in kept for item in some)
+    return dropped
+
+
+def _of_other_loops(items: list[pytest.Item]) -> set[pytest.Item]:
+    """Tests under a loop other than the one that is chosen for them."""
     places = Places()
     runs: dict[tuple[str, tuple[int, ...]], dict[int, list[pytest.Item]]] = {}
     for item in items:
@@ -98,9 +137,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         # In turn along each parameter. The name, or all tests without parameters would run under the same loop.
         chosen = (zlib.crc32(test.encode()) + sum(others)) % len(under)
         dropped.update(item for number, some in enumerate(under.values()) if number != chosen for item in some)
-    if dropped:
-        config.hook.pytest_deselected(items=list(dropped))
-        items[:] = [item for item in items if item not in dropped]
+    return dropped
 
 
 class Places:
@@ -129,8 +166,19 @@ def no_orphan_left() -> Iterator[None]:
     assert not left, f"processes outlived the tests: {left}"
 
 
+@pytest.fixture(scope="session", autouse=True)
+def warm_servers(no_orphan_left: None) -> Iterator[WarmServers | None]:
+    """Where fork servers come from, without the start of an interpreter for each (`tests/warm.py`)."""
+    if "HOLDFAST_COLD" in os.environ or not sys.platform.startswith("linux"):
+        yield None
+        return
+    warm = WarmServers()
+    yield warm
+    warm.close()
+
+
 @pytest.fixture(autouse=True)
-def nothing_left(no_orphan_left: None) -> Iterator[None]:
+def nothing_left(warm_servers: WarmServers | None) -> Iterator[None]:
     """Fail a test that leaves a child process or open files behind.
 
     This fixture is set up before the event loop of the test and torn down after it has been closed.
@@ -141,6 +189,18 @@ def nothing_left(no_orphan_left: None) -> Iterator[None]:
     assert not left, f"the test left child processes: {left}"
     grown = leaks.files()
     assert not grown, f"the test left files open: {grown}"
+
+
+@pytest.fixture(autouse=True)
+def warm_fork_servers(nothing_left: None, warm_servers: WarmServers | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    if warm_servers is not None:
+        monkeypatch.setattr(fork_server, "exec_server", warm_servers.exec_server)
+
+
+@pytest.fixture
+def cold_fork_servers(warm_fork_servers: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start fork servers as users' are: by exec. For tests that are about that."""
+    monkeypatch.setattr(fork_server, "exec_server", launch.exec_server)
 
 
 @pytest.fixture(autouse=True)
@@ -159,14 +219,20 @@ def no_task_left_if_async(nothing_left: None, request: pytest.FixtureRequest) ->
 
 
 @pytest.fixture
-async def no_task_left() -> AsyncIterator[None]:
+async def no_task_left(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[None]:
     """Fail an async test that leaves a task running; its own fixtures have been torn down by then.
 
-    The stock loop (and the virtual clock, which is one) is in debug mode, which sees calls from other threads and keeps
-    the origin of each callback. That takes more time than the tests themselves, so uvloop runs as it does for users.
+    The stock loop (and the virtual clock, which is one) is in debug mode, which sees calls from other threads. That it
+    also keeps the origin of each callback takes a third of the time of such tests: that it does with
+    `HOLDFAST_LOOPS=both` only. uvloop runs as it does for users.
     """
     loop = asyncio.get_running_loop()
-    loop.set_debug(isinstance(loop, asyncio.BaseEventLoop))
+    if os.environ.get("HOLDFAST_LOOPS") == "both":
+        loop.set_debug(isinstance(loop, asyncio.BaseEventLoop))
+    elif isinstance(loop, asyncio.BaseEventLoop):
+        # What looks at calls goes by the attribute, what keeps origins (futures, tasks, handles) asks the method.
+        monkeypatch.setattr(loop, "_debug", True)
+        monkeypatch.setattr(loop, "get_debug", lambda: False)
     leaks = Leaks()
     yield
     left = await leaks.tasks()

@@ -88,6 +88,7 @@ async def test_a_message_without_handler_is_refused_at_the_call_every_time(syste
     assert system.dead_letters == 0
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("send", ["tell", "ask", "send"])
 async def test_what_is_no_message_is_refused_with_advice(send: str, isolation: Any) -> None:
@@ -127,6 +128,7 @@ class Babbler(hf.Actor):
         return refused
 
 
+@pytest.mark.pairs
 @pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
 @pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("to", ["task", "process"])

@@ -7,6 +7,8 @@ import pytest
 
 import holdfast as hf
 
+pytestmark = pytest.mark.pairs
+
 LONG = 30.0  # Nothing waits for this: what is owed for ever fails then, before the test run is ended.
 
 

@@ -10,6 +10,8 @@ import pytest
 import holdfast as hf
 from tests.checkpoint.players import start
 
+pytestmark = pytest.mark.pairs
+
 
 class Begin(hf.Message):
     how: str

@@ -18,6 +18,8 @@ from tests.checkpoint.guards import over, running
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Tick, start, until
 from tests.checkpoint.strikes import doer, event, let_through, sink, strike, struck
 
+pytestmark = pytest.mark.pairs
+
 
 class Held:
     """A recovery that stands still before it is released, until it is let go on."""

@@ -14,6 +14,8 @@ from tests.checkpoint.players import Do, Note, Notes, Seen, until
 from tests.checkpoint.strikes import sink
 from tests.checkpoint.trees import add, at, back, doing, escalate, running, seen, snapshot, top, tree
 
+pytestmark = pytest.mark.pairs
+
 
 async def two_snapshots(system: hf.ActorSystem) -> None:
     """ "a" is in the older snapshot, "b" in the newest too, and "c" in none."""

@@ -15,6 +15,8 @@ from tests.checkpoint.players import Do, Doer, Late, Note, Seen, until
 from tests.checkpoint.strikes import NEVER, event, let_through, sink
 from tests.checkpoint.trees import add, at, back, doing, end_process, running, seen, top, tree
 
+pytestmark = pytest.mark.pairs
+
 # -- ends that are recovered from -------------------------------------------------------------------------------------
 
 

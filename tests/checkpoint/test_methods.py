@@ -18,6 +18,8 @@ from holdfast.checkpoint.recovery_file import RecoveryFile
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, start, until
 from tests.checkpoint.strikes import NEVER, event, home, host_of, let_through, strike
 
+pytestmark = pytest.mark.pairs
+
 Ended = Literal["kept", "lost"]
 
 

@@ -15,6 +15,8 @@ import holdfast as hf
 from tests.checkpoint.players import Do, Doer, Hooks, No, Note, Notes, Seen, Sink, start, until
 from tests.checkpoint.strikes import NEVER, doer, event, let_through, sink, snapshot_after, strike, struck
 
+pytestmark = pytest.mark.pairs
+
 # -- state, mailbox, the message in hand ------------------------------------------------------------------------------
 
 

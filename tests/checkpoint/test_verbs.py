@@ -15,6 +15,8 @@ import holdfast as hf
 from tests.checkpoint.players import Note, Notes, Sink, start, until
 from tests.checkpoint.strikes import NEVER, home, strike
 
+pytestmark = pytest.mark.pairs
+
 FIRST, RESTORED, TURN, RECOVERED, STOPPED = "on_start(False)", "on_start(True)", "turn", "on_recovered", "on_stop"
 
 

@@ -19,6 +19,8 @@ from holdfast.actors.process.worker_pool import Worker
 from holdfast.checkpoint.home.recorded_moves import RecordedToProcess, RecordedToTask
 from tests.control.movers import Count, Ledger, Note, Seen, Slow
 
+pytestmark = pytest.mark.pairs
+
 OTHER: dict[str, Any] = {"task": "process", "process": "task"}
 KINDS = {"plain": None, "recorded": hf.hybrid(interval=0.05)}
 

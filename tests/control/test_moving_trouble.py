@@ -21,6 +21,8 @@ from tests.control.movers import (
 )
 from tests.control.players import Account, Add, Crash, Total, until_there
 
+pytestmark = pytest.mark.pairs
+
 
 @pytest.mark.parametrize("how", ["raise", "hang", "exit"])
 async def test_if_the_new_life_does_not_come_up_the_old_one_goes_on(

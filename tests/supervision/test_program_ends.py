@@ -19,6 +19,7 @@ import pytest
 import holdfast as hf
 from tests.actors.process.waiting import next_event, until
 from tests.supervision.programs import FAMILY, STUBBORN, Ends, family, info, keeper_of, python, sh
+from tests.warm import own_children
 
 
 @pytest.fixture
@@ -211,7 +212,7 @@ async def test_however_long_that_takes(system: hf.ActorSystem) -> None:
             await next_event(events, hf.ActorStarted)
             for _ in range(10):
                 await asyncio.sleep(0)
-            assert psutil.Process().children() == [keeper], "nothing else is started"
+            assert own_children() == [keeper], "nothing else is started"
         finally:
             keeper.resume()
         assert (await next_event(events, hf.ProcessDied)).pid == before
@@ -348,7 +349,7 @@ async def test_no_descriptor_task_or_zombie_is_left_by_many_lives(system: hf.Act
     await info(system)
     assert len(os.listdir("/proc/self/fd")) == files
     assert len(asyncio.all_tasks()) <= tasks + 1
-    assert len(psutil.Process().children()) == 2, "two keepers"
+    assert len(own_children()) == 2, "two keepers"
 
 
 # -- below another process -----------------------------------------------------------------------------------------

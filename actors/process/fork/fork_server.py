@@ -22,7 +22,7 @@ from ...errors import ProcessUnavailable
 from .boot import HEADER, Kind, receive
 from .child_processes import signal_by
 from .forked_process import SOCKET_BYTES, Forked, ForkRequest, check_can_watch, has_ended
-from .launch import check_can_start, inherited, server_command, server_config, server_environment
+from .launch import check_can_start, exec_server, server_config
 
 FORK_SECONDS = 10.0  # a server that does not answer by then is stopped or stuck
 IMPORT_SECONDS = 120.0  # time for user modules to be imported
@@ -122,15 +122,7 @@ class ForkServer:
         with theirs:
             config = json.dumps(server_config(self._entry, self._preload)._asdict())
             ours.send(HEADER.pack(Kind.CONFIG, 0, 0) + config.encode())
-            self._process = subprocess.Popen(
-                server_command(theirs.fileno()),
-                stdin=subprocess.DEVNULL,
-                stdout=inherited(1),
-                stderr=inherited(2),
-                pass_fds=(theirs.fileno(),),
-                env=server_environment(),
-                start_new_session=True,  # a Ctrl-C in the terminal is the program's business
-            )
+            self._process = exec_server(theirs.fileno())
         try:
             self._pidfd = os.pidfd_open(self._process.pid)
             check_can_watch(self._pidfd, ours.fileno())

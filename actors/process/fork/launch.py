@@ -73,6 +73,23 @@ def server_command(control_fd: int) -> list[str]:
     return [sys.executable, *flags, "-P", os.path.abspath(boot.__file__), str(control_fd)]
 
 
+def exec_server(control_fd: int) -> subprocess.Popen[bytes]:
+    """Start it: a child in a session of its own, with the given descriptor and our standard output and error.
+
+    Raises:
+        OSError: no process, memory or descriptor is left.
+    """
+    return subprocess.Popen(
+        server_command(control_fd),
+        stdin=subprocess.DEVNULL,
+        stdout=inherited(1),
+        stderr=inherited(2),
+        pass_fds=(control_fd,),
+        env=server_environment(),
+        start_new_session=True,  # a Ctrl-C in the terminal is the program's business
+    )
+
+
 def inherited(fd: int) -> int | None:
     """Share a standard stream with the server, or give it /dev/null if a daemon has closed it."""
     try:

@@ -13,8 +13,6 @@ import threading
 import time
 from typing import Any
 
-import numpy as np
-
 import holdfast as hf
 
 
@@ -66,11 +64,6 @@ class Seen(hf.Message):
     """To a recorder."""
 
     text: str
-
-
-class Array(hf.Message[np.ndarray]):
-    values: np.ndarray
-    factor: float
 
 
 class Introduce(hf.Message[str]):
@@ -219,8 +212,8 @@ class Worker(Account):
             time.sleep(600)
 
     def do_allocate(self, size: int) -> int:
-        self._ballast = np.ones(size, dtype=np.uint8)
-        return self._ballast.nbytes
+        self._ballast = bytearray(b"x") * size
+        return len(self._ballast)
 
     def do_open_files(self, count: int) -> int:
         files = []
@@ -313,11 +306,6 @@ class Notebook(hf.Actor):
     @hf.on(Where)
     def where(self, message: Where) -> int:
         return os.getpid()
-
-    @hf.on(Array)
-    def array(self, message: Array) -> np.ndarray:
-        message.values.flags.writeable = message.values.flags.writeable or True
-        return message.values * message.factor
 
     @hf.on(Introduce)
     async def introduce(self, message: Introduce) -> str:

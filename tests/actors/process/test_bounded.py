@@ -22,6 +22,8 @@ from tests.actors.process.observers import Observer, Publish, Send
 from tests.actors.process.players import Add, Block, Note, Notes, Slow, Total, Worker
 from tests.actors.process.waiting import until
 
+pytestmark = pytest.mark.pairs
+
 Busy = Callable[..., Awaitable[hf.ActorRef[Any]]]
 
 

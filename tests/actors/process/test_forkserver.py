@@ -77,7 +77,10 @@ def main(sock, page):
     return 7
 '''
 
-pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="pidfd and memfd are Linux's")
+pytestmark = [
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="pidfd and memfd are Linux's"),
+    pytest.mark.usefixtures("cold_fork_servers"),
+]
 
 
 class Fixture:

@@ -29,6 +29,8 @@ from tests.actors.process.observers import (
 from tests.actors.process.players import Fail, Note, Notebook, Notes, Pass, Where, WhoSent
 from tests.actors.process.waiting import until
 
+pytestmark = pytest.mark.pairs
+
 Make = Callable[..., Awaitable[hf.ActorRef[Observer]]]
 
 

@@ -16,6 +16,7 @@ import holdfast as hf
 from holdfast.actors.process.fork import fork_server
 from tests.actors.process.players import Account, Add, Total, Where
 from tests.actors.process.waiting import until
+from tests.warm import own_children
 
 
 def account(name: str) -> hf.ChildSpec:
@@ -24,7 +25,7 @@ def account(name: str) -> hf.ChildSpec:
 
 def servers() -> list[psutil.Process]:
     """The fork servers of this program."""
-    return psutil.Process().children()
+    return own_children()
 
 
 class Refusing:

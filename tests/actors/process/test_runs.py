@@ -11,6 +11,8 @@ import pytest
 import holdfast as hf
 from holdfast.actors.process.wire.connection import LARGE_ARRAY, RUN_BYTES
 
+pytestmark = pytest.mark.pairs
+
 
 class Number(hf.Message[int]):
     value: int

@@ -16,6 +16,8 @@ from holdfast.actors.kernel.cell import Cell
 from holdfast.actors.process.wire.connection import MOST_NAMES
 from tests.actors.process.waiting import SECONDS, next_event
 
+pytestmark = pytest.mark.pairs
+
 
 class Order(hf.Message[str]):
     """Stop, kill, or start a child somewhere; the reply is the error, if there is one."""

@@ -17,7 +17,7 @@ from holdfast.checkpoint.sqlite import SqliteJournal
 from tests.checkpoint.sqlite.disk import Disk, operations
 
 SOURCE = Path(__file__).with_name("disk.c")
-CUTS = int(os.environ.get("HOLDFAST_CUTS", "150"))
+CUTS = int(os.environ.get("HOLDFAST_CUTS", "80"))
 """Power losses for each seed; more in a campaign."""
 
 WRITER = """
