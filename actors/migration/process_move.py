@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Generator
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from ..errors import CannotMove, StartFailed
@@ -133,7 +133,7 @@ class Move:
         self.cell.host = self.transit
 
     @contextlib.contextmanager
-    def commit(self) -> Iterator[None]:
+    def commit(self) -> Generator[None]:
         """Within this the new life becomes the one: there is no way back from here on."""
         self.is_done = True
         tap = self.cell.extra().tap
