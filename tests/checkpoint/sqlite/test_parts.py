@@ -16,7 +16,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.journal import DamagedStore, ForeignStore, StoreFailed, StoreInUse
-from holdfast.checkpoint.sqlite import SqliteJournal
+from holdfast.checkpoint.sqlite import SqliteJournal, open_store
 from holdfast.checkpoint.sqlite.row_codec import crc_of
 from holdfast.checkpoint.sqlite.store_parts import NOTE
 from tests.checkpoint.players import Doer, Note, Seen
@@ -296,7 +296,10 @@ async def test_a_store_that_goes_while_it_is_open_acknowledges_nothing_more(tmp_
     # It was told while the system ran: that is all.
 
 
-async def test_a_store_that_goes_unnoticed_is_told_of_at_the_end(tmp_path: Path) -> None:
+async def test_a_store_that_goes_unnoticed_is_told_of_at_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(open_store, "LOOK_SECONDS", 3600.0)  # Nobody looks while it runs.
     path = tmp_path / "app.db"
     told: list[hf.Event] = []
     async with contextlib.AsyncExitStack() as stack:
