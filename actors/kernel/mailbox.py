@@ -10,15 +10,14 @@ import asyncio
 import dataclasses
 from collections import deque
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
-from ..errors import MailboxFull, SpecError
+from ..errors import MailboxFull
+from ..overflow import Overflow, check, decide
 from .envelope import LEAVE, Ask, Envelope, Item
 
 if TYPE_CHECKING:
     from .cell import Cell
-
-Overflow = Literal["block", "fail", "drop_newest", "drop_oldest", "latest"]
 
 
 def admit_first(cell: Cell, item: Any) -> None:
@@ -155,18 +154,16 @@ class Bound:
         if self.count < self.capacity and not self.waiting:
             self.put(cell, item)
             return
-        match self.overflow:
-            case "block" if isinstance(item, Ask):
+        verdict, keep = decide(self.overflow, self.capacity, is_ask=isinstance(item, Ask))
+        match verdict:
+            case "wait":
                 self.waiting.append(item)
-            case "block" | "fail":
+            case "refuse":
                 self._refuse(cell, item)
-            case "drop_newest":
+            case "lose":
                 self._lose(cell, item)
-            case "drop_oldest":
-                self._lose_queued(cell, keep=self.capacity - 1)
-                self.put(cell, item)
-            case "latest":
-                self._lose_queued(cell, keep=0)
+            case "take":
+                self._lose_queued(cell, keep)
                 self.put(cell, item)
 
     def inherit(self, old: Bound) -> Bound:
@@ -317,11 +314,8 @@ def bounded(capacity: int, *, overflow: Overflow = "block") -> Bounded:
 
     Args:
         capacity: messages, >= 1.
-        overflow: "block" (tell raises MailboxFull, send waits, ask waits to its deadline), "fail" (all raise),
+        overflow: "block" (tell raises MailboxFull, send waits, ask waits to its deadline), "reject" (all raise),
             "drop_newest", "drop_oldest", or "latest" (only the newest is kept); the loser goes to dead letters.
     """
-    if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
-        raise SpecError("bounded", f"capacity must be a whole number of messages >= 1, not {capacity!r}")
-    if overflow not in get_args(Overflow):
-        raise SpecError("bounded", f"overflow must be one of {', '.join(get_args(Overflow))}, not {overflow!r}")
+    check("bounded", capacity, overflow)
     return Bounded(capacity, overflow)

@@ -19,6 +19,7 @@ from ..kernel import lifecycle, links, mailbox
 from ..kernel.cell import DOWN, GONE, RUNNING, Cell
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item
+from ..overflow import DROPS
 from ..persistence import child_key
 from .resource_limits import Limits
 from .wire import frames
@@ -138,7 +139,7 @@ class RemoteBound(mailbox.Bound):
 
     def __init__(self, bound: mailbox.Bound) -> None:
         super().__init__(bound.capacity, bound.overflow)
-        self._at_once = 1 if bound.overflow in ("drop_oldest", "latest") else bound.capacity + 1
+        self._at_once = 1 if bound.overflow in DROPS else bound.capacity + 1
 
     def admit(self, cell: Cell, item: Any) -> None:
         if self.count >= self.capacity:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from ...actors.errors import MailboxFull
 from ...actors.kernel.mailbox import Bound, Senders
+from ...actors.overflow import DROPS, decide
 from ..protocol import MESSAGE, START, Answer
 from .inputs import Batch, Input
 
@@ -26,7 +27,7 @@ class HomeBound:
     def __init__(self, home: Switch, chosen: Bound) -> None:
         self._home = home
         self.capacity, self.overflow = chosen.capacity, chosen.overflow
-        self.one_at_a_time = chosen.overflow in ("drop_oldest", "latest")
+        self.one_at_a_time = chosen.overflow in DROPS
         stashed = home.stashed()
         self._counted = {  # by id, in admission order
             key: source for key, source in home.open.items() if source.kind == MESSAGE and key not in stashed
@@ -60,26 +61,21 @@ class HomeBound:
         """
         if not self.is_full:
             return True
-        match self.overflow:
-            case "block" if ask is not None:
-                self.waiting.append((ask, name, body, sender))
-                return False
-            case "block" | "fail":
-                error = MailboxFull(self._home.path, self.capacity)
-                if ask is None:
-                    raise error
-                ask.fail(error)
-                return False
-            case "drop_newest":
-                if ask is not None:
-                    ask.fail(MailboxFull(self._home.path, self.capacity))
-                self._home.ends.lost(name, body, self._why())
-                return False
-            case "drop_oldest":
-                self._drop(keep=self.capacity - 1)
-            case _:  # the latest only
-                self._drop(keep=0)
-        return True
+        verdict, keep = decide(self.overflow, self.capacity, is_ask=ask is not None)
+        if verdict == "take":
+            self._drop(keep)
+            return True
+        if verdict == "wait" and ask is not None:
+            self.waiting.append((ask, name, body, sender))
+            return False
+        error = MailboxFull(self._home.path, self.capacity)
+        if verdict == "lose":
+            self._home.ends.lost(name, body, self._why())
+        elif ask is None:
+            raise error
+        if ask is not None:
+            ask.fail(error)
+        return False
 
     def _why(self) -> str:
         return f"mailbox full ({self.capacity}, {self.overflow})"

@@ -14,6 +14,7 @@ from ...actors.errors import MailboxFull
 from ...actors.events import HeldMessages
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.mailbox import Senders
+from ...actors.overflow import decide
 from ..home.inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from .settings import Held
@@ -66,20 +67,28 @@ class Holding:
         topic = self._added = self._take_topic()
         rule = self._rules[topic]
         if rule is not None and self._count(topic) >= rule.capacity:
-            match rule.overflow:
-                case "block" if ask is not None:
-                    self._waiting.append((ask, name, body, sender, topic))
-                    return False
-                case "block" | "reject":
-                    self.refused += 1
-                    error = MailboxFull(self._home.path, rule.capacity)
-                    if ask is None:
-                        raise error
-                    ask.fail(error)
-                    return False
-                case _:
-                    self._drop(topic, rule, 0 if rule.overflow == "latest" else rule.capacity - 1)
+            verdict, keep = decide(rule.overflow, rule.capacity, is_ask=ask is not None)
+            if verdict == "wait" and ask is not None:
+                self._waiting.append((ask, name, body, sender, topic))
+                return False
+            if verdict != "take":
+                self._turn_away(rule, ask, name, body, is_lost=verdict == "lose")
+                return False
+            self._drop(topic, rule, keep)
         return self.inner is None or self.inner.makes_room(ask, name, body, sender)
+
+    def _turn_away(self, rule: Held, ask: Ask | None, name: str, body: bytes, *, is_lost: bool) -> None:
+        """Raises MailboxFull: it is a tell, and its sender is to know."""
+        error = MailboxFull(self._home.path, rule.capacity)
+        if is_lost:
+            self.dropped += 1
+            self._home.ends.lost(name, body, _why(rule))
+        else:
+            self.refused += 1
+            if ask is None:
+                raise error
+        if ask is not None:
+            ask.fail(error)
 
     def _take_topic(self) -> str:
         """By which topic that has a rule of its own the message in hand comes."""
@@ -96,7 +105,7 @@ class Holding:
         mine = [source for source, by in self._counted.values() if by == topic]
         for source in mine[: len(mine) - keep]:
             self.dropped += 1
-            home.ends.lost(source.name, source.body, f"held for too long ({rule.capacity}, {rule.overflow})")
+            home.ends.lost(source.name, source.body, _why(rule))
             home.ends.without_turn(source, answer, batch)
         batch.commit(home.journal)
 
@@ -181,6 +190,10 @@ class Holding:
         """The life that was fed this goes on."""
         if self.inner is not None:
             self.inner.take_up(in_hand)
+
+
+def _why(rule: Held) -> str:
+    return f"held for too long ({rule.capacity}, {rule.overflow})"
 
 
 class Inlet(Cell):

@@ -11,8 +11,8 @@ import msgspec
 from ...actors.errors import SpecError, type_name
 from ...actors.kernel.codec import encode_special, unencodable
 from ...actors.kernel.message import Message, message_name
+from ...actors.overflow import Overflow, check
 
-HeldOverflow = Literal["block", "latest", "drop_oldest", "reject"]
 Phase = Literal["safe_state", "isolate", "restart", "restore", "replay", "release"]
 PHASES: tuple[Phase, ...] = get_args(Phase)
 
@@ -85,22 +85,19 @@ class Held:
     """How many messages are held while an actor is recovered, and what becomes of more; made by `held`."""
 
     capacity: int
-    overflow: HeldOverflow = "block"
+    overflow: Overflow = "block"
 
 
-def held(capacity: int, *, overflow: HeldOverflow = "block") -> Held:
+def held(capacity: int, *, overflow: Overflow = "block") -> Held:
     """At most `capacity` messages are held while an actor is recovered.
 
     Args:
         capacity: messages, >= 1. Those that waited before the crash do not count.
         overflow: "block" (a tell raises MailboxFull, a send waits, an ask waits to its deadline), "latest" (only the
-            newest is kept), "drop_oldest", "reject" (all raise MailboxFull). What is dropped is a dead letter.
+            newest is kept), "drop_oldest", "drop_newest", "reject" (all raise MailboxFull). What is dropped is a
+            dead letter.
     """
-    if not isinstance(capacity, int) or isinstance(capacity, bool) or capacity < 1:
-        raise SpecError("held", f"capacity must be a whole number of messages >= 1, not {capacity!r}")
-    if overflow not in get_args(HeldOverflow):
-        known = ", ".join(map(repr, get_args(HeldOverflow)))
-        raise SpecError("held", f"overflow must be one of {known}, not {overflow!r}")
+    check("held", capacity, overflow)
     return Held(capacity, overflow)
 
 

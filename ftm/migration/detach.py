@@ -16,11 +16,12 @@ from ...actors.kernel.cell import Cell, Host
 from ...actors.kernel.envelope import Envelope
 from ...actors.kernel.lifecycle import LOCAL
 from ...actors.kernel.links import Down, Exit, Monitor
-from ...actors.kernel.mailbox import Bound, Overflow
+from ...actors.kernel.mailbox import Bound
 from ...actors.kernel.timers import Timer
 from ...actors.migration.here import Arrival
 from ...actors.migration.process_move import Move
 from ...actors.migration.quiesce import now, obey_commands
+from ...actors.overflow import Overflow
 from ...checkpoint.home.capacity import HomeBound
 from ...checkpoint.home.recorded_hosts import TaskHost
 from ...checkpoint.home.recorded_moves import Detached, RecordedArrival, refuse_unsaved

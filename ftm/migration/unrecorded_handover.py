@@ -15,9 +15,10 @@ from ...actors.errors import CannotMove, HoldfastError, StartFailed, error_text
 from ...actors.exit_reasons import ExitReason, unpack_exit
 from ...actors.kernel.cell import GONE, RUNNING, Cell, Host
 from ...actors.kernel.envelope import Item
-from ...actors.kernel.mailbox import Bound, Bounded, Overflow
+from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.message import message_name
 from ...actors.migration.quiesce import now
+from ...actors.overflow import Overflow
 from ...actors.process.wire import frames
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.wire.start_codec import pack_recipe

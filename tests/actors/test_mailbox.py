@@ -203,7 +203,7 @@ async def test_block_whoever_waits_hears_of_the_end(system: hf.ActorSystem) -> N
 
 
 async def test_fail_refuses_tell_send_and_ask(system: hf.ActorSystem) -> None:
-    box, gate = await busy(system, hf.bounded(1, overflow="fail"))
+    box, gate = await busy(system, hf.bounded(1, overflow="reject"))
     box.tell(Put(1))
     with pytest.raises(hf.MailboxFull):
         box.tell(Put(2))
@@ -262,7 +262,7 @@ async def test_an_actor_that_overflows_its_own_mailbox_in_a_turn_lives_on(system
 async def test_what_the_runtime_puts_in_takes_no_place(system: hf.ActorSystem) -> None:
     """Pipe results and timers always fit, and make no room for more than the capacity."""
     gate = asyncio.Event()
-    box = system.spawn(hf.start(Box, gate), mailbox=hf.bounded(2, overflow="fail"))
+    box = system.spawn(hf.start(Box, gate), mailbox=hf.bounded(2, overflow="reject"))
     box.tell(Pipe())
     for _ in range(10):
         await asyncio.sleep(0)

@@ -156,7 +156,7 @@ async def test_stashed_asks_fail_when_the_actor_ends_for_good(system: hf.ActorSy
 
 
 async def test_a_stashed_message_takes_no_place_until_it_comes_back(system: hf.ActorSystem) -> None:
-    shop = system.spawn(hf.start(Shop), mailbox=hf.bounded(3, overflow="fail"))
+    shop = system.spawn(hf.start(Shop), mailbox=hf.bounded(3, overflow="reject"))
     for number in range(6):
         shop.tell(Item(number))
         await system.node.settled()

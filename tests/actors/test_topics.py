@@ -111,7 +111,7 @@ async def test_a_subscriber_that_cannot_take_it_does_not_keep_it_from_the_others
 
     gate = asyncio.Event()
     slow = system.spawn(hf.start(Subscriber), "slow", mailbox=hf.bounded(1))
-    full = system.spawn(hf.start(Subscriber), "full", mailbox=hf.bounded(1, overflow="fail"))
+    full = system.spawn(hf.start(Subscriber), "full", mailbox=hf.bounded(1, overflow="reject"))
     for busy in (slow, full):
         busy.tell(Do(lambda _: gate.wait()))
     await asyncio.sleep(0)

@@ -52,6 +52,7 @@ class Held:
         ("reject", ["0", "1", "2"], 3),
         ("latest", ["5"], 0),
         ("drop_oldest", ["3", "4", "5"], 0),
+        ("drop_newest", ["0", "1", "2"], 0),
     ],
 )
 async def test_tells_beyond_the_capacity(
@@ -129,14 +130,14 @@ async def test_held_asks_keep_their_deadline(isolation: str) -> None:
         assert await ref.ask(Seen()) == ["patient"]
 
 
-@pytest.mark.parametrize("overflow", ["latest", "drop_oldest", "reject"])
+@pytest.mark.parametrize("overflow", ["latest", "drop_oldest", "drop_newest", "reject"])
 async def test_an_ask_that_loses_its_place_hears_of_it(isolation: str, overflow: Any) -> None:
     held = Held()
     async with running(recovery_hooks=held.hooks) as system:
         ref = await doer(system, isolation, held=hf.held(1, overflow=overflow))
         await held.strike(system, ref)
         first, second = ref.ask(Note("first"), timeout=30.0), ref.ask(Note("second"), timeout=30.0)
-        loser, winner = (second, first) if overflow == "reject" else (first, second)
+        loser, winner = (second, first) if overflow in ("reject", "drop_newest") else (first, second)
         with pytest.raises(hf.MailboxFull):
             await loser
         await held.let_go(system)
@@ -231,7 +232,7 @@ async def test_each_topic_has_its_own_rule(store: str | None, isolation: str, pu
 async def test_a_bounded_mailbox_keeps_its_own_rule_as_well(isolation: str) -> None:
     held = Held()
     async with running() as system:
-        options: Any = {"mailbox": hf.bounded(2, overflow="fail")}
+        options: Any = {"mailbox": hf.bounded(2, overflow="reject")}
         recovery = hf.hybrid(3600.0, held=hf.held(5))
         ref = await start(system, isolation, "doer", hf.start(Doer), recovery=recovery, **options)
         system.homes.recoveries.hooks = held.hooks

@@ -219,7 +219,7 @@ async def test_or_it_is_waited_for(options: dict[str, Any]) -> None:
 async def test_while_nobody_is_up_messages_wait_in_their_order() -> None:
     async with hf.ActorSystem(log=False) as system:
         worker = hf.child(None, hf.start(Worker), backoff=hf.Backoff(10, 10))
-        top, pool = await begin(system, worker, size=1, mailbox=hf.bounded(3, overflow="fail"))
+        top, pool = await begin(system, worker, size=1, mailbox=hf.bounded(3, overflow="reject"))
         one(system, 0).tell(Boom())
         await settled(system)
         late = pool.ask(Job(), 1.0)

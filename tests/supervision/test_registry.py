@@ -206,7 +206,7 @@ async def test_dispatch_calls_a_function_with_the_entries_in_the_caller() -> Non
 async def test_a_holder_without_room_keeps_a_message_from_nobody_else() -> None:
     async with hf.ActorSystem(log=False) as system:
         names = await open_names(system, keys="duplicate")
-        full = system.spawn(hf.start(Holder), "full", mailbox=hf.bounded(1, overflow="fail"))
+        full = system.spawn(hf.start(Holder), "full", mailbox=hf.bounded(1, overflow="reject"))
         free = system.spawn(hf.start(Holder), "free")
         for holder in (full, free):
             await by(holder, lambda: names.register("k", 0))

@@ -68,7 +68,7 @@ WRONG: list[tuple[Callable[[], object], str, str]] = [
     (lambda: hf.ActorSystem("a/b"), "ActorSystem", "the name must be text without '/', not 'a/b'"),
     (lambda: hf.ActorSystem(intensity=-1), "supervisor", "intensity must be a whole number >= 0, not -1"),
     (lambda: hf.bounded(0), "bounded", "capacity must be a whole number of messages >= 1, not 0"),
-    (lambda: hf.bounded(1, overflow="wait"), "bounded", "overflow must be one of block, fail, drop_newest"),  # type: ignore[arg-type]
+    (lambda: hf.bounded(1, overflow="wait"), "bounded", "overflow must be one of block, reject, drop_newest"),  # type: ignore[arg-type]
 ]
 
 

@@ -57,7 +57,7 @@ class Notebook(hf.Actor):
 
 WAYS: dict[str, dict[str, Any]] = {
     "task": {},
-    "bounded": {"mailbox": hf.bounded(2, overflow="fail")},
+    "bounded": {"mailbox": hf.bounded(2, overflow="reject")},
     "process": {"isolation": "process"},
     "recorded": {"recovery": hf.hybrid()},
     "recorded process": {"recovery": hf.hybrid(), "isolation": "process"},

@@ -76,7 +76,7 @@ async def test_tell_is_refused_when_it_is_full(busy: Busy, gate: Path) -> None:
     assert await ref.ask(Total()) == 4
 
 
-@pytest.mark.parametrize("overflow", ["fail", "block"])
+@pytest.mark.parametrize("overflow", ["reject", "block"])
 async def test_ask_is_refused_or_waits(busy: Busy, gate: Path, overflow: str) -> None:
     ref = await busy(2, overflow)
     asks = [ref.ask(Add(1)) for _ in range(5)]
@@ -141,7 +141,7 @@ async def test_many_messages_flow_through_a_small_mailbox(busy: Busy, gate: Path
 
 async def test_one_ask_after_the_other_is_never_too_many(busy: Busy, gate: Path) -> None:
     """The reply may be here before the word that there is room again."""
-    ref = await busy(1, "fail")
+    ref = await busy(1, "reject")
     gate.touch()
     await ref.ask(Total())
     assert [await ref.ask(Add(1)) for _ in range(200)] == list(range(2, 202))
@@ -163,7 +163,7 @@ async def test_a_sender_in_a_process_waits_too(system: hf.ActorSystem, busy: Bus
 async def test_a_sender_in_a_process_hears_that_it_is_full_or_gone(
     system: hf.ActorSystem, busy: Busy, gate: Path
 ) -> None:
-    ref = await busy(2, "fail", kind=Slow)
+    ref = await busy(2, "reject", kind=Slow)
     sender = await system.start(hf.child("sender", hf.start(Observer), isolation="process"))
     assert await sender.ask(Send(ref, 5)) == "2 MailboxFull"
     gate.touch()
