@@ -124,7 +124,8 @@ from holdfast.checkpoint.life.determinism_guard import NotDeterministic
 from holdfast.checkpoint.life.readonly_guard import NotReadonly
 from holdfast.checkpoint.life.replay_guard import StateDiverged
 from holdfast.checkpoint.method import Method, checkpoint_only, fresh, hybrid, replay_only
-from holdfast.checkpoint.recovery.settings import (
+from holdfast.checkpoint.recovery_file import RecoveryFile, load_recovery
+from holdfast.checkpoint.recovery_settings import (
     Held,
     RecoveryHooks,
     RecoveryStep,
@@ -133,7 +134,6 @@ from holdfast.checkpoint.recovery.settings import (
     recovery_hooks,
     safe_state,
 )
-from holdfast.checkpoint.recovery_file import RecoveryFile, load_recovery
 from holdfast.checkpoint.snapshot.snapshot_groups import NoSuchGroup
 from holdfast.checkpoint.snapshot.snapshot_schedule import CheckpointFailed
 from holdfast.supervision.admin import (
@@ -203,7 +203,6 @@ from holdfast.system.transaction.operation import Operation, Step
 if TYPE_CHECKING:
     from holdfast.ftm.alarms import Diverged, Masked, ProtectionLost
     from holdfast.ftm.bricks.sealed_frames import FrameRefused
-    from holdfast.ftm.bricks.voters import NoMajority
     from holdfast.ftm.events import (
         BackgroundWorkLost,
         FailedOver,
@@ -222,14 +221,15 @@ if TYPE_CHECKING:
     from holdfast.ftm.group.reconfiguration import CannotAdapt
     from holdfast.ftm.mechanisms.ad import AD
     from holdfast.ftm.mechanisms.lfr import LFR
-    from holdfast.ftm.mechanisms.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.mechanisms.nvp import NVP
     from holdfast.ftm.mechanisms.pbr import PBR
     from holdfast.ftm.mechanisms.rb import RB
     from holdfast.ftm.mechanisms.sec import SEC
     from holdfast.ftm.mechanisms.tmr import TMR
     from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.model.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.sec.authority import CertificationAuthority as CertificationAuthority  # not in `__all__`
+    from holdfast.ftm.votes.voters import NoMajority
     from holdfast.system.protection import AdaptationUndone
 
 __version__ = "0.1.0"
@@ -500,16 +500,16 @@ _LAZY = {
     "FrameRefused": "holdfast.ftm.bricks.sealed_frames",
     "LFR": "holdfast.ftm.mechanisms.lfr",
     "Masked": "holdfast.ftm.alarms",
-    "Mechanism": "holdfast.ftm.mechanisms.mechanism",
+    "Mechanism": "holdfast.ftm.model.mechanism",
     "MechanismAttached": "holdfast.ftm.events",
     "MechanismDetached": "holdfast.ftm.events",
     "CannotAdapt": "holdfast.ftm.group.reconfiguration",
     "MechanismChanged": "holdfast.ftm.events",
     "AdaptationUndone": "holdfast.system.protection",
-    "MechanismRefused": "holdfast.ftm.mechanisms.mechanism",
+    "MechanismRefused": "holdfast.ftm.model.mechanism",
     "MechanismSettled": "holdfast.ftm.events",
     "NVP": "holdfast.ftm.mechanisms.nvp",
-    "NoMajority": "holdfast.ftm.bricks.voters",
+    "NoMajority": "holdfast.ftm.votes.voters",
     "PBR": "holdfast.ftm.mechanisms.pbr",
     "ProtectionLost": "holdfast.ftm.alarms",
     "ProtectionStatus": "holdfast.ftm.group.protected",
@@ -522,7 +522,7 @@ _LAZY = {
     "TR": "holdfast.ftm.mechanisms.tr",
     "TurnHung": "holdfast.ftm.events",
     "WrongSuspicion": "holdfast.ftm.events",
-    "compose": "holdfast.ftm.mechanisms.mechanism",
+    "compose": "holdfast.ftm.model.mechanism",
 }
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from holdfast.actors.kernel.actor import Actor, Start
 from holdfast.ftm.bricks.bricks import Brick
 from holdfast.ftm.group.proxy import Proxy
-from holdfast.ftm.mechanisms.mechanism import BUILT_IN, find
+from holdfast.ftm.model.mechanism import BUILT_IN, find
 from holdfast.ftm.replica.replica import Replica
 from holdfast.ftm.replica.state_manager import StateManager
 

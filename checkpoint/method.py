@@ -10,7 +10,8 @@ import msgspec
 
 from ..actors.errors import SpecError, type_name
 from ..actors.kernel.actor import Actor
-from .recovery.settings import (
+from .compression import check_compress
+from .recovery_settings import (
     SAFE_STATE_TIMEOUT,
     Held,
     RecoveryHooks,
@@ -19,7 +20,6 @@ from .recovery.settings import (
     as_safe_state,
     check_seconds,
 )
-from .snapshot.compression import check_compress
 
 Durability = Literal["memory", "os", "fsync"]
 OnEscalate = Literal["restore", "older_snapshot", "fresh"]

@@ -25,7 +25,7 @@ from ..actors.kernel.message import Message, message_name
 from ..actors.values.classes import find_class
 from . import method as methods
 from .method import Method
-from .recovery.settings import SafeState, held, safe_state
+from .recovery_settings import SafeState, held, safe_state
 
 METHODS: dict[str, Callable[..., Method]] = {
     "fresh": methods.fresh,

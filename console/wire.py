@@ -112,7 +112,7 @@ def open_arg(arg: AnyArg) -> Any:
 
 def is_mechanism(value: Any) -> bool:
     """Whether these are mechanisms: one or several, each an instance, or a class of them."""
-    from ..ftm.mechanisms.mechanism import Mechanism
+    from ..ftm.model.mechanism import Mechanism
 
     layers: Any = value if isinstance(value, (tuple, list)) and value else (value,)
     found = [isinstance(one, Mechanism) or (isinstance(one, type) and issubclass(one, Mechanism)) for one in layers]
@@ -122,7 +122,7 @@ def is_mechanism(value: Any) -> bool:
 
 def pack_mechanism(value: Any) -> list[Any]:
     """Mechanisms as plain data: each its name or file, or how it is described; whether they are several."""
-    from ..ftm.mechanisms.mechanism import Mechanism
+    from ..ftm.model.mechanism import Mechanism
 
     layers: Any = value if isinstance(value, (tuple, list)) else (value,)
     made = [one() if isinstance(one, type) else one for one in layers]
@@ -132,7 +132,7 @@ def pack_mechanism(value: Any) -> list[Any]:
 
 def open_mechanism(data: list[Any]) -> Any:
     """The mechanisms again. Imports the modules, or reads the files, that define them."""
-    from ..ftm.mechanisms.mechanism import Description, revive
+    from ..ftm.model.mechanism import Description, revive
 
     several, *said = data
     made = [one if isinstance(one, str) else revive(msgspec.msgpack.decode(one, type=Description)) for one in said]

@@ -364,7 +364,7 @@ def check_mechanism(where: str, mechanism: Any, kind: type[Actor], *, is_supervi
     for layer in layers:
         if isinstance(layer, type) or not hasattr(layer, "check") or not hasattr(layer, "replicas"):
             hint = (
-                "; a class by its name is `find(name)` of `holdfast.ftm.mechanisms.mechanism`"
+                "; a class by its name is `find(name)` of `holdfast.ftm.model.mechanism`"
                 if isinstance(layer, str)
                 else ""
             )

@@ -142,8 +142,8 @@ class Moves:
 
     async def _unprotected(self, cell: Cell, timeout: float) -> None:
         from ..ftm.events import MechanismDetached
-        from ..ftm.mechanisms.mechanism import compose
         from ..ftm.migration.detach import from_group
+        from ..ftm.model.mechanism import compose
 
         before: ChildSpec = cell.spec
         wanted = dataclasses.replace(before, mechanism=None, isolation="task")

@@ -81,7 +81,7 @@ class Protection:
             spec = self._completed_below(spec, address)
         if address not in self._loaded:
             return spec
-        from ..ftm.mechanisms.mechanism import Description, MechanismRefused, revive
+        from ..ftm.model.mechanism import Description, MechanismRefused, revive
 
         self._loaded.discard(address)
         declared, current, *before = self._kept[address]

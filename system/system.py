@@ -31,8 +31,8 @@ from ..checkpoint.home.subtree_homes import Lived, SubtreeHome, SubtreeHost
 from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
 from ..checkpoint.protocol import Wanted
-from ..checkpoint.recovery.settings import RecoveryHooks
 from ..checkpoint.recovery_file import RecoveryFile, load_recovery
+from ..checkpoint.recovery_settings import RecoveryHooks
 from ..checkpoint.stores import check_durability, check_system, open_journal
 from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
 from ..supervision.patience import end_within
@@ -263,8 +263,8 @@ class ActorSystem(Recorded, Controls):
             MechanismRefused: its mechanisms do not go together, or not in this order.
         """
         from ..ftm.group.group_host import GroupHost
-        from ..ftm.mechanisms.mechanism import COMMON, compose
         from ..ftm.model.composition import check_stack  # Most systems protect nobody.
+        from ..ftm.model.mechanism import COMMON, compose
 
         check_stack(compose(spec.mechanism), spec.start.kind, spec.id)
         self._workers.want(spec.start.kind.__module__)
@@ -280,8 +280,8 @@ class ActorSystem(Recorded, Controls):
         Raises:
             MechanismRefused: its mechanisms cannot be had here, or do not go together.
         """
-        from ..ftm.mechanisms.mechanism import COMMON
         from ..ftm.migration.subtree_groups import subtree_group
+        from ..ftm.model.mechanism import COMMON
 
         group = subtree_group(place, cell, wanted, before)
         for name in (REPLICA, *COMMON):

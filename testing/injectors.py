@@ -19,8 +19,8 @@ from ..actors.kernel.ref import ActorRef
 from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
 from ..checkpoint.group_commit import Submission
-from ..checkpoint.home.inputs import HomeJournal
 from ..checkpoint.home.outputs import switch_of
+from ..checkpoint.inputs import HomeJournal
 from ..checkpoint.journal import Saved, StoreFailed
 from ..system.system import ActorSystem
 from .damage import damaged

@@ -11,13 +11,13 @@ import msgspec
 from ...actors.errors import HoldfastError
 from ...actors.exit_reasons import pack_exit
 from ...actors.kernel import links
+from ..inputs import OVERHEAD
 from ..protocol import DOWN, EXIT, MESSAGE
-from .inputs import OVERHEAD
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Item
+    from ..inputs import Input
     from ..journal import Entry
-    from .inputs import Input
     from .switch import Switch
 
 

@@ -12,8 +12,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from ...actors.kernel.codec import Parcel
+from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer, Out
-from .inputs import Batch, Input
 from .pending_asks import MARK, OVER, SwitchAsk
 
 if TYPE_CHECKING:

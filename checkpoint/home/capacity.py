@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 from ...actors.errors import MailboxFull
 from ...actors.kernel.mailbox import Bound, Senders
 from ...actors.overflow import DROPS, decide
+from ..inputs import Batch, Input
 from ..protocol import MESSAGE, START, Answer
-from .inputs import Batch, Input
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Ask

@@ -10,8 +10,8 @@ from ...actors.errors import ActorStopped, AskFailed, HoldfastError, Quarantined
 from ...actors.events import MessageQuarantined
 from ...actors.kernel.codec import Parcel
 from ..group_commit import Unkept
+from ..inputs import OVERHEAD, Batch, Input
 from ..protocol import DROPPED, MESSAGE, START, Answer
-from .inputs import OVERHEAD, Batch, Input
 
 if TYPE_CHECKING:
     from .switch import Switch

@@ -13,10 +13,10 @@ from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import child_key
 from ..group_commit import Commits, Unkept
+from ..inputs import HomeJournal
 from ..journal import Journal, Saved
 from ..method import Durability, Method, hybrid
 from ..protocol import START
-from ..recovery.held_messages import hold, inlet, let_go
 from ..recovery.recoveries import Recoveries, Recovery
 from ..recovery_file import RecoveryFile
 from ..snapshot.rollback import older_snapshot, roll_back
@@ -26,7 +26,7 @@ from ..snapshot.unreplayed import forget_turns
 from .admission import Admission
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
-from .inputs import HomeJournal
+from .held_messages import hold, inlet, let_go
 from .quarantine import PLACE, Quarantine
 from .switch import Switch
 

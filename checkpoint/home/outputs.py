@@ -14,11 +14,11 @@ from ...actors.errors import AskDeadlock, HoldfastError, MailboxFull
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Envelope
+from ..durable_links import UNDONE_BY, connect
+from ..inputs import Batch
 from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
-from ..recovery.held_messages import Inlet, inlet
-from .durable_links import UNDONE_BY, connect
-from .inputs import Batch
+from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
 
 if TYPE_CHECKING:

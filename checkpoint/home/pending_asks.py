@@ -11,8 +11,8 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
+from ..inputs import Batch
 from ..protocol import REPLY, Answer, Out, Outcome
-from .inputs import Batch
 
 if TYPE_CHECKING:
     from ...actors.kernel.codec import Codec

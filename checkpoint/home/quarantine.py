@@ -14,8 +14,8 @@ import msgspec
 from ...actors.errors import HoldfastError, NoSuchActor
 from ...actors.kernel.cell import ANY
 from ...actors.kernel.codec import Parcel
+from ..inputs import Batch, Input
 from ..protocol import MESSAGE, PIPE, TICK
-from .inputs import Batch, Input
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node

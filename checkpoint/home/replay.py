@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 from ...actors.events import ReplayPaced
-from .inputs import Turn
+from ..inputs import Turn
 
 if TYPE_CHECKING:
     from ..protocol import LifePort

@@ -13,8 +13,8 @@ from ...actors.errors import UnknownMessage
 from ...actors.events import TurnsSkipped
 from ...actors.kernel.actor import Actor, Handles
 from ...actors.kernel.node import cell_kind
+from ..inputs import OVERHEAD, Turn
 from ..protocol import MESSAGE, OK, STASHED, Out
-from .inputs import OVERHEAD, Turn
 
 if TYPE_CHECKING:
     from .switch import Switch

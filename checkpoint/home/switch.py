@@ -18,6 +18,9 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.message import message_name
+from ..durable_links import Ties
+from ..durable_timers import Timers
+from ..inputs import OVERHEAD, Batch, HomeJournal, Input, Turn
 from ..journal import Saved
 from ..life.replay_guard import StateDiverged
 from ..method import Method
@@ -52,7 +55,6 @@ from ..protocol import (
     answer_digest,
     pieces,
 )  # fmt: skip
-from ..recovery.held_messages import Holding, Inlet, let_go
 from ..schema import Shapes, start_name
 from ..snapshot.snapshot_blocks import Images
 from ..snapshot.snapshot_receiver import Arrival
@@ -61,9 +63,7 @@ from ..snapshot.snapshot_schedule import Due
 from .admission import submit, taken_up
 from .capacity import HomeBound
 from .disposal import Ends
-from .durable_links import Ties
-from .durable_timers import Timers
-from .inputs import OVERHEAD, Batch, HomeJournal, Input, Turn
+from .held_messages import Holding, Inlet, let_go
 from .journal_limit import Limit
 from .outputs import Outputs, went_elsewhere
 from .pending_asks import Calls, SwitchAsk, answer_ask, origin_of

@@ -18,7 +18,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import Message, message_name
-from ..home.durable_timers import said_by
+from ..durable_timers import said_by
 from ..method import Method
 from ..protocol import (
     FAILED,

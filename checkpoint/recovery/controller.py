@@ -12,10 +12,10 @@ from ...actors.kernel.actor import on
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
 from ...actors.kernel.ref import ActorRef
+from ..recovery_settings import Hook
 from .part import Part
 from .recoveries import ENTER, LEAVE, STAGES, Point, Recovery
 from .safe_states import Receiver
-from .settings import Hook
 
 
 class Look(Message):

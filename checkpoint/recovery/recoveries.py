@@ -12,8 +12,8 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from ...actors.events import HeldMessages, RecoveryHookFailed, RecoveryPhase, SafeStateKept
+from ..recovery_settings import Hook, RecoveryHooks, RecoveryStep
 from .safe_states import Safety
-from .settings import Hook, RecoveryHooks, RecoveryStep
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node

@@ -19,7 +19,7 @@ from ...actors.kernel.lifecycle import LOCAL
 from ...actors.kernel.node import cell_kind
 from ...actors.safe_state import SafeStateChange
 from ..home.outputs import switch_of
-from .settings import SafeState
+from ..recovery_settings import SafeState
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node

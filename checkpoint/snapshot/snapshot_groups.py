@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ...actors.errors import HoldfastError
-from ..home.inputs import Input
+from ..inputs import Input
 from ..journal import Entry, Saved
 from .snapshot_record import FORMAT, Meta, outlasting, owed
 

@@ -8,15 +8,15 @@ import msgspec
 
 from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotDamaged
-from ..home.durable_links import Tie
-from ..home.durable_timers import Saved
-from ..home.inputs import OVERHEAD, Input, Turn
+from ..compression import PLAIN, compressor, decompress
+from ..durable_links import Tie
+from ..durable_timers import Saved
 from ..home.pending_asks import SwitchAsk, origin_of
+from ..inputs import OVERHEAD, Input, Turn
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
 from ..protocol import DOWN, EXIT, PIPE, STASHED, TICK, Answer, Snapshot
 from ..schema import as_shape, kind_in
-from .compression import PLAIN, compressor, decompress
 from .shared_blocks import Place
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ import msgspec
 
 from ...actors.errors import AskFailed
 from ...actors.events import TurnsLost
-from ..home.inputs import OVERHEAD
+from ..inputs import OVERHEAD
 from ..protocol import OK, START, STASHED
 from .snapshot_record import FORMAT, Meta, go_back
 

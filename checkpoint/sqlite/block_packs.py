@@ -16,8 +16,8 @@ from collections.abc import Collection, Sequence
 from hashlib import blake2b
 from typing import Final
 
+from ..compression import PLAIN, compressor, decompress
 from ..journal import DamagedStore, StoreFailed
-from ..snapshot.compression import PLAIN, compressor, decompress
 from ..snapshot.shared_blocks import PAGE, Segment, memory_file
 from .snapshot_files import refuse_shared, write_durably
 from .store_parts import Parts

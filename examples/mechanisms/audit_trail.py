@@ -11,7 +11,7 @@ from typing import ClassVar
 
 from holdfast.ftm.bricks.brick_messages import Done, Work
 from holdfast.ftm.bricks.bricks import After, Before, Brick
-from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
+from holdfast.ftm.model.mechanism import Mechanism, Role
 
 
 def write(brick: Brick, lines: list[str]) -> None:

@@ -20,7 +20,7 @@ from ...checkpoint.protocol import (
     TurnEnd,
     Unsaved,
 )
-from ..replica.state_images import Image, Patch
+from .state_images import Image, Patch
 
 
 class StaleEpoch(Refusal):

@@ -27,8 +27,8 @@ from .letters import FOREVER as FOREVER
 from .peer_channel import Inbox, Posting
 
 if TYPE_CHECKING:
-    from ..mechanisms.mechanism import Mechanism
-    from ..replica.standing import Standing
+    from ..model.mechanism import Mechanism
+    from .standing import Standing
 
 R = TypeVar("R")
 

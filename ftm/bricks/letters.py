@@ -11,13 +11,13 @@ from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal, message_name
 from ...actors.kernel.ref import ActorRef
 from ...checkpoint.protocol import pieces
-from ..replica.standing import PeerLost
 from .brick_messages import NotFollowing, StaleEpoch
 from .sealed_frames import Back, Call, LinkLost, Part, Refused, Sealed
+from .standing import PeerLost
 
 if TYPE_CHECKING:
-    from ..replica.standing import Standing
     from .sealed_frames import SecuredLink
+    from .standing import Standing
 
 
 FOREVER = 10.0 * 86400.0

@@ -19,15 +19,15 @@ from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal, message_name
 from ...checkpoint.protocol import pieces
-from ..replica.standing import PeerLost
 from .brick_messages import ConfigMismatch, NotFollowing, StaleEpoch
 from .letters import FOREVER, LETTER_BYTES, SEALED, Letter, Letters, Sheet
 from .sealed_frames import Part, Refused
+from .standing import PeerLost
 
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
-    from ..replica.standing import Standing
     from .sealed_frames import SecuredLink
+    from .standing import Standing
 
 R = TypeVar("R")
 

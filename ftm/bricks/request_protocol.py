@@ -22,23 +22,6 @@ from ...actors.kernel.message import Message, message_name
 from ...checkpoint.protocol import DROPPED, Answer, TurnEnd
 from ..alarms import RequestsDropped
 from ..group.behind import is_still_due
-from ..replica.replica_orders import (
-    Abort,
-    Commit,
-    Computes,
-    Doing,
-    EndTurn,
-    Export,
-    Finish,
-    Install,
-    Join,
-    Peer,
-    Prepare,
-    Quiesce,
-    Rehearse,
-    Stand,
-)
-from ..replica.state_images import image_from
 from .brick_messages import (
     MOST_REQUESTS,
     CannotLead,
@@ -59,13 +42,30 @@ from .brick_messages import (
 )
 from .bricks import FOREVER, Brick, Flush, Proceed, Settle
 from .peer_channel import Where
+from .replica_orders import (
+    Abort,
+    Commit,
+    Computes,
+    Doing,
+    EndTurn,
+    Export,
+    Finish,
+    Install,
+    Join,
+    Peer,
+    Prepare,
+    Quiesce,
+    Rehearse,
+    Stand,
+)
 from .sealed_frames import Opened, Refused
+from .state_images import image_from
 from .state_transfer import Assume, Play, Transfer
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
-    from ..mechanisms.mechanism import Mechanism
-    from ..replica.standing import Standing
+    from ..model.mechanism import Mechanism
+    from .standing import Standing
 
 
 CANARY = -1

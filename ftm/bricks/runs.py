@@ -24,14 +24,14 @@ from ...checkpoint.protocol import AWAITED, CRASH, DROPPED, FAILED, Answer, Outc
 from ...supervision.spec import child
 from ..replica.protected_actor import Server
 from ..replica.replica_life import ServerLife
+from ..votes.canonical import canonical, end_form
+from ..votes.voters import Agreed, AnyVoter, Undecided, _decide
 from .brick_messages import Beside, Done, Request, State, Work
 from .bricks import After, Before
-from .canonical import canonical, end_form
-from .voters import Agreed, AnyVoter, Undecided, _decide
 
 if TYPE_CHECKING:
-    from ..replica.standing import Standing
-    from ..replica.state_images import Image
+    from .standing import Standing
+    from .state_images import Image
 
 _NUMBERS: Final = itertools.count(1)
 MOST_INPUTS: Final = 4096

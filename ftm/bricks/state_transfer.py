@@ -17,11 +17,11 @@ from ...actors.kernel.bindings import Binding
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message
 from ...checkpoint.snapshot.key_variables import save_state
-from ..replica.replica_orders import Export, Exported, Join, Peer
-from ..replica.standing import PeerLost
 from .brick_messages import CannotJoin, ConfigMismatch, Done, Logged, StaleEpoch, State, Strayed
 from .bricks import FOREVER, Abandon, Brick, Flush
+from .replica_orders import Export, Exported, Join, Peer
 from .sealed_gate import Gate
+from .standing import PeerLost
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor

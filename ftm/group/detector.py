@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, ClassVar
 from ...actors.errors import SpecError
 from ...actors.kernel.actor import Actor, on
 from ...actors.observer_clock import OwnClock
-from ..replica.replica_orders import Beat, Broken
+from ..bricks.replica_orders import Beat, Broken
 from .membership import is_within
 
 if TYPE_CHECKING:

@@ -17,9 +17,9 @@ from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import RUNNING
 from ...actors.process.process_host import ProcessHost
 from ..bricks.brick_messages import Lead
+from ..bricks.replica_orders import Commit, Peer, Prepare
 from ..bricks.sealed_frames import Refused
 from ..events import FailedOver
-from ..replica.replica_orders import Commit, Peer, Prepare
 from .group import Look
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import msgspec
 
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
-from ...checkpoint.home.inputs import EXPIRED, Batch
+from ...checkpoint.inputs import EXPIRED, Batch
 from ...checkpoint.protocol import (
     DROPPED,
     FAILED,

@@ -26,9 +26,9 @@ from ...supervision.respec import replace_mechanism, respec
 from ...supervision.spec import ChildSpec, Flags, child
 from ...supervision.supervisor import Supervisor
 from ..bricks.brick_messages import Lead
+from ..bricks.replica_orders import Finish, Install, Setting
 from ..events import ReplicaLost
-from ..mechanisms.mechanism import NOTHING, compose
-from ..replica.replica_orders import Finish, Install, Setting
+from ..model.mechanism import NOTHING, compose
 from .detector import Detection, Detector
 from .failover import FailoverManager, why_ended
 from .group import Group, Look
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import TurnEnd
     from ...checkpoint.snapshot.snapshot_record import Meta
-    from ..mechanisms.mechanism import Mechanism
+    from ..model.mechanism import Mechanism
 
 LED_WITHIN = 60.0
 """Seconds that the first replica may take to take up its state."""

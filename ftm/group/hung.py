@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError
 from ...checkpoint.protocol import FAILED
+from ..bricks.replica_orders import EndTurn, Stalled
 from ..events import TurnHung
-from ..replica.replica_orders import EndTurn, Stalled
 
 if TYPE_CHECKING:
     import asyncio

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.actor import Actor, on
 from ..bricks.brick_messages import ConfigMismatch, Follow
+from ..bricks.replica_orders import Join
 from ..bricks.sealed_frames import Refused
 from ..events import ReplicaJoined
-from ..replica.replica_orders import Join
 from .failover import bury
 from .group import Look
 

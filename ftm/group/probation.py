@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Final
 from ...actors.errors import HoldfastError
 from ...actors.kernel.message import message_name
 from ..bricks.brick_messages import RequestDropped
+from ..bricks.replica_orders import Computes, Doing
 from ..events import MechanismSettled
-from ..mechanisms.mechanism import NOTHING
-from ..replica.replica_orders import Computes, Doing
+from ..model.mechanism import NOTHING
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from ...checkpoint.protocol import TurnEnd
-    from ..mechanisms.mechanism import Mechanism
+    from ..model.mechanism import Mechanism
     from .group import Group
     from .reconfiguration import Reconfiguration
 

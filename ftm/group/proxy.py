@@ -9,8 +9,8 @@ from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.message import Message, message_name
 from ..bricks.brick_messages import Done, Outward
+from ..bricks.replica_orders import Stalled
 from ..bricks.sealed_frames import Agree, Back, Call, Greet, Refused, Sealed
-from ..replica.replica_orders import Stalled
 from .group import Flush
 from .membership import is_within
 

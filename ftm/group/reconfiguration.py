@@ -24,7 +24,7 @@ from ...actors.kernel.message import Message
 from ...supervision.admin import AlreadyPresent, DeleteChild, StartChild, TerminateChild
 from ...supervision.spec import ChildSpec
 from ..bricks.brick_messages import ConfigMismatch, StaleEpoch
-from ..replica.replica_orders import Abort, Commit, Prepare, Quiesce, Stand
+from ..bricks.replica_orders import Abort, Commit, Prepare, Quiesce, Stand
 from .failover import bury
 from .group import Look
 from .trial import TRIAL, TrialFailed, tried, until_given_up
@@ -32,7 +32,7 @@ from .trial import ended as ended_trial
 
 if TYPE_CHECKING:
     from ..bricks.sealed_frames import SecuredLink
-    from ..mechanisms.mechanism import Mechanism
+    from ..model.mechanism import Mechanism
     from .group import Group
 
 PREPARED_WITHIN = 30.0

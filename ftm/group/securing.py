@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from ...actors.kernel.node import Node
     from ..bricks.sealed_frames import Reach, SecuredLink
-    from ..mechanisms.mechanism import Mechanism
+    from ..model.mechanism import Mechanism
 
 
 class Securing:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.cell import Cell
 from ...supervision.admin import DeleteChild, StartChild, TerminateChild
-from ..replica.replica_orders import Rehearse
+from ..bricks.replica_orders import Rehearse
 from .failover import killed, why_ended
 
 if TYPE_CHECKING:

@@ -21,11 +21,11 @@ from typing import Any, ClassVar
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
-from ..bricks.assertions import Assertion, AssertionFailed, Inspector, names_of
 from ..bricks.brick_messages import Request, State
 from ..bricks.runs import Deciding, Run, plain
 from ..bricks.shadow_runs import Compute, Helping
-from .mechanism import Mechanism, MechanismRefused, Role
+from ..model.mechanism import Mechanism, MechanismRefused, Role
+from ..votes.assertions import Assertion, AssertionFailed, Inspector, names_of
 
 
 class Assisting(Helping):

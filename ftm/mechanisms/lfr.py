@@ -28,9 +28,9 @@ from ..alarms import Diverged, NondeterminismFound, ProtectionLost, StatesDiffer
 from ..bricks.brick_messages import FORWARDED, Done, Request, State, Work
 from ..bricks.bricks import After, Before, Brick, Proceed
 from ..bricks.runs import Missing, Shadow, digest_of_state
+from ..bricks.standing import PeerLost
 from ..bricks.state_transfer import GoneAstray
-from ..replica.standing import PeerLost
-from .mechanism import Mechanism, Role
+from ..model.mechanism import Mechanism, Role
 
 RUNS_AGAIN = 3
 """How often what has differed is computed again."""

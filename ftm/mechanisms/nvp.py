@@ -21,13 +21,13 @@ import msgspec
 from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor
 from ..alarms import Masked
-from ..bricks.assertions import names_of
 from ..bricks.brick_messages import Request, State
 from ..bricks.runs import Deciding, Remembering, Run, Shadow, turns_of, vote
-from ..bricks.versions import version
-from ..bricks.voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided
 from ..model.declaration import Cost
-from .mechanism import Mechanism, Role
+from ..model.mechanism import Mechanism, Role
+from ..votes.assertions import names_of
+from ..votes.versions import version
+from ..votes.voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided
 from .rb import protected_class
 
 MAJORITY = Majority()
@@ -122,6 +122,6 @@ def voter_of(value: Any) -> Any:
     except msgspec.ValidationError as error:
         raise ValueError(f"{value!r} is no voter: {error}") from error
     if isinstance(made, type) or not hasattr(made, "vote"):
-        known = "Exact(), Majority(), Tolerance(...), Median() or custom(function) of holdfast.ftm.bricks.voters"
+        known = "Exact(), Majority(), Tolerance(...), Median() or custom(function) of holdfast.ftm.votes.voters"
         raise ValueError(f"a voter is one such as {known}, not {made!r}")
     return made

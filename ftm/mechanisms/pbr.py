@@ -19,9 +19,9 @@ from ...actors.kernel.message import Message
 from ..alarms import ProtectionLost
 from ..bricks.brick_messages import Change, Done, Logged, State
 from ..bricks.bricks import FOREVER, After
-from ..replica.standing import PeerLost
+from ..bricks.standing import PeerLost
+from ..model.mechanism import Mechanism, Role
 from ..replica.state_manager import MISFIT, Apply, Capture
-from .mechanism import Mechanism, Role
 
 
 class Checkpoint(Message[int]):

@@ -18,11 +18,11 @@ from typing import Any, ClassVar
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ..alarms import Objected
-from ..bricks.assertions import Assertion, Inspector, names_of
 from ..bricks.brick_messages import Request, State
 from ..bricks.runs import Deciding, Missing, Remembering, Run, Shadow
-from ..bricks.versions import version
-from .mechanism import Mechanism, MechanismRefused, Role
+from ..model.mechanism import Mechanism, MechanismRefused, Role
+from ..votes.assertions import Assertion, Inspector, names_of
+from ..votes.versions import version
 
 
 class NotAccepted(HoldfastError, text="{actor}: {why}"):

@@ -46,7 +46,7 @@ from ..bricks.sealed_frames import (
     encode_reply,
     tell_over,
 )
-from .mechanism import Mechanism, MechanismRefused, Role
+from ..model.mechanism import Mechanism, MechanismRefused, Role
 
 if TYPE_CHECKING:
     from ...actors.kernel.message import Message

@@ -27,10 +27,10 @@ from ..alarms import Masked, Outvoted, ProtectionLost
 from ..bricks.brick_messages import Done, NotFollowing, Request, StaleEpoch, State, Strayed, is_marker
 from ..bricks.runs import Deciding, Digests, Run, turns_of, vote
 from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settled
-from ..bricks.voters import Majority, Median, NoMajority, Undecided
+from ..bricks.standing import PeerLost
 from ..model.declaration import Cost
-from ..replica.standing import PeerLost
-from .mechanism import Mechanism, Role
+from ..model.mechanism import Mechanism, Role
+from ..votes.voters import Majority, Median, NoMajority, Undecided
 from .nvp import voter_of
 
 MAJORITY = Majority()

@@ -21,9 +21,9 @@ from ...checkpoint.protocol import FAILED, Answer, TurnEnd
 from ..alarms import Masked
 from ..bricks.brick_messages import Done
 from ..bricks.bricks import FOREVER, After
-from ..bricks.voters import NoMajority
+from ..model.mechanism import Mechanism, Role
 from ..replica.state_manager import LastRun, Ran, RunAgain, Undo
-from .mechanism import Mechanism, Role
+from ..votes.voters import NoMajority
 
 
 def outcome(ran: Ran) -> tuple[Any, ...]:

@@ -28,10 +28,10 @@ from ...checkpoint.home.recorded_moves import Detached, RecordedArrival, refuse_
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK
 from ...checkpoint.snapshot.key_variables import restore_state
+from ..bricks.replica_orders import EXPORTED_WITHIN, Export
 from ..group.group_host import GroupHost
 from ..group.steering import AGAIN_AFTER
 from ..group.transient_homes import is_unkept
-from ..replica.replica_orders import EXPORTED_WITHIN, Export
 from .subtree_groups import SubtreeGroup
 
 if TYPE_CHECKING:

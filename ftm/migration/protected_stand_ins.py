@@ -39,7 +39,7 @@ from ...checkpoint.protocol import (
 )
 from ...supervision.respec import replace_mechanism
 from ..group.transient_homes import UNKEPT
-from ..mechanisms.mechanism import Description, compose, revive
+from ..model.mechanism import Description, compose, revive
 from ..replica.replica_life import NOWHERE
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from ...checkpoint.home.recorded_hosts import RemoteLife
 from ...checkpoint.home.recorded_moves import Detached, refuse_unsaved
 from ...checkpoint.protocol import Closed, Live, Protected, ToHome
 from ...supervision.respec import recipe_spec
-from ..mechanisms.mechanism import compose
+from ..model.mechanism import compose
 from .attach import ToGroup
 from .detach import ToRecordedTask
 from .subtree_groups import SubtreeGroup

@@ -27,8 +27,8 @@ from ...supervision.respec import recipe_spec
 from ..group.group_host import GroupHost
 from ..group.reconfiguration import REST_WITHIN, Reconfiguration
 from ..group.transient_homes import forget_later, is_unkept
-from ..mechanisms.mechanism import COMMON, Code, Description, Mechanism, MechanismRefused, revive
 from ..model.composition import check_stack, describe
+from ..model.mechanism import COMMON, Code, Description, Mechanism, MechanismRefused, revive
 
 if TYPE_CHECKING:
     from ...checkpoint.home.recorded_hosts import RemoteLife

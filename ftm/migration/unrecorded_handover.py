@@ -24,14 +24,14 @@ from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.wire.start_codec import pack_recipe
 from ...actors.process.worker_pool import Worker
 from ...checkpoint.home.capacity import HomeBound
+from ...checkpoint.home.held_messages import inlet
 from ...checkpoint.home.recorded_hosts import RemoteLife
 from ...checkpoint.home.subtree_homes import SubtreeHome, SubtreeHost
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import DOWN, EXIT, Closed, Live, Protected, ToHome, Wanted
-from ...checkpoint.recovery.held_messages import inlet
 from ...supervision.respec import recipe_spec
 from ..group.transient_homes import UNKEPT
-from ..mechanisms.mechanism import compose
+from ..model.mechanism import compose
 from .attach import ToGroup
 from .detach import ToPlainTask
 from .recorded_handover import settle_in, worker_of

@@ -9,18 +9,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ...actors.errors import type_name
 from ...actors.kernel.message import message_name
-from ..mechanisms.mechanism import (
-    Description,
-    Mechanism,
-    MechanismRefused,
-    Part,
-    Role,
-    compose,
-    find,
-    load,
-    load_module,
-)
 from .declaration import BadDeclaration, Entry
+from .mechanism import Description, Mechanism, MechanismRefused, Part, Role, compose, find, load, load_module
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor

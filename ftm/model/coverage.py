@@ -15,7 +15,7 @@ from .declaration import FAULTS, NEEDS, Entry, Mechanisms
 
 def built_in_mechanisms() -> Mechanisms:
     """The declarations of the mechanisms that come with the package. They are imported only here: they bring bricks."""
-    mechanism = import_module("..mechanisms.mechanism", __package__)
+    mechanism = import_module(".mechanism", __package__)
     return [mechanism.find(name) for name in mechanism.BUILT_IN]
 
 

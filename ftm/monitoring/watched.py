@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import SpecError
 from ...actors.kernel.node import cell_kind
-from ..mechanisms.mechanism import compose
 from ..model.application import Application
 from ..model.composition import layers_of
+from ..model.mechanism import compose
 from .judge import Judge, Settings
 from .monitor import Adapt, Watch
 
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
-    from ..mechanisms.mechanism import Mechanism
     from ..model.change_model import Resources
+    from ..model.mechanism import Mechanism
 
 PLAIN = ("pbr", "lfr", "tmr", "tr")
 """Mechanisms that need nothing but the actor itself."""

@@ -9,13 +9,13 @@ from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.message import Message
 from ...checkpoint.protocol import START
+from ..bricks.replica_orders import Beat, Stalled
 from ..bricks.sealed_frames import tell_over
 from .replica_life import ServerLife
-from .replica_orders import Beat, Stalled
 
 if TYPE_CHECKING:
+    from ..bricks.standing import Standing
     from .rewind_points import Points
-    from .standing import Standing
 
 
 class Tick(Message):

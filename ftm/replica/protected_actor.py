@@ -40,7 +40,7 @@ from ...checkpoint.protocol import (
     Unsaved,
 )
 from ..bricks.brick_messages import Request, State
-from ..mechanisms.mechanism import has_state_access
+from ..model.mechanism import has_state_access
 from .replica_life import BLOCKED, ENDED, OVER, UNDONE, ServerLife
 from .replica_reports import Reports
 

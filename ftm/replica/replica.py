@@ -28,14 +28,14 @@ from ...supervision.spec import Flags, Plan, child
 from ...supervision.supervisor import Supervisor
 from ..bricks.brick_messages import FORWARDED, Work
 from ..bricks.bricks import FOREVER, After, Before, Brick, Flush, Proceed, Settle
+from ..bricks.replica_orders import Abort, Broken, Commit, Prepare, Setting
 from ..bricks.request_protocol import InnerProtocol, RequestProtocol
 from ..bricks.sealed_frames import Opened, Refused
+from ..bricks.standing import Standing
 from ..bricks.state_transfer import Assume, Play
-from ..mechanisms.mechanism import Description, Mechanism, MechanismRefused, revive
+from ..model.mechanism import Description, Mechanism, MechanismRefused, revive
 from .heartbeat import Heart
 from .protected_actor import Server
-from .replica_orders import Abort, Broken, Commit, Prepare, Setting
-from .standing import Standing
 from .state_manager import StateManager
 
 SERVER, STATE, BEAT, PROTOCOL = "server", "state", "beat", "protocol"

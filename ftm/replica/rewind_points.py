@@ -26,13 +26,13 @@ from ...checkpoint.method import Method
 from ...checkpoint.protocol import FAILED, Feed, Go, Live, Out, Outcome, Released, Restore, TurnEnd
 from ...checkpoint.snapshot.key_variables import key_names, put_back, state_of, variables
 from ..bricks.brick_messages import Beside, Change, Request, State, WorkLost
+from ..bricks.state_images import BLOCK, Images, Misfit
+from ..bricks.state_images import patch as make_patch
 from .replica_life import ENDED, NOWHERE, OVER, BeginAgain, PartOver, ServerLife, Skip
-from .state_images import BLOCK, Images, Misfit
-from .state_images import patch as make_patch
 
 if TYPE_CHECKING:
+    from ..bricks.standing import Standing
     from .protected_actor import Server
-    from .standing import Standing
 
 COMPACT_BYTES: Final = 64 * 1024
 """Deltas that are larger than the state they belong to, and than this, are replaced by a whole state."""

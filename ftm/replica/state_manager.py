@@ -12,10 +12,10 @@ from ...actors.kernel.bindings import Binding
 from ...actors.kernel.message import Message
 from ...checkpoint.protocol import TurnEnd
 from ..bricks.brick_messages import Change, State
-from .state_images import Misfit
+from ..bricks.state_images import Misfit
 
 if TYPE_CHECKING:
-    from .standing import Standing
+    from ..bricks.standing import Standing
 
 MISFIT: Final = -3
 """In place of a turn: these differences do not fit; all of it is wanted."""

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from ...actors.errors import ActorStopped, HoldfastError
 from ...actors.kernel.message import Message
 from ..bricks.sealed_frames import FrameRefused
-from ..mechanisms.mechanism import MechanismRefused
+from ..model.mechanism import MechanismRefused
 from .authority import Enrol, GetCertificate, GetRevocations, GetRoot, Revoke
 from .certificates import MOST_NAME, Trust, about, make_request, public_of
 from .handshake import Participant

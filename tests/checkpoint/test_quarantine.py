@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.home.inputs import Batch
+from holdfast.checkpoint.inputs import Batch
 from tests.checkpoint.players import Do, Doer, Note, Seen, Sink, start
 
 RECOVERY = hf.hybrid(interval=1000.0, max_deliveries=2)

@@ -284,7 +284,7 @@ CHECKS = {
         "test_what_a_killed_life_says and memory",
     ),
     "S2: no more is held than the policy says": Check(
-        "checkpoint/recovery/held_messages.py",
+        "checkpoint/home/held_messages.py",
         "self._count(topic) >= rule.capacity:\n            match",
         "False:\n            match",
         "tests/checkpoint/test_controller_held.py",
@@ -319,7 +319,7 @@ CHECKS = {
         "test_hooks_are_called_in_order and task",
     ),
     "S4: who waits for room is let in behind what was held": Check(
-        "checkpoint/recovery/held_messages.py",
+        "checkpoint/home/held_messages.py",
         "        while self._waiting:\n            ask",
         "        while False:\n            ask",
         "tests/checkpoint/test_controller_held.py",

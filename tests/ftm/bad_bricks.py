@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 import holdfast as hf
 from holdfast.ftm.bricks.brick_messages import Done, Work
 from holdfast.ftm.bricks.bricks import After, Before, Proceed
-from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
-from holdfast.ftm.replica.standing import PeerLost
+from holdfast.ftm.bricks.standing import PeerLost
+from holdfast.ftm.model.mechanism import Mechanism, Role
 
 HOWS = ("hang", "raise", "exit", "allocate", "block", "garbage", "swallow")
 WHENS = ("init", "start", "message", "peer")

@@ -25,7 +25,7 @@ from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group import group_host
 from holdfast.ftm.group.detector import Detection
 from holdfast.ftm.group.group import Group, Look
-from holdfast.ftm.mechanisms.mechanism import Mechanism
+from holdfast.ftm.model.mechanism import Mechanism
 from tests.ftm.faults import FRAMES, KINDS, LATE, VALUES, claims
 from tests.ftm.injection import READ, REQUEST, Fault, Page, recipe, unwrap, wrap_root
 from tests.ftm.stacks import enrolling

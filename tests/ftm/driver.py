@@ -25,9 +25,9 @@ from holdfast.checkpoint.protocol import (
     TurnEnd,
 )
 from holdfast.ftm.bricks.brick_messages import Done, Ended, Follow, Inward, Lead, Outward, Request, Strayed, Work
-from holdfast.ftm.mechanisms.mechanism import Mechanism
+from holdfast.ftm.bricks.replica_orders import Beat, Install, Join, Peer, Setting
+from holdfast.ftm.model.mechanism import Mechanism
 from holdfast.ftm.replica.replica import Replica
-from holdfast.ftm.replica.replica_orders import Beat, Install, Join, Peer, Setting
 
 ADDRESS = "/app/x"
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from holdfast.ftm.mechanisms.mechanism import Mechanism
+from holdfast.ftm.model.mechanism import Mechanism
 from holdfast.ftm.replica.replica import nested
 from tests.ftm.injection import READ, REQUEST, Fault
 

@@ -10,7 +10,7 @@ import msgspec
 from holdfast.checkpoint.protocol import MESSAGE, OK, REPLY, Answer, TurnEnd
 from holdfast.ftm.bricks.brick_messages import Request, Work
 from holdfast.ftm.bricks.bricks import Before
-from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
+from holdfast.ftm.model.mechanism import Mechanism, Role
 
 
 class Striking(Before):

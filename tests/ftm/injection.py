@@ -27,15 +27,15 @@ from holdfast.checkpoint.protocol import OK, REPLY, Answer, TurnEnd
 from holdfast.ftm.bricks.brick_messages import Done, Follow, Lead, Work
 from holdfast.ftm.bricks.bricks import Brick
 from holdfast.ftm.bricks.letters import Letter
+from holdfast.ftm.bricks.replica_orders import Peer
 from holdfast.ftm.bricks.sealed_frames import Sealed
 from holdfast.ftm.group.detector import Detector
 from holdfast.ftm.group.failover import FailoverManager
 from holdfast.ftm.group.join import Joiner
 from holdfast.ftm.group.proxy import Proxy
-from holdfast.ftm.mechanisms.mechanism import BUILT_IN, find
+from holdfast.ftm.model.mechanism import BUILT_IN, find
 from holdfast.ftm.replica.heartbeat import Heart
 from holdfast.ftm.replica.replica import Replica
-from holdfast.ftm.replica.replica_orders import Peer
 from holdfast.ftm.replica.state_manager import StateManager
 from tests.ftm.accounts import Bank, Counter
 from tests.ftm.stacks import HUGE

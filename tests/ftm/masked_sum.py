@@ -7,7 +7,7 @@ from typing import ClassVar
 
 from holdfast.ftm.bricks.brick_messages import Done, Work
 from holdfast.ftm.bricks.bricks import After, Before
-from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
+from holdfast.ftm.model.mechanism import Mechanism, Role
 
 SEEN: list[str] = []
 

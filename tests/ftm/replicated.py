@@ -9,8 +9,8 @@ from typing import Any
 
 import holdfast as hf
 from holdfast.checkpoint.protocol import OK, REPLY, Answer
+from holdfast.ftm.bricks.replica_orders import Peer
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.replica.replica_orders import Peer
 from tests.ftm.driver import Driver
 
 

@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 
 from holdfast.actors.errors import HoldfastError
 from holdfast.ftm.alarms import Objected
-from holdfast.ftm.bricks.assertions import AssertionFailed, Inspector, names_of
 from holdfast.ftm.bricks.brick_messages import Request, State
 from holdfast.ftm.bricks.runs import Deciding, Remembering, Run
-from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
+from holdfast.ftm.model.mechanism import Mechanism, Role
+from holdfast.ftm.votes.assertions import AssertionFailed, Inspector, names_of
 
 
 class Checking(Deciding):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import holdfast as hf
-from holdfast.ftm.mechanisms.mechanism import load
+from holdfast.ftm.model.mechanism import load
 from tests.ftm.accounts import Add, Bank, Put, Transfer
 from tests.ftm.store import Cas, Look, Store, Write
 from tests.ftm.versions import OtherCounter, SameCounter

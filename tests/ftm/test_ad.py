@@ -13,13 +13,13 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import Diverged, Objected
-from holdfast.ftm.bricks.assertions import AssertionFailed
+from holdfast.ftm.bricks.replica_orders import Peer
 from holdfast.ftm.mechanisms.ad import AD
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused, find, load, revive
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.replica.replica_orders import Peer
+from holdfast.ftm.model.mechanism import MechanismRefused, find, load, revive
+from holdfast.ftm.votes.assertions import AssertionFailed
 from tests.ftm import versions
 from tests.ftm.accounts import Account, Bank, Counter, Load, Put, Tags, Transfer
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Say, Total, pair

@@ -16,9 +16,9 @@ from holdfast.ftm.bricks.bricks import After
 from holdfast.ftm.events import MechanismChanged
 from holdfast.ftm.group.reconfiguration import CannotAdapt
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpointing
 from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.model.mechanism import MechanismRefused
 from tests.ftm.accounts import Account, Add, Bank, Closed, Counter, Load, Put, Tags, Total, Transfer
 from tests.ftm.test_failover import METHODS, group_of, other, pid_of, two_again
 

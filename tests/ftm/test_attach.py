@@ -20,8 +20,8 @@ from holdfast.ftm.events import MechanismAttached, MechanismDetached
 from holdfast.ftm.group.failover import FailoverManager
 from holdfast.ftm.group.group_host import GroupHost
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import Mechanism, MechanismRefused, Role
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.model.mechanism import Mechanism, MechanismRefused, Role
 from tests.ftm.accounts import Account, Add, Closed, Counter, Fussy, Later, Load, Pay, Purse, Tags, Total
 from tests.ftm.test_failover import METHODS, group_of, pid_of, two_again
 

@@ -12,7 +12,7 @@ import holdfast as hf
 from holdfast.ftm.alarms import RequestsDropped
 from holdfast.ftm.bricks.brick_messages import Done, RequestDropped, Work
 from holdfast.ftm.bricks.bricks import After, Before
-from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
+from holdfast.ftm.model.mechanism import Mechanism, Role
 from tests.ftm.accounts import Add, Counter, Tags
 
 REFUSED, ANSWERED, DROPPED = -1, -2, -3

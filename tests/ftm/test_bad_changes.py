@@ -18,11 +18,11 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.bricks.brick_messages import Work
 from holdfast.ftm.bricks.bricks import Before
+from holdfast.ftm.bricks.replica_orders import Computes
 from holdfast.ftm.events import MechanismSettled
 from holdfast.ftm.group import probation
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.replica.replica_orders import Computes
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.bad_bricks import HOWS, PARTS, WHENS, Wrong, WrongProceed
 from tests.ftm.test_adaptation import stack

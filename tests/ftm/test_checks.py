@@ -15,12 +15,12 @@ import holdfast as hf
 from holdfast.checkpoint.protocol import DROPPED, OK, REPLY, Answer, Outcome, TurnEnd
 from holdfast.ftm.bricks.brick_messages import Change, Done, NotFollowing, ReplyEvicted, Request, State, Work
 from holdfast.ftm.bricks.letters import Letter
+from holdfast.ftm.bricks.replica_orders import Broken
 from holdfast.ftm.bricks.reply_log import ReplyLog
 from holdfast.ftm.group.group_host import GroupHost
 from holdfast.ftm.group.proxy import Settle
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
-from holdfast.ftm.replica.replica_orders import Broken
 from holdfast.ftm.replica.rewind_points import checksum
 from holdfast.ftm.replica.state_manager import MISFIT, Apply
 from tests.ftm import accounts

@@ -11,7 +11,7 @@ from holdfast.actors.values import encode_value
 from holdfast.ftm.alarms import ProtectionCostly
 from holdfast.ftm.bricks.brick_messages import State
 from holdfast.ftm.bricks.runs import Digests, digest_of_state
-from holdfast.ftm.replica.state_images import image_from
+from holdfast.ftm.bricks.state_images import image_from
 from tests.ftm.replicated import Add
 
 MEGABYTES = 64

@@ -17,11 +17,11 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.actors.kernel.actor import Start
 from holdfast.actors.observer_clock import OwnClock
+from holdfast.ftm.bricks.replica_orders import Beat
 from holdfast.ftm.group.detector import HIGHEST, Accrual, Detection, Detector
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.replica.replica_orders import Beat
 from tests.ftm.accounts import Add, Counter
 from tests.ftm.test_failover import group_of, pid_of, two_again
 

@@ -21,10 +21,10 @@ import pytest
 import holdfast as hf
 import holdfast.ftm
 from holdfast.console.endpoint import control_endpoint
-from holdfast.ftm.mechanisms.mechanism import BUILT_IN, MechanismRefused, find, load
 from holdfast.ftm.model.change_model import label
 from holdfast.ftm.model.coverage import coverage, selection_table
 from holdfast.ftm.model.declaration import FAULTS, NEEDS
+from holdfast.ftm.model.mechanism import BUILT_IN, MechanismRefused, find, load
 from holdfast.ftm.sec import sec_errors as sec_errors
 from tests.ftm.accounts import Add, Closed, Counter, Load, Tags
 

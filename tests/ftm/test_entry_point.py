@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.mechanisms.mechanism import ENTRY_POINTS, MechanismRefused, find
+from holdfast.ftm.model.mechanism import ENTRY_POINTS, MechanismRefused, find
 from tests.ftm.accounts import Add, Counter, Tags
 
 MODULE = "mechanisms_of_somebody"

@@ -14,8 +14,8 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import FailedOver
-from holdfast.ftm.mechanisms.mechanism import Role
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.model.mechanism import Role
 from tests.ftm.accounts import Add, Boom, Counter, Tags, Total
 from tests.ftm.test_failover import group_of, pid_of, started
 

@@ -27,10 +27,10 @@ from holdfast.diagnosis.repair import (
 )
 from holdfast.diagnosis.repair.executor import Executor, Result
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import find
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.model.application import Application
 from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.model.mechanism import find
 from holdfast.ftm.monitoring.adaptations import AdaptationDecided, AdaptationHeld
 from holdfast.ftm.monitoring.judge import Judge, Settings
 from holdfast.ftm.monitoring.monitor import MonitoringEngine, Observe, Watch

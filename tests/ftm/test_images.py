@@ -15,11 +15,11 @@ from holdfast.actors.errors import DamagedValue
 from holdfast.actors.values import encode_value
 from holdfast.ftm.alarms import Masked
 from holdfast.ftm.bricks.brick_messages import Change, State
+from holdfast.ftm.bricks.entry_rows import Rows
+from holdfast.ftm.bricks.state_images import BLOCK, Image, Misfit, Patch, cut, image_from, patch
 from holdfast.ftm.mechanisms.pbr import Checkpoint
 from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.replica import rewind_points
-from holdfast.ftm.replica.entry_rows import Rows
-from holdfast.ftm.replica.state_images import BLOCK, Image, Misfit, Patch, cut, image_from, patch
 from tests.ftm.replicated import pair
 from tests.ftm.test_failover import group_of, pid_of, two_again
 from tests.ftm.warehouse import KINDS, Break, Ledger, Resize, Sum, Touch, Warehouse

@@ -12,7 +12,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.events import ReplicaJoined
-from holdfast.ftm.mechanisms.mechanism import COMMON
+from holdfast.ftm.model.mechanism import COMMON
 from tests.ftm.accounts import Add, Counter, Tags
 
 STACKS = {

@@ -11,10 +11,10 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.alarms import Diverged
 from holdfast.ftm.bricks.brick_messages import CannotJoin, CannotLead
+from holdfast.ftm.bricks.replica_orders import Peer
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.replica.replica_orders import Peer
+from holdfast.ftm.model.mechanism import MechanismRefused
 from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Guess, Put, Read, Say, Total, kills_of_two, pair
 from tests.ftm.versions import FAULTY
 

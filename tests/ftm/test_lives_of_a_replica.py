@@ -12,9 +12,9 @@ import holdfast as hf
 from holdfast.actors.kernel.message import message_name
 from holdfast.checkpoint.protocol import MESSAGE, Feed, TurnEnd
 from holdfast.ftm.bricks.brick_messages import Request
+from holdfast.ftm.bricks.standing import Standing
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.replica.protected_actor import Server
-from holdfast.ftm.replica.standing import Standing
 from tests.ftm.accounts import Add, Counter
 
 

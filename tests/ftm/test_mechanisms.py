@@ -10,8 +10,12 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.bricks.bricks import After
+from holdfast.ftm.bricks.replica_orders import Abort, Commit, Prepare
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import (
+from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.model.composition import check_stack
+from holdfast.ftm.model.mechanism import (
     BUILT_IN,
     Description,
     Mechanism,
@@ -21,11 +25,7 @@ from holdfast.ftm.mechanisms.mechanism import (
     load,
     revive,
 )
-from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.model.composition import check_stack
 from holdfast.ftm.replica.replica import weave
-from holdfast.ftm.replica.replica_orders import Abort, Commit, Prepare
 from tests.ftm import versions
 from tests.ftm.driver import Driver
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Total, pair

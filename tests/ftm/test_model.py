@@ -460,7 +460,7 @@ def test_the_selection_table_says_none_where_nothing_is_valid() -> None:
 
 
 def test_the_built_in_mechanisms_are_the_default() -> None:
-    pytest.importorskip("holdfast.ftm.mechanisms.mechanism")
+    pytest.importorskip("holdfast.ftm.model.mechanism")
     names = [entry.name for entry in coverage().entries]
     assert {"pbr", "lfr", "tr"} <= set(names)
     assert select(Faults.of("crash"), GOOD, Resources(units=2)).best is not None

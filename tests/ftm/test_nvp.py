@@ -8,10 +8,10 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import Masked
-from holdfast.ftm.bricks.voters import Exact, Majority, Median, NoMajority, Tolerance, custom
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused, find, revive
 from holdfast.ftm.mechanisms.nvp import NVP
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.model.mechanism import MechanismRefused, find, revive
+from holdfast.ftm.votes.voters import Exact, Majority, Median, NoMajority, Tolerance, custom
 from tests.ftm import versions
 from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Put, Read, Say, Total, pair
 from tests.ftm.versions import FAULTY

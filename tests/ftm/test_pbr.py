@@ -15,10 +15,10 @@ from holdfast.checkpoint.protocol import Closed as LifeClosed
 from holdfast.ftm.alarms import ProtectionLost
 from holdfast.ftm.bricks.brick_messages import ConfigMismatch, Done, Follow, Lead, Request, StaleEpoch, State, Work
 from holdfast.ftm.bricks.letters import Letter
+from holdfast.ftm.bricks.replica_orders import Export, Finish, Install, Join, Peer
 from holdfast.ftm.bricks.reply_log import ReplyLog
+from holdfast.ftm.bricks.state_images import image_from
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
-from holdfast.ftm.replica.replica_orders import Export, Finish, Install, Join, Peer
-from holdfast.ftm.replica.state_images import image_from
 from tests.ftm.replicated import (
     Add,
     Back,

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.replica.replica_orders import Export, Install
+from holdfast.ftm.bricks.replica_orders import Export, Install
 from tests.ftm.replicated import Add, Read, Total, pair
 
 

@@ -18,10 +18,10 @@ from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.events import MechanismSettled
 from holdfast.ftm.group import probation
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import Mechanism, Role
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR, Computing, Voting
 from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.model.mechanism import Mechanism, Role
 from holdfast.system.protection import AdaptationUndone
 from tests.ftm import probation_root
 from tests.ftm.accounts import Add, Counter, Load, Tags

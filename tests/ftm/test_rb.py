@@ -8,9 +8,9 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import Objected
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused, find, revive
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.rb import RB, NotAccepted
+from holdfast.ftm.model.mechanism import MechanismRefused, find, revive
 from tests.ftm import versions
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Read, Total, pair
 

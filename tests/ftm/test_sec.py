@@ -21,12 +21,12 @@ from holdfast.actors.kernel.codec import Parcel
 from holdfast.actors.process.stand_ins import Inner
 from holdfast.checkpoint.protocol import Closed
 from holdfast.ftm.bricks.brick_messages import Done, Follow, Lead, Work
+from holdfast.ftm.bricks.replica_orders import Export, Join, Peer
 from holdfast.ftm.bricks.sealed_frames import TELLS, Agree, Back, Call, Greet, LinkLost, Opened, Part, Refused, Sealed
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.sec import SEC
 from holdfast.ftm.mechanisms.tmr import TMR
+from holdfast.ftm.model.mechanism import MechanismRefused
 from holdfast.ftm.replica.replica import weave
-from holdfast.ftm.replica.replica_orders import Export, Join, Peer
 from holdfast.ftm.sec.authority import CertificationAuthority, Enrol, GetRoot
 from holdfast.ftm.sec.certificates import Trust, make_request
 from holdfast.ftm.sec.handshake import Participant

@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.bricks.replica_orders import Abort, Commit, Prepare, Stalled
 from holdfast.ftm.bricks.sealed_frames import Opened, Refused, Sealed
 from holdfast.ftm.bricks.state_transfer import Assume
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.replica.replica import EndBricks
-from holdfast.ftm.replica.replica_orders import Abort, Commit, Prepare, Stalled
 from tests.ftm.accounts import Add, Counter, Tags
 from tests.ftm.test_adaptation_trouble import fails, struck
 from tests.ftm.test_sec import CA, Tap, every, flip, group_of, joined

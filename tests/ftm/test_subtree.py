@@ -17,9 +17,9 @@ import pytest
 import holdfast as hf
 from holdfast.actors.exit_reasons import KILLED, pack_exit
 from holdfast.checkpoint.protocol import Closed
-from holdfast.ftm.mechanisms.mechanism import Code, Description, MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.migration.subtree_groups import SubtreeGroup, known
+from holdfast.ftm.model.mechanism import Code, Description, MechanismRefused
 from tests.ftm.accounts import Account, Add, Counter, Load, Pay, Purse, Tags
 from tests.ftm.test_failover import METHODS, SEED, group_of, pid_of, two_again
 

@@ -12,10 +12,10 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.alarms import Masked, Outvoted, ProtectionLost
-from holdfast.ftm.bricks.voters import Median, NoMajority
 from holdfast.ftm.events import FailedOver, ReplicaJoined
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused, find, revive
 from holdfast.ftm.mechanisms.tmr import TMR
+from holdfast.ftm.model.mechanism import MechanismRefused, find, revive
+from holdfast.ftm.votes.voters import Median, NoMajority
 from tests.ftm.accounts import Account, Bank, Counter, Load, Tags, Transfer
 from tests.ftm.accounts import Put as Pay
 from tests.ftm.replicated import Add, Back, Closed, Fail, Fetch, Put, Read, Say, Total, all_once, pair, traffic

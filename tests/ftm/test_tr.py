@@ -9,10 +9,10 @@ import pytest
 import holdfast as hf
 from holdfast.actors.errors import UnsavableValue
 from holdfast.ftm.alarms import Masked
-from holdfast.ftm.bricks.voters import NoMajority
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.model.mechanism import MechanismRefused
+from holdfast.ftm.votes.voters import NoMajority
 from tests.ftm.replicated import Add, Closed, Fail, Fetch, Large, Other, Read, Say, Spoil, Total, pair
 
 STRIKES: list[Any] = []

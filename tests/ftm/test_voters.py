@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.actors.kernel.codec import encode_special
 from holdfast.checkpoint.protocol import CRASH, OK, REFUSAL, REPLY, Answer, Out, TurnEnd
-from holdfast.ftm.bricks.canonical import ABSENT, canonical
-from holdfast.ftm.bricks.voters import (
+from holdfast.ftm.votes.canonical import ABSENT, canonical
+from holdfast.ftm.votes.voters import (
     Agreed,
     AnyVoter,
     Custom,

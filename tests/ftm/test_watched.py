@@ -9,10 +9,10 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.mechanisms.lfr import LFR
-from holdfast.ftm.mechanisms.mechanism import MechanismRefused
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.model.application import Application
 from holdfast.ftm.model.change_model import Faults, Resources
+from holdfast.ftm.model.mechanism import MechanismRefused
 from holdfast.ftm.monitoring.adaptations import AdaptationDone, AdaptationFailed
 from holdfast.ftm.monitoring.judge import Settings
 from holdfast.ftm.monitoring.monitor import MonitoringEngine, Observe, Report

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import holdfast as hf
-from holdfast.ftm.mechanisms.mechanism import load
+from holdfast.ftm.model.mechanism import load
 from tests.ftm.accounts import Add as Count
 from tests.ftm.accounts import Counter
 from tests.ftm.replicated import Add, Fetch, Total

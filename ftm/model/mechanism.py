@@ -37,7 +37,8 @@ FILES = "holdfast_mechanism_"
 """How the modules of mechanisms are called that were loaded from a file."""
 ENTRY_POINTS = "holdfast.mechanisms"
 BUILT_IN = ("pbr", "lfr", "tr", "ad", "rb", "nvp", "tmr", "sec")
-COMMON = tuple(f"{__package__}.{name}" for name in BUILT_IN if name != "sec")
+BUILT_IN_PACKAGE = f"{(__package__ or '').rpartition('.')[0]}.mechanisms"
+COMMON = tuple(f"{BUILT_IN_PACKAGE}.{name}" for name in BUILT_IN if name != "sec")
 """Modules that each replica has from its first moment; not that which needs an extra."""
 
 
@@ -260,7 +261,7 @@ def find(name: str) -> type[Mechanism]:
         MechanismRefused: there is none of that name, or it cannot be loaded.
     """
     if name in BUILT_IN:
-        return only(importlib.import_module(f"{__package__}.{name}"), name)
+        return only(importlib.import_module(f"{BUILT_IN_PACKAGE}.{name}"), name)
     from importlib.metadata import entry_points  # It takes longer to import than all of this package.
 
     for point in entry_points(group=ENTRY_POINTS, name=name):

@@ -15,15 +15,15 @@ from ...actors.events import HeldMessages
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.mailbox import Senders
 from ...actors.overflow import decide
-from ..home.inputs import Batch, Input
+from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
-from .settings import Held
+from ..recovery_settings import Held
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Host
     from ...actors.kernel.envelope import Ask
-    from ..home.capacity import HomeBound
-    from ..home.switch import Switch
+    from .capacity import HomeBound
+    from .switch import Switch
 
 
 class Holding:

@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING, Any, Literal
 from ...actors.errors import HoldfastError
 from ...checkpoint.protocol import TurnEnd
 from ..alarms import ProtectionCostly
-from ..bricks.brick_messages import FORWARDED, ConfigMismatch, Logged, Request, StaleEpoch
-from ..bricks.reply_log import ReplyLog
-from ..bricks.state_comparison import Looking
+from .brick_messages import FORWARDED, ConfigMismatch, Logged, Request, StaleEpoch
+from .reply_log import ReplyLog
+from .state_comparison import Looking
 
 if TYPE_CHECKING:
     from ...actors.kernel.message import Message
     from ...actors.kernel.node import Node
-    from ..bricks.peer_channel import Outbox
-    from ..bricks.sealed_frames import SecuredLink
-    from ..mechanisms.mechanism import Mechanism
-    from .protected_actor import Server
+    from ..model.mechanism import Mechanism
+    from ..replica.protected_actor import Server
+    from .peer_channel import Outbox
+    from .sealed_frames import SecuredLink
 
 COSTLY = 0.01
 """Seconds from which on it is told what going through the state takes."""

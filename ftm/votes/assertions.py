@@ -13,7 +13,7 @@ from typing import Any
 
 from ...actors.errors import HoldfastError, type_name
 from ...checkpoint.protocol import FAILED, MESSAGE, OK, REPLY, TurnEnd
-from ..mechanisms.mechanism import FILES, SCRIPTS
+from ..model.mechanism import FILES, SCRIPTS
 from ..replica.protected_actor import Server
 
 PARAMETERS = frozenset({"reply", "message", "state"})

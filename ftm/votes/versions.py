@@ -6,7 +6,7 @@ from typing import Any
 
 from ...actors.errors import type_name
 from ...actors.kernel.actor import Actor
-from ..mechanisms.mechanism import MechanismRefused, has_state_access
+from ..model.mechanism import MechanismRefused, has_state_access
 from .assertions import imported
 
 

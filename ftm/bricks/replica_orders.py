@@ -12,7 +12,7 @@ import msgspec
 
 from ...actors.kernel.message import Message
 from ...checkpoint.protocol import TurnEnd
-from ..mechanisms.mechanism import Description
+from ..model.mechanism import Description
 
 
 class Setting(msgspec.Struct, array_like=True, frozen=True):

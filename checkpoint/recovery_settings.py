@@ -8,10 +8,10 @@ from typing import Any, Literal, get_args
 
 import msgspec
 
-from ...actors.errors import SpecError, type_name
-from ...actors.kernel.codec import encode_special, unencodable
-from ...actors.kernel.message import Message, message_name
-from ...actors.overflow import Overflow, check
+from ..actors.errors import SpecError, type_name
+from ..actors.kernel.codec import encode_special, unencodable
+from ..actors.kernel.message import Message, message_name
+from ..actors.overflow import Overflow, check
 
 Phase = Literal["safe_state", "isolate", "restart", "restore", "replay", "release"]
 PHASES: tuple[Phase, ...] = get_args(Phase)

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, TypeAlias
 
 import msgspec
 
-from ...actors.errors import HoldfastError
-from ...actors.kernel.envelope import Ask
-from ..journal import Entry
-from ..protocol import TICK, Feed
+from ..actors.errors import HoldfastError
+from ..actors.kernel.envelope import Ask
+from .journal import Entry
+from .protocol import TICK, Feed
 
 if TYPE_CHECKING:
-    from ..group_commit import Commits, Unkept
+    from .group_commit import Commits, Unkept
 
 HomeJournal: TypeAlias = "Commits | Unkept"
 """What a home writes to."""

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from ..protocol import TICK, Answer, Clock, Out
 from .inputs import Batch, TimerState
+from .protocol import TICK, Answer, Clock, Out
 
 if TYPE_CHECKING:
-    from ..snapshot.snapshot_record import Meta
-    from .switch import Switch
+    from .home.switch import Switch
+    from .snapshot.snapshot_record import Meta
 
 Saved = tuple[str, bytes, float, float]
 """A timer in a snapshot: type name and body of its message, seconds left, interval."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ...actors.kernel import links
+from ..actors.kernel import links
 
 if TYPE_CHECKING:
-    from ...actors.kernel.cell import Cell
-    from .switch import Switch
+    from ..actors.kernel.cell import Cell
+    from .home.switch import Switch
 
 Tie = tuple[str, str]
 """What ("monitor", "watch" or "link"), and the other address."""
