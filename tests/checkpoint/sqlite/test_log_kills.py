@@ -20,8 +20,8 @@ EVERY = 1 if "HOLDFAST_CUTS" in os.environ else 3
 SERVER = """
 import ctypes, os, shutil, sys, traceback
 from contextlib import closing
-from holdfast.checkpoint.sqlite import SqliteJournal, log
-log.MOST_ROWS = 6
+from holdfast.checkpoint.sqlite import SqliteJournal, append_log
+append_log.MOST_ROWS = 6
 shim, folder = ctypes.CDLL(sys.argv[1]), sys.argv[2]
 steps_left = ctypes.c_long.in_dll(shim, "steps_left")
 

@@ -22,9 +22,9 @@ CUTS = int(os.environ.get("HOLDFAST_CUTS", "80"))
 
 WRITER = """
 import os, random, sys
-from holdfast.checkpoint.sqlite import SqliteJournal, log, store
+from holdfast.checkpoint.sqlite import SqliteJournal, append_log, open_store
 from holdfast.checkpoint.journal import StoreFailed
-store._CHECKPOINT_BYTES, store._WAL_FRAMES, log.MOST_ROWS = 1 << 16, 32, 12
+open_store._CHECKPOINT_BYTES, open_store._WAL_FRAMES, append_log.MOST_ROWS = 1 << 16, 32, 12
 folder, seed, syncs = sys.argv[1], int(sys.argv[2]), sys.argv[3] == "fsync"
 draw = random.Random(seed)
 journal = SqliteJournal(folder + "/app.db", takeover=True)
