@@ -285,8 +285,8 @@ CHECKS = {
     ),
     "S2: no more is held than the policy says": Check(
         "checkpoint/home/held_messages.py",
-        "self._count(topic) >= rule.capacity:\n            match",
-        "False:\n            match",
+        "self._count(topic) >= rule.capacity:\n            verdict",
+        "False:\n            verdict",
         "tests/checkpoint/test_controller_held.py",
         "test_tells_beyond_the_capacity and task",
     ),

@@ -400,6 +400,20 @@ CHECKS = {
         "tests/ftm/test_failover_turns.py",
         "test_nobody_waits_for_the_turn_in_hand",
     ),
+    "a word of a migration has an end": Check(
+        "actors/migration/words.py",
+        "        if self._size > MOST:\n",
+        "        if False:\n",
+        "tests/migration/test_words.py",
+        "without_an_end",
+    ),
+    "a word of an earlier attempt to migrate is void": Check(
+        "actors/process/worker_pool.py",
+        "        heard = self.movers.get(frame.attempt)\n",
+        "        heard = next(iter(self.movers.values()), None)\n",
+        "tests/migration/test_words.py",
+        "earlier_attempt",
+    ),
     "a message that kills is found out": Check(
         "ftm/group/group.py",
         "        return out.requests[0].feed.id\n",

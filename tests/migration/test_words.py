@@ -10,6 +10,7 @@ from holdfast.actors.migration import words
 from holdfast.actors.migration.words import Incoming, say
 from holdfast.actors.process.wire.connection import BadFrame
 from holdfast.actors.process.wire.frames import Migrate
+from holdfast.actors.process.worker_pool import Worker
 from holdfast.actors.values import encode_value
 
 
@@ -52,3 +53,13 @@ def test_a_word_without_an_end_is_refused(monkeypatch: pytest.MonkeyPatch) -> No
     assert [incoming.take(piece) for _ in range(2)] == [None, None]
     with pytest.raises(BadFrame, match="more than 25 bytes"):
         incoming.take(piece)
+
+
+def test_a_word_of_an_earlier_attempt_is_void() -> None:
+    """A worker that has been slow says that it has come to rest, and another attempt is under way."""
+    heard: list[str] = []
+    worker: Any = Worker.__new__(Worker)
+    worker.movers = {2: lambda frame: heard.append(frame.step)}
+    worker.on_migrate(Migrate("/app/a", 1, "taken", b"", True))
+    worker.on_migrate(Migrate("/app/a", 2, "refused", b"", True))
+    assert heard == ["refused"]
