@@ -18,6 +18,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.exit_reasons import SHUTDOWN, pack_exit
 from holdfast.actors.kernel.codec import Parcel
+from holdfast.actors.kernel.envelope import Envelope
 from holdfast.actors.process.stand_ins import Inner
 from holdfast.checkpoint.protocol import Closed
 from holdfast.ftm.bricks.brick_messages import Done, Follow, Lead, Work
@@ -267,7 +268,9 @@ async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
         protocol.tell(Work(group.epoch, group.config, 99, []))
         over = Closed(0, dict(pack_exit(SHUTDOWN)), False)
         end = Done(group.epoch, group.config, group.number, [], True, None, [over])
-        node.cell_at("/app/c/ftm/proxy").ref.tell(end)
+        proxy = node.cell_at("/app/c/ftm/proxy")
+        proxy.ref.tell(end)
+        proxy.admit(proxy, Envelope(end, node.cell_at("/app/c/ftm/r1/protocol")))  # As whoever leads would send it.
         for frame in (b"", b"rubbish", os.urandom(100)):
             with pytest.raises(Refused, match="wrong_session"):
                 await protocol.ask(Sealed(frame))
