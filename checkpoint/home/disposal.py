@@ -11,7 +11,7 @@ from ...actors.events import MessageQuarantined
 from ...actors.kernel.codec import Parcel
 from ..group_commit import Unkept
 from ..inputs import OVERHEAD, Batch, Input
-from ..protocol import DROPPED, MESSAGE, START, Answer
+from ..protocol import DROPPED, MESSAGE, START, TICK, Answer
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -68,13 +68,14 @@ class Ends:
         self.begun(source, AskFailed(home.path, why), batch)
         batch.commit(home.journal)
 
-    def drop_all(self, why: str, *, keep_tells: bool = False) -> None:
+    def drop_all(self, why: str, *, keep_tells: bool = False, keep_ticks: bool = True) -> None:
         """Nobody lives here any more: whoever waits is told, the rest goes to dead letters.
 
         What has begun, and what is to be answered later, fails otherwise than what has surely not.
 
         `keep_tells`: it is the actor's supervisor that has ended. Both may be started again, so what nobody waits for
         stays for the next life.
+        `keep_ticks`: what timers have brought stays as well, as the timers do that run: the address is not erased.
         """
         home = self._home
         batch, stopped = Batch(), ActorStopped(home.path, why)
@@ -87,6 +88,8 @@ class Ends:
             home.bound.release(stopped)
         for source in list(home.open.values()):
             if source.kind == START or (keep_tells and source.ask is None):
+                continue
+            if source.kind == TICK and keep_ticks:
                 continue
             if source.ask is None and source.kind == MESSAGE:
                 self.lost(source.name, source.body, why)
@@ -106,7 +109,7 @@ class Ends:
         home = self._home
         home.journal = Unkept(home.journal.commits)
         home.calls.abandon()
-        self.drop_all(why)
+        self.drop_all(why, keep_ticks=False)
         home.timers.replace({})
         home.ties.replace([])
         home.images.close()

@@ -89,6 +89,29 @@ async def test_stopped_and_started_again_the_state_comes_back(system: hf.ActorSy
     assert sorted(await again.ask(Seen())) == ["kept", "news", "tick"]
 
 
+async def test_a_tick_that_had_come_when_the_actor_was_stopped_is_handled_by_the_next_life(
+    system: hf.ActorSystem, isolation: Any
+) -> None:
+    """As its timer would go on if it had not run out yet."""
+    own, above = below(isolation)
+    spec = hf.child("doer", hf.start(Doer), isolation=own, recovery=hf.hybrid(interval=NEVER))
+    await system.start(hf.supervisor("house", children=[spec], isolation=above))
+    house, ref = system.ref("/app/house", hf.Supervisor), system.ref("/app/house/doer", Doer)
+    await ref.ask(Do(["add kept", "after 0.05"]))
+    await system.suspend(ref)
+    cell: Any = ref._cell
+    await until(lambda: any(source.kind == "tick" for source in cell.host.switch.open.values()))
+    for _ in range(2):
+        await house.ask(TerminateChild("doer"))
+        again = await house.ask(RestartChild("doer"))
+        await until_seen(again, ["kept", "tick"])
+
+
+async def until_seen(ref: Any, texts: list[str]) -> None:
+    while await ref.ask(Seen()) != texts:
+        await asyncio.sleep(0.005)
+
+
 async def test_an_actor_that_stopped_itself_comes_back_as_it_was(system: hf.ActorSystem, isolation: str) -> None:
     ref = await doer(system, isolation)
     ref.tell(Do(["add kept", "stop"]))
