@@ -17,7 +17,7 @@ import msgspec
 
 from ..actors.errors import HoldfastError
 from ..actors.kernel.actor import Actor
-from ..actors.process.fork.forked_process import check_can_watch
+from ..actors.streams import Listener
 from ..actors.values import encode_value
 from ..system.script import check_folders
 from ..system.system import ActorSystem
@@ -192,52 +192,15 @@ class Endpoint:
         self._system, self._uid = system, uid
         self._loop = asyncio.get_running_loop()
         self._clients: set[asyncio.Task[Any]] = set()
-        self._connecting: set[asyncio.Task[None]] = set()
-        self._socket: socket.socket | None = None  # on which we listen
-        self._is_watched = False  # it is
+        self._listener: Listener | None = None
         self._turned_away: dict[socket.socket, asyncio.TimerHandle] = {}
         self._idle: dict[asyncio.Task[Any], None] = {}  # those that have asked for nothing, the longest first
 
     def listen(self, sock: socket.socket) -> None:
         """Serve whoever connects to a listening socket. Raises OSError: the system cannot watch one more."""
-        check_can_watch(sock.fileno())
-        self._socket, self._is_watched = sock, True
-        self._loop.add_reader(sock, self._accept, sock)
-
-    def _accept(self, sock: socket.socket) -> None:
-        """Connections wait. Each is tried before the loop has it: uvloop ends the program if it cannot be watched."""
-        for _ in range(MOST_CLIENTS):
-            try:
-                client, _ = sock.accept()
-            except (BlockingIOError, ConnectionAbortedError):
-                return
-            except OSError:  # There are no descriptors, or no memory: whoever waits is served when there are.
-                self._pause(sock)
-                return
-            client.setblocking(False)
-            try:
-                check_can_watch(client.fileno())
-            except OSError as error:
-                self._turn_away(client, error)
-                continue
-            task = self._loop.create_task(self._connect(client))
-            self._connecting.add(task)
-            task.add_done_callback(self._connecting.discard)
-
-    def _pause(self, sock: socket.socket) -> None:
-        if self._is_watched:
-            self._is_watched = False
-            self._loop.remove_reader(sock)
-        self._loop.call_later(LINGER, self._go_on)
-
-    def _go_on(self) -> None:
-        sock = self._socket
-        if sock is None:
-            return
-        try:
-            self.listen(sock)
-        except OSError:
-            self._pause(sock)
+        listener = Listener(sock, self.serve, self._turn_away)
+        listener.start()
+        self._listener = listener
 
     def _turn_away(self, client: socket.socket, error: OSError) -> None:
         """Tell a client why it is not served; what it sends meanwhile is not read, and must not cut off our answer."""
@@ -250,27 +213,15 @@ class Endpoint:
         self._turned_away.pop(client).cancel()
         client.close()
 
-    async def _connect(self, client: socket.socket) -> None:
-        reader = asyncio.StreamReader(64 * 1024, self._loop)
-        try:
-            await self._loop.connect_accepted_socket(
-                lambda: asyncio.StreamReaderProtocol(reader, self.serve, self._loop), client
-            )
-        except OSError:
-            client.close()  # It has gone.
-        except BaseException:
-            client.close()
-            raise
-
     async def close(self) -> None:
         """End all connections; what they have asked for and is not done is undone."""
-        if self._socket is not None:
-            if self._is_watched:
-                self._loop.remove_reader(self._socket)
-            self._socket, self._is_watched = None, False
+        connecting: set[asyncio.Task[None]] = set()
+        if self._listener is not None:
+            self._listener.stop()
+            connecting = self._listener.connecting
         for client in list(self._turned_away):
             self._let_go(client)
-        while tasks := {*self._clients, *self._connecting}:
+        while tasks := {*self._clients, *connecting}:
             for task in tasks:
                 task.cancel()
             await asyncio.wait(tasks)

@@ -19,8 +19,9 @@ from ..exit_reasons import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal
 from ..kernel.cell import Cell
 from ..kernel.envelope import Ask
 from ..migration.words import NO_ATTEMPT, say
+from ..streams import check_can_watch
 from .fork.fork_server import ForkServer
-from .fork.forked_process import Forked, check_can_watch, has_ended
+from .fork.forked_process import Forked, has_ended
 from .fork.launch import keep_large_memory, why_not_importable
 from .process_watchdog import LOOKS, Watch, oom_kills
 from .program.stdout import OutputReader

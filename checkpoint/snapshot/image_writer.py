@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
-from ...actors.process.fork.forked_process import check_can_watch
+from ...actors.streams import check_can_watch
 from ..protocol import Kept, Marked, Shared, Snapshot, Unsaved
 from .key_variables import state_of, variables
 from .shared_blocks import (

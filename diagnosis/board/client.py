@@ -11,6 +11,7 @@ from typing import TypeVar
 from urllib.parse import urlsplit
 
 from ...actors.errors import HoldfastError
+from ...actors.streams import connect
 from ...supervision.backoff import Backoff
 from .frames import (
     Answer,
@@ -229,7 +230,7 @@ class Board:
         while True:
             try:
                 async with asyncio.timeout(self._timeout):
-                    reader, writer = await asyncio.open_connection(self._host, self._port, limit=PIECE)
+                    reader, writer = await connect((self._host, self._port), limit=PIECE)
             except (OSError, TimeoutError) as error:
                 self._problem = str(error) or "it does not answer"
             else:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import socket
 from typing import Protocol
 
+from ...actors.streams import Listener
 from .frames import (
     Answer,
     AskMeasurements,
@@ -65,7 +67,8 @@ class BoardServer:
 
     def __init__(self, device: Device, host: str = "127.0.0.1", port: int = 0) -> None:
         self._device, self._host, self._port = device, host, port
-        self._server: asyncio.Server | None = None
+        self._socket: socket.socket | None = None
+        self._listener: Listener | None = None
         self._clients: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
         self.delay = 0.0
         self.is_mute = self.is_deaf = False
@@ -76,14 +79,24 @@ class BoardServer:
         return f"tcp://{f'[{self._host}]' if ':' in self._host else self._host}:{self._port}"
 
     async def start(self) -> None:
-        """Listen. Raises OSError: the address cannot be had."""
-        self._server = await asyncio.start_server(self._serve, self._host, self._port, limit=PIECE)
-        self._port = self._server.sockets[0].getsockname()[1]
+        """Listen. Raises OSError: the address cannot be had, or the system cannot watch one more connection."""
+        family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
+        sock = self._socket = socket.create_server((self._host, self._port), family=family)
+        sock.setblocking(False)
+        self._listener = Listener(sock, self._serve, limit=PIECE)
+        try:
+            self._listener.start()
+        except OSError:
+            sock.close()
+            raise
+        self._port = sock.getsockname()[1]
 
     def abort(self) -> None:
         """End at once, without waiting for anybody."""
-        if self._server is not None:
-            self._server.close()
+        if self._listener is not None:
+            self._listener.stop()
+        if self._socket is not None:
+            self._socket.close()
         self.drop()
 
     async def close(self) -> None:
@@ -91,8 +104,6 @@ class BoardServer:
         self.abort()
         while self._clients:
             await asyncio.wait(list(self._clients))
-        if self._server is not None:
-            await self._server.wait_closed()
 
     def drop(self) -> None:
         """Cut all connections as if the cable were pulled: what is under way is lost."""

@@ -8,7 +8,6 @@ import dataclasses
 import importlib
 import os
 import re
-import socket
 import stat
 import sys
 from collections.abc import Awaitable, Callable
@@ -17,6 +16,7 @@ from typing import Any, Literal, cast
 
 from ...actors.errors import SpecError
 from ...actors.kernel.threads import Threads, is_async
+from ...actors.streams import Address, connect
 
 FIRST_LOOK, LAST_LOOK = 0.01, 0.2
 """Seconds between two looks at the world outside, which tells nobody when it changes; they grow."""
@@ -143,7 +143,7 @@ async def reached(sign: Sign, threads: Threads) -> None:
 async def _there(sign: Sign, threads: Threads) -> bool:
     value = sign.ready.value
     if sign.ready.kind == "port":
-        return await _answers(socket.AF_UNSPEC, value)
+        return await _answers(value)
     if sign.ready.kind == "call":
         found: object = value() if is_async(_plain(value)) else await threads.run(value)
         answer = await found if isinstance(found, Awaitable) else found
@@ -154,7 +154,7 @@ async def _there(sign: Sign, threads: Threads) -> bool:
     if stamp is None:
         return False
     if stamp.is_socket:  # The file of a dead listener stays: only a connection says that somebody is there.
-        return await _answers(socket.AF_UNIX, value)
+        return await _answers(value)
     return stamp != sign.before
 
 
@@ -162,12 +162,11 @@ def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
     return function.function if isinstance(function, Named) else function
 
 
-async def _answers(family: socket.AddressFamily, address: Any) -> bool:
-    """Whether somebody takes connections there."""
-    opening = asyncio.open_unix_connection(address) if family == socket.AF_UNIX else asyncio.open_connection(*address)
+async def _answers(address: Address) -> bool:
+    """Whether somebody takes connections there, as far as can be seen."""
     try:
         async with asyncio.timeout(CONNECT_SECONDS):
-            _, writer = await opening
+            _, writer = await connect(address)
     except (OSError, TimeoutError):
         return False
     writer.close()

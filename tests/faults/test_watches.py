@@ -90,3 +90,11 @@ def test_neither_clients_nor_pipes_can_be_watched(error: str, loop: str, tmp_pat
         assert os.strerror(getattr(errno, error)) in line
     assert said[2] == f"got {BYTES} True\n"
     assert after == ["served\n"]
+
+
+@pytest.mark.parametrize(("loop", "error"), [("asyncio", "ENOMEM"), ("uvloop", "ENOSPC")])
+def test_no_connection_is_made_or_taken_that_cannot_be_watched(loop: str, error: str, tmp_path: Path) -> None:
+    said, after = run("connections", [loop], f"error={error}", tmp_path)
+    problem = os.strerror(getattr(errno, error))
+    assert said == [f"not connected: {problem}\n", "served nobody\n"]
+    assert after == ["connected x\n", "served y\n"]

@@ -19,9 +19,10 @@ from collections import deque
 from collections.abc import Callable, Sequence
 
 from ...errors import ProcessUnavailable
+from ...streams import check_can_watch
 from .boot import HEADER, Kind, receive
 from .child_processes import signal_by
-from .forked_process import SOCKET_BYTES, Forked, ForkRequest, check_can_watch, has_ended
+from .forked_process import SOCKET_BYTES, Forked, ForkRequest, has_ended
 from .launch import check_can_start, exec_server, server_config
 
 FORK_SECONDS = 10.0  # a server that does not answer by then is stopped or stuck

@@ -60,17 +60,6 @@ def has_ended(pidfd: int) -> bool:
     return bool(poll.poll(0))
 
 
-def check_can_watch(*fds: int) -> None:
-    """Raise OSError if a loop cannot watch these descriptors beside all that is watched.
-
-    There may be no memory for it, or `fs.epoll.max_user_watches` be reached. asyncio tells that to nobody who waits for
-    the descriptor, and uvloop ends the whole program. It is not a reservation: another may take what is left.
-    """
-    with select.epoll() as scratch:
-        for fd in fds:
-            scratch.register(fd, select.EPOLLIN)
-
-
 class ForkRequest:
     """A fork that was asked for: our ends of everything, the child's ends until they are sent, and the outcome."""
 

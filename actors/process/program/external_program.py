@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from ...errors import ActorStopped, HoldfastError, ProcessUnavailable
 from ...exit_reasons import NORMAL, Exited, ExitReason, Hung, OutOfMemory, Signal
-from ..fork.forked_process import check_can_watch
+from ...streams import check_can_watch
 from ..process_watchdog import Watch, oom_kills
 from ..resource_limits import Limits
 from . import reaper

@@ -6,7 +6,7 @@ import asyncio
 import os
 from collections import deque
 
-from ..fork.forked_process import check_can_watch
+from ...streams import check_can_watch
 from .stdout import UNWATCHED_SECONDS
 
 MOST_WAITING = 1024 * 1024

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 
-from ..fork.forked_process import check_can_watch
+from ...streams import check_can_watch
 
 LONGEST = 16 * 1024
 """Bytes after which a line without an end is passed on in pieces."""
