@@ -273,11 +273,10 @@ class Unsaved(msgspec.Struct, array_like=True, tag=16):
 
 
 class Protected(msgspec.Struct, array_like=True):
-    """What a wanted child that a mechanism protects is made of: its recipe, the layers as data, and its bindings."""
+    """What a wanted child that a mechanism protects is made of: its recipe, and the layers as data."""
 
     recipe: bytes
     layers: list[Any]
-    bindings: dict[str, str]
 
 
 class Wanted(msgspec.Struct, array_like=True, tag=17):
@@ -288,6 +287,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     topics: list[str]
     method: Method
     bound: Bounded | None
+    bindings: dict[str, str]  # where its ports lead
     protected: Protected | None = None
 
 
