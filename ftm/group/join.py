@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.actor import Actor, on
@@ -24,9 +24,25 @@ FOLLOWED_WITHIN = 2.0
 JOINED_WITHIN = 60.0
 """Seconds that the transfer of a state may take."""
 DEAF_AFTER = 2
-"""Orders to follow that a replica does not take, one after the other: then it is started again."""
+"""Orders to follow that a replica does not take, one after the other: then it is started again.
+
+If it says nothing at all, the time that it got no processor, or may be going through its state, does not count.
+"""
 FIRST_RETRY, LONGEST_RETRY = 0.02, 2.0
 """Seconds until a replica that could not join is tried again; doubled each time."""
+
+
+class Deaf(NamedTuple):
+    """A replica that has not taken an order to follow: in which life, how often, and since when.
+
+    `starved`: seconds for which it had got no processor by then.
+    """
+
+    name: str
+    life: int
+    times: int
+    since: float
+    starved: float
 
 
 class Joiner(Actor):
@@ -40,7 +56,7 @@ class Joiner(Actor):
         self._group = group
         self._timer: asyncio.TimerHandle | None = None
         self._delay = FIRST_RETRY
-        self._deaf = ("", 0, 0)  # who has not answered, in which life, and how often
+        self._deaf = Deaf("", 0, 0, 0.0, 0.0)
 
     def on_start(self, restored: bool) -> None:
         """Whoever was about to join begins anew."""
@@ -104,12 +120,16 @@ class Joiner(Actor):
 
     async def _tell_to_follow(self, name: str, life: int, epoch: int) -> None:
         """One that was started with links that are secured otherwise does not even understand that it is a mismatch."""
-        group = self._group
+        group, begin, starved = self._group, time.monotonic(), self._group.starved(name)
         try:
             await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
-        except (AskTimeout, Refused):
-            self._deaf = (name, life, self._deaf[2] + 1 if self._deaf[:2] == (name, life) else 1)
-            if self._deaf[2] < DEAF_AFTER:
+        except (AskTimeout, Refused) as error:
+            first = self._deaf if self._deaf[:2] == (name, life) else Deaf(name, life, 0, begin, starved)
+            self._deaf = first._replace(times=first.times + 1)
+            silent = time.monotonic() - first.since - (group.starved(name) - first.starved)
+            if isinstance(error, AskTimeout) and silent < DEAF_AFTER * FOLLOWED_WITHIN + group.at_work(name):
+                raise  # It got no processor, or goes through a large state.
+            if self._deaf.times < DEAF_AFTER:
                 raise
             await bury(group, name, life)  # Its next life has the present stack of mechanisms.
             raise

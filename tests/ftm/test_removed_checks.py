@@ -400,6 +400,13 @@ CHECKS = {
         "tests/ftm/test_failover_turns.py",
         "test_nobody_waits_for_the_turn_in_hand",
     ),
+    "a joiner that goes through its state is not deaf": Check(
+        "ftm/group/join.py",
+        "            if isinstance(error, AskTimeout) and silent <",
+        "            if False and silent <",
+        "tests/ftm/test_deaf_joiner.py",
+        "60",
+    ),
     "a word of a migration has an end": Check(
         "actors/migration/words.py",
         "        if self._size > MOST:\n",
