@@ -273,10 +273,11 @@ class Unsaved(msgspec.Struct, array_like=True, tag=16):
 
 
 class Protected(msgspec.Struct, array_like=True):
-    """What a wanted child that a mechanism protects is made of: its recipe, and the layers as data."""
+    """What a wanted child that a mechanism protects is made of: its recipe, the layers as data, and its bindings."""
 
     recipe: bytes
     layers: list[Any]
+    bindings: dict[str, str]
 
 
 class Wanted(msgspec.Struct, array_like=True, tag=17):
@@ -287,7 +288,6 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     topics: list[str]
     method: Method
     bound: Bounded | None
-    bindings: dict[str, str]  # where its ports lead
     protected: Protected | None = None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from ..exit_reasons import ExitReason
 from ..kernel import lifecycle, links
@@ -16,9 +16,6 @@ from .wire.start_codec import loaded
 
 if TYPE_CHECKING:
     from ..kernel.node import Node
-
-MOST_BINDINGS: Final = 256
-"""Addresses that a process may say one actor is bound to."""
 
 
 class Inner:
@@ -33,8 +30,8 @@ class Inner:
         """All of them that are there."""
         return self._cells.values()
 
-    def born(self, home: Cell, path: str, kind: str, life: int, bindings: dict[str, str]) -> None:
-        """A life has begun at `path` below `home`, with these bindings; one that was made here since goes before.
+    def born(self, home: Cell, path: str, kind: str, life: int) -> None:
+        """A life has begun at `path` below `home`.
 
         Raises:
             BadFrame: that address is not for this process to give.
@@ -46,7 +43,6 @@ class Inner:
             cell.state, cell.admit = RUNNING, self._admit
         cell.life = life
         know(cell, kind)
-        know_bindings(cell, bindings)
 
     def homed(self, home: Cell, path: str, cell: Cell | None, host: Host) -> Cell:
         """An address below `home` whose own home is here: its cell outlives the process.
@@ -102,18 +98,6 @@ class Inner:
         for path, cell in reversed(list(self._cells.items())):
             if cell.host is self._host:
                 self.gone(path, reason)
-
-
-def know_bindings(cell: Cell, bindings: dict[str, str]) -> None:
-    """Where the process of an actor has bound it; what was bound here since goes before.
-
-    Raises:
-        BadFrame: such bindings cannot be.
-    """
-    if len(bindings) > MOST_BINDINGS or not all(path.startswith("/") for path in bindings.values()):
-        raise BadFrame(f"{cell.path} is bound to what cannot be, or to more than {MOST_BINDINGS} addresses")
-    for port, path in bindings.items():
-        cell.extra().bindings.setdefault(port, cell.node.cell_at(path))
 
 
 def know(cell: Cell, kind: str) -> None:

@@ -241,9 +241,7 @@ class Guest(Peer):
         start = cell.extra().start
         kind = type(cell.actor) if cell.actor is not None else None if start is None else start.kind
         if kind is not None:
-            bindings = {port: target.path for port, target in cell.extra().bindings.items()}
-            data = {"path": path, "kind": message_name(kind), "life": cell.life, "bindings": bindings}
-            self.command(root, "born", data)
+            self.command(root, "born", {"path": path, "kind": message_name(kind), "life": cell.life})
 
     def _on_event(self, event: Event) -> None:
         if type(event) is ActorStarted:

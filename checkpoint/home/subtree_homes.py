@@ -20,7 +20,7 @@ from ...actors.kernel.mailbox import Bound
 from ...actors.persistence import child_key
 from ...actors.process.process_host import Elsewhere, ProcessHost
 from ...actors.process.resource_limits import Limits
-from ...actors.process.stand_ins import know, know_bindings
+from ...actors.process.stand_ins import know
 from ...actors.process.wire import frames
 from ...actors.process.worker_pool import Worker, Workers
 from ..protocol import Begin, Closed, Started, ToHome, Wanted
@@ -208,7 +208,6 @@ class SubtreeHome(HomeHost, Elsewhere):
         cell = self.cell = worker.inner.homed(top, self.path, self.cell, self)
         cell.spec = wanted  # Somebody restarts it: it is not dead between two lives.
         know(cell, wanted.kind)
-        know_bindings(cell, wanted.bindings)
         if wanted.bound is not None:
             cell.extra().bound = Bound(wanted.bound.capacity, wanted.bound.overflow)
         port = RemoteLife(self.path, worker)

@@ -91,8 +91,7 @@ class ChildStub:
         self._up = node.loop.create_future()
         port = self._port = self.joined(cell)
         kind, topics = message_name(start.kind), list(start.kind._topics)
-        bindings = {name: target.path for name, target in more.bindings.items()}
-        port.to_home(Wanted(self._number, kind, topics, method, self.bound, bindings, made))
+        port.to_home(Wanted(self._number, kind, topics, method, self.bound, made))
         return self._up
 
     def is_starting(self, number: int) -> bool:

@@ -96,7 +96,7 @@ class OutOfSubtree(ToGroup):
             raise CannotMove(cell.path, "its life has ended")
         self.is_done = True
         wanted = self._place.hand_over(host)
-        protected = Protected(b"", [])  # What it is made of is known.
+        protected = Protected(b"", [], {})  # What it is made of is known.
         host.found(msgspec.structs.replace(wanted, protected=protected), RemoteLife(cell.path, self._worker))
         self._say("leave", number=wanted.number, layers=host.described())
         host.take_over(cell, group)

@@ -60,6 +60,8 @@ class SubtreeGroup(GroupHost):
         self._wanted, self._port = wanted, port
         self._recipe, self._topics = made.recipe, wanted.topics
         self._stop_wanted, self._is_restarting, self._last = None, False, None
+        for name, path in made.bindings.items():
+            cell.extra().bindings.setdefault(name, cell.node.cell_at(path))
         try:
             entered = self.enter(cell)  # Now: from here on what is sent is admitted by the home.
         except StartFailed as error:  # What is recorded does not fit its class.

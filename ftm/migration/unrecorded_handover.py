@@ -159,8 +159,8 @@ class OutOfProcess(ToGroup):
         self._move_in(switch, unpack(self._worker, cell, told["queue"]), list(more.topics), None)
         self._let_go(self._held)
         kind = self._spec.start.kind
-        protected = Protected(b"", [])  # What it is made of is known.
-        host.found(Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen, {}, protected), self._port)
+        protected = Protected(b"", [], {})  # What it is made of is known.
+        host.found(Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen, protected), self._port)
         self._place.found(cell, host)
         host.take_over(cell, group)
         more.trap_exits = False

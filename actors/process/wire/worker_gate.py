@@ -289,9 +289,6 @@ def _born(gate: Gate, to: str, frame: frames.Command) -> None:
     life = frame.data.get("life")
     if type(life) is not int or not 0 <= life < MOST_LIVES:
         raise BadFrame(f"a life with the number {life!r}")
-    bindings = frame.data.get("bindings")
-    if not isinstance(bindings, dict) or not all(type(one) is str for pair in bindings.items() for one in pair):
-        raise BadFrame("a life without its bindings")
 
 
 def _gone(gate: Gate, to: str, frame: frames.Command) -> None:

@@ -96,18 +96,10 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "offer to terminate a child": lambda: frame(f.Offer(1, SUP, TERMINATE, raw(["victim"]))),
     "publish an order": lambda: frame(f.Publish(1, "/t", TERMINATE, raw(["victim"]))),
     # claims
-    "a child below the supervisor": lambda: command(
-        SUP, "born", path="/app/sup/planted", kind="a:B", life=1, bindings={}
-    ),
+    "a child below the supervisor": lambda: command(SUP, "born", path="/app/sup/planted", kind="a:B", life=1),
     "the address of another": lambda: command(EVIL, "born", path=VICTIM, kind="a:B", life=1),
     "a life that is no number": lambda: command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life="zz"),
     "a life of any number": lambda: command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1 << 62),
-    "a life without bindings": lambda: command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1),
-    "a binding to nowhere": lambda: command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1, bindings={"p": "x"}),
-    "a binding that is none": lambda: command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1, bindings={"p": 5}),
-    "bindings without end": lambda: command(
-        EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1, bindings={str(n): "/a" for n in range(300)}
-    ),
     "an address without a name": lambda: command(EVIL, "born", path=f"{EVIL}//x", kind="a:B", life=1),
     "below what is not there": lambda: command(EVIL, "born", path=f"{EVIL}/x/y", kind="a:B", life=1),
     "the end of another's child": lambda: command(SUP, "gone", path=VICTIM, reason=NORMAL),
