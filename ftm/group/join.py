@@ -38,7 +38,6 @@ class Deaf(NamedTuple):
     `starved`: seconds for which it had got no processor by then.
     """
 
-    name: str
     life: int
     times: int
     since: float
@@ -56,7 +55,7 @@ class Joiner(Actor):
         self._group = group
         self._timer: asyncio.TimerHandle | None = None
         self._delay = FIRST_RETRY
-        self._deaf = Deaf("", 0, 0, 0.0, 0.0)
+        self._deaf: dict[str, Deaf] = {}  # by name
 
     def on_start(self, restored: bool) -> None:
         """Whoever was about to join begins anew."""
@@ -124,15 +123,19 @@ class Joiner(Actor):
         try:
             await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
         except (AskTimeout, Refused) as error:
-            first = self._deaf if self._deaf[:2] == (name, life) else Deaf(name, life, 0, begin, starved)
-            self._deaf = first._replace(times=first.times + 1)
-            silent = time.monotonic() - first.since - (group.starved(name) - first.starved)
+            first = self._deaf.get(name)
+            if first is None or first.life != life:
+                first = Deaf(life, 0, begin, starved)
+            deaf = self._deaf[name] = first._replace(times=first.times + 1)
+            starved = min(group.starved(name) - first.starved, group.detection.hopeless)
+            silent = time.monotonic() - first.since - starved
             if isinstance(error, AskTimeout) and silent < DEAF_AFTER * FOLLOWED_WITHIN + group.at_work(name):
                 raise  # It got no processor, or goes through a large state.
-            if self._deaf.times < DEAF_AFTER:
+            if deaf.times < DEAF_AFTER:
                 raise
             await bury(group, name, life)  # Its next life has the present stack of mechanisms.
             raise
+        self._deaf.pop(name, None)
 
     def _later(self, seconds: float | None = None) -> None:
         """Look again then; None: what has failed is tried again, after longer each time."""
