@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ...actors.errors import MailboxFull
 from ...actors.kernel.mailbox import Bound, Senders
-from ...actors.overflow import DROPS, decide
+from ...actors.overflow import DROPS, Overflow, decide
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, START, Answer
 
@@ -26,7 +26,8 @@ class HomeBound:
 
     def __init__(self, home: Switch, chosen: Bound) -> None:
         self._home = home
-        self.capacity, self.overflow = chosen.capacity, chosen.overflow
+        self.capacity = chosen.capacity
+        self.overflow: Overflow = chosen.overflow
         self.one_at_a_time = chosen.overflow in DROPS
         stashed = home.stashed()
         self._counted = {  # by id, in admission order
