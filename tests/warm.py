@@ -186,9 +186,15 @@ def serve(control: socket.socket) -> None:
 
     gc.collect()
     gc.freeze()
-    control.send(b"warm")
+    try:
+        control.send(b"warm")
+    except (BrokenPipeError, ConnectionResetError):  # The tests were over before we were warm.
+        return
     while True:
-        data, fds, _, _ = socket.recv_fds(control, PACKET_BYTES, 3)
+        try:
+            data, fds, _, _ = socket.recv_fds(control, PACKET_BYTES, 3)
+        except ConnectionResetError:
+            return
         if not data:
             return
         control.send(struct.pack("i", fork(control, json.loads(data), fds)))

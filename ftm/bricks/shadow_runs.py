@@ -97,7 +97,8 @@ class Helping(Remembering):
         digest = b""
         if order.keep:
             digest = self._digests.of(run.state)
-            self._keep(order, run, digest, epoch)
+            if not self._keep(order, run, digest, epoch):
+                return Computed([], [], None, b"", [], f"{self._standing.path} lives on from another state")
         return Computed(run.ends, run.released, None if order.keep else run.state, digest, run.objections)
 
     def _base(self, order: Compute) -> State | None:
@@ -110,10 +111,11 @@ class Helping(Remembering):
             self._digest, self._kept = self._digests.of(point), point
         return point if self._digest == order.base else None
 
-    def _keep(self, order: Compute, run: Run, digest: bytes, epoch: int) -> None:
+    def _keep(self, order: Compute, run: Run, digest: bytes, epoch: int) -> bool:
+        """Whether what it has led to is from now on the state that is here."""
         standing = self._standing
         if standing.leads or standing.server.life is not None:
-            return
+            return False
         assert run.state is not None
         standing.server.install(run.state)
         self._digest, self._kept = digest, run.state
@@ -123,3 +125,4 @@ class Helping(Remembering):
             standing.log.replace(order.log)
         standing.log.add(entries)
         standing.kept = epoch, run.state.turn  # It may have been told meanwhile that another one leads.
+        return True

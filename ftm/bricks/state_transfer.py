@@ -180,20 +180,23 @@ class Transfer(Gate):
     async def _taken(self, take: Take) -> int:
         standing, server = self._standing, self._standing.server
         standing.set_peer(take.leader, "live")
-        if take.state is not None and standing.kept > (standing.epoch, take.state.turn):
-            standing.ready()  # It has computed with the leader meanwhile, and is further than that.
-            return server.turn
-        standing.unready()
-        standing.forwarded_as -= 1  # What is on its way to Proceed now, or in it, leads on from another state.
-        await self.proceed.ask(Abandon(), timeout=FOREVER)
-        await server.drop_life()
-        server.install(take.state)
-        standing.log.replace(take.log)
-        standing.inside.clear()
-        if standing.computes:
-            await server.ensure()
+        if not self._is_further(take):
+            standing.unready()
+            standing.forwarded_as -= 1  # What is on its way to Proceed now, or in it, leads on from another state.
+            await self.proceed.ask(Abandon(), timeout=FOREVER)
+            await server.drop_life()
+            if not self._is_further(take):  # Nothing may come between this and the state.
+                server.install(take.state)
+                standing.log.replace(take.log)
+            standing.inside.clear()
+            if standing.computes:
+                await server.ensure()
         standing.ready()
         return server.turn
+
+    def _is_further(self, take: Take) -> bool:
+        """Whether what was computed here for the leader, which waits for nobody to join, leads on from that state."""
+        return self._standing.kept > (self._standing.epoch, -1 if take.state is None else take.state.turn)
 
     # -- out of the group ---------------------------------------------------------------------------------------------
 

@@ -253,6 +253,13 @@ CHECKS = {
         "tests/ftm/test_nvp.py",
         "test_a_strict_voter",
     ),
+    "TMR: what a joiner computes meanwhile is not overwritten by the state it joins with": Check(
+        "ftm/bricks/state_transfer.py",
+        "            if not self._is_further(take):  # Nothing may come",
+        "            if True:  # Nothing may come",
+        "tests/ftm/test_tmr_failover.py",
+        "test_what_a_joiner_computes",
+    ),
     "TMR: a leader that was outvoted gives way": Check(
         "ftm/mechanisms/tmr.py",
         "        if 0 in wrong:  #",

@@ -101,6 +101,30 @@ async def test_what_only_the_next_leader_knows_leaves_when_the_third_one_has_it_
     assert await driver.ask(Read()) == [1, 2]
 
 
+@pytest.mark.parametrize("handled", [0, 1])
+async def test_what_a_joiner_computes_while_it_takes_a_state_is_not_overwritten_by_that(
+    system: hf.ActorSystem, handled: int
+) -> None:
+    driver = await trio_of(system)
+    for n in range(handled):
+        await driver.ask(Add(n))
+    proceed = system.node.cell_at(driver.path("r3") + "/proceed").ref
+    await system.suspend(proceed)
+    joining = asyncio.create_task(driver.join("r3"))
+    async with asyncio.timeout(30):
+        while driver.standing("r3").peer != driver.path("r1") or driver.standing("r3").is_ready:
+            await asyncio.sleep(0)
+    for _ in range(50):  # It waits for its Proceed to drop what that has.
+        await asyncio.sleep(0)
+    assert await driver.ask(Add(7)) == 7
+    await system.resume(proceed)
+    await joining
+    for name in ("r1", "r2"):
+        await driver.stop_replica(name)
+    await driver.fail_over("r3")
+    assert await driver.ask(Read()) == [*range(handled), 7]
+
+
 class Curious(Total):
     """On the third replica it asks what it has not asked elsewhere, and so comes to no outcome there."""
 
