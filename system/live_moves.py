@@ -16,14 +16,14 @@ from ..actors.kernel.cell import Cell, Host
 from ..actors.kernel.lifecycle import LOCAL
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
-from ..actors.migration.process_move import Move
-from ..actors.migration.to_process import ToProcess
-from ..actors.migration.to_task import ToTask
+from ..actors.migration.here import FromHere, ToHere
+from ..actors.migration.move import Entering, Leaving, Move
+from ..actors.migration.worker import FromWorker, ToWorker
 from ..actors.process.process_host import ProcessHost
 from ..actors.process.resource_limits import Limits
 from ..actors.process.worker_pool import Workers
 from ..checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
-from ..checkpoint.home.recorded_moves import RecordedToProcess, RecordedToTask
+from ..checkpoint.home.recorded_moves import FromRecordedHere, FromRecordedWorker, ToRecordedHere, ToRecordedWorker
 from ..supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
@@ -104,7 +104,7 @@ class Moves:
 
     async def _protected(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> None:
         from ..ftm.events import MechanismAttached
-        from ..ftm.migration.attach import to_group
+        from ..ftm.migration.protection import into_group
 
         before = _spec_of(cell)
         wanted = dataclasses.replace(before, mechanism=mechanism)
@@ -121,7 +121,7 @@ class Moves:
             move = await self._moved(
                 cell,
                 timeout,
-                lambda: to_group(cell, homes, mechanism, timeout),
+                lambda: into_group(cell, homes, mechanism, timeout),
                 moved,
             )
         except BaseException:
@@ -129,7 +129,7 @@ class Moves:
                 await self._settle_in(cell, "process", before.limits, timeout)
             raise
         if self._node.watched:
-            names = tuple(layer.name for layer in move.host.layers)
+            names = tuple(layer.name for layer in move.entering.host.layers)
             self._node.emit(MechanismAttached(cell.path, names, move.gone_on_at - move.rest_at))
 
     async def unprotect(self, cell: Cell, timeout: float) -> None:
@@ -142,7 +142,7 @@ class Moves:
 
     async def _unprotected(self, cell: Cell, timeout: float) -> None:
         from ..ftm.events import MechanismDetached
-        from ..ftm.migration.detach import from_group
+        from ..ftm.migration.protection import out_of_group
         from ..ftm.model.mechanism import compose
 
         before: ChildSpec = cell.spec
@@ -150,7 +150,7 @@ class Moves:
         move = await self._moved(
             cell,
             timeout,
-            lambda: from_group(cell, self._node.host_for(wanted), timeout),
+            lambda: out_of_group(cell, self._node.host_for(wanted), timeout),
             lambda: replace_mechanism(cell, wanted),
         )
         if self._node.watched:
@@ -233,23 +233,36 @@ class Moves:
                 return move
             finally:
                 del self._under_way[cell]
-                ending: asyncio.Future[None] | None = getattr(move, "ending", None)
-                if ending is not None:  # The processes of replicas that are not needed.
-                    await ending
+                if move.ending is not None:  # The processes of replicas that are not needed.
+                    await move.ending
 
     def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
         """The move that brings the actor to where its spec says."""
-        old, new = cell.host, self._node.host_for(spec)
-        if isinstance(new, RecordedProcessHost):
-            return RecordedToProcess(cell, new, timeout, self._workers, spec.limits)
-        if isinstance(new, ProcessHost):
-            return ToProcess(cell, new, timeout, self._workers, spec.limits)
-        worker = old.worker_of(cell) if isinstance(old, ProcessHost) else None
-        if worker is None:
-            raise CannotMove(cell.path, "its process has ended")
-        if isinstance(new, TaskHost):
-            return RecordedToTask(cell, new, timeout, worker)
-        return ToTask(cell, new, timeout, worker)
+        return Move(cell, leaving(cell), self._entering(self._node.host_for(spec), spec.limits), timeout)
+
+    def _entering(self, host: Host, limits: Limits | None) -> Entering:
+        if isinstance(host, RecordedProcessHost):
+            return ToRecordedWorker(host, self._workers, limits)
+        if isinstance(host, ProcessHost):
+            return ToWorker(host, self._workers, limits)
+        return ToRecordedHere(host) if isinstance(host, TaskHost) else ToHere(host)
+
+
+def leaving(cell: Cell) -> Leaving:
+    """The side of a move that is where the actor lives now, in this process or in one of its own.
+
+    Raises:
+        CannotMove: that has ended.
+    """
+    host = cell.host
+    if isinstance(host, TaskHost):
+        return FromRecordedHere(host)
+    if not isinstance(host, ProcessHost):
+        return FromHere()
+    worker = host.worker_of(cell)
+    if worker is None:
+        raise CannotMove(cell.path, "its process has ended")
+    return FromRecordedWorker(worker) if isinstance(host, RecordedProcessHost) else FromWorker(worker)
 
 
 def check_isolation(isolation: object, limits: object, timeout: object) -> None:

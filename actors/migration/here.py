@@ -7,58 +7,103 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any
 
+from ..control.orders_lane import Call
 from ..errors import CannotMove, StartFailed, error_text
 from ..exit_reasons import ExitReason
 from ..kernel import lifecycle, mailbox
-from ..kernel.cell import RUNNING, Cell
+from ..kernel.cell import RUNNING, Cell, Host
 from ..kernel.context import ActorContext
 from ..kernel.envelope import Item
+from ..kernel.lifecycle import Stop
 from ..kernel.mailbox import Bound
-from .luggage import Owe
-from .quiesce import Take, decoded, now, settle, sorted_out, twin
+from ..kernel.timers import Timer
+from .luggage import check_sendable, pack_rest
+from .move import Entering, Leaving, Move
+from .quiesce import Take, Transit, decoded, farewell, now, part, resume, settle, sorted_out, twin
 from .worker_moves import await_up
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor, Start
-    from .process_move import Move
+    from ..kernel.links import Monitor
 
 
-class Departure:
-    """A life in this process comes to rest between two turns, and is packed there."""
+class FromHere(Leaving):
+    """A life in this process, which has no home: it comes to rest between two turns, and is packed there."""
 
-    def __init__(
-        self, move: Move, owe: Owe, pack: Callable[[Actor, bytes], None], ignored: tuple[str, ...] = ()
-    ) -> None:
-        self._move, self._pack = move, pack
-        self._start = move.cell.extra().start
-        self._take = Take(owe, self._at_rest, move.give_up, ignored)
-        self._rested: asyncio.Future[None] = move.node.loop.create_future()
+    def __init__(self, ignored: tuple[str, ...] = ()) -> None:
+        self._ignored = ignored  # children that are not the actor's own
+        self._take: Take | None = None
+        self._old: Cell | None = None
+        self._topics: set[str] = set()
+        self._links: set[Cell] = set()
+        self._watches: set[Monitor] = set()
 
     async def quiesce(self) -> None:
-        """Bring the life to rest.
-
-        Raises:
-            CannotMove: it did not come to rest in time, or cannot leave.
-        """
-        move = self._move
-        lifecycle.urge(move.cell, self._take)
-        await move.within(self._rested, move.timeout, lambda: f"{self._take.why}, and that did not change")
+        move, entering = self.move, self.move.entering
+        self._start = move.cell.extra().start
+        self._rested: asyncio.Future[None] = move.node.loop.create_future()
+        take = self._take = Take(entering.owe, self._at_rest, move.give_up, self._ignored)
+        lifecycle.urge(move.cell, take)
+        await move.within(self._rested, move.timeout, lambda: f"{take.why}, and that did not change")
 
     def _at_rest(self, actor: Actor, state: bytes) -> None:
         """Called in its place between two turns; if this raises, the actor goes on."""
-        move = self._move
+        move, more = self.move, self.cell.extra()
         if move.given_up.done():
             raise CannotMove(move.cell.path, move.given_up.result())
-        if move.cell.extra().start is not self._start:
+        if more.start is not self._start:
             raise CannotMove(move.cell.path, "its code was replaced meanwhile; try again")
         move.rest_at = now()
-        self._pack(actor, state)
+        luggage = move.luggage
+        luggage.suspended, luggage.traps, luggage.stash = more.suspended, more.trap_exits, list(more.stash or ())
+        # What belongs to the address: a new life that fails may have added to it.
+        self._topics, self._links, self._watches = set(more.topics), set(more.links), set(more.watching)
+        self.pack(actor, state)
         move.at_rest()
         self._rested.set_result(None)
 
-    def call_off(self) -> None:
-        """The life is not to come to rest any more."""
-        self._take.is_void = True
+    def pack(self, actor: Actor, state: bytes) -> None:
+        """Take along what the life has."""
+        check_sendable(self.cell)
+        self.move.luggage.state, self.move.luggage.rest = state, pack_rest(actor)
+        self.move.entering.packed(actor)
+
+    def part(self) -> list[Item]:
+        cell, luggage = self.cell, self.move.luggage
+        luggage.bound = cell.extra().bound
+        self._old = part(cell)
+        items, commands = sorted_out(cell)
+        luggage.queue = [item for item in items if not isinstance(item, Call)]
+        return [*commands, *(item for item in items if isinstance(item, Call))]
+
+    def retire(self) -> None:
+        assert self._old is not None
+        farewell(self._old, self.stop())
+
+    def stop(self) -> Item:
+        """What ends the old life."""
+        return Stop(self.move.reason())
+
+    def resume(self) -> None:
+        if self._take is not None:
+            self._take.is_void = True
+        cell, transit = self.cell, self.move.transit
+        if transit is None:
+            return
+        more = cell.extra()
+        for topic in set(more.topics) - self._topics:
+            cell.node.topics.unsubscribe(topic, cell)
+        for peer in set(more.links) - self._links:
+            peer.extra().links.pop(cell, None)
+            del more.links[peer]
+        for watch in set(more.watching) - self._watches:
+            watch.cancel()
+        self.take_back(transit)
+        transit.over(cell, transit.old)
+        resume(cell)
+
+    def take_back(self, transit: Transit) -> None:
+        """What had been given away."""
 
 
 class Arrival:
@@ -132,6 +177,52 @@ class Arrival:
     def discard(self) -> None:
         """The new life is not to be."""
         dispose(self.other)
+
+
+class ToHere(Entering):
+    """The life of an actor without a home begins in this process."""
+
+    to = "to a task"
+
+    def __init__(self, host: Host) -> None:
+        self.host = host
+        self._arrival: Arrival | None = None
+
+    async def begin(self) -> None:
+        start, luggage = self.cell.extra().start, self.move.luggage
+        assert start is not None
+        arrival = self._arrival = Arrival(self.cell)
+        await arrival.is_up(self.move, arrival.begin(start, luggage.restore, trap_exits=luggage.traps))
+
+    def take_over(self) -> list[Item]:
+        cell, luggage, arrival = self.cell, self.move.luggage, self._arrival
+        assert arrival is not None
+        bound = None
+        if luggage.bound is not None:
+            bound = Bound(luggage.bound.capacity, luggage.bound.overflow).inherit(luggage.bound)
+        commands = arrival.take_over(luggage.queue, luggage.stash, bound, suspended=luggage.suspended)
+        for name, body, left, interval in luggage.timers:
+            message = cell.node.codec.decode(cell.table.kind_named(name), body)
+            Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
+        for ask in luggage.waiting:
+            cell.admit(cell, ask)
+        if bound is not None:
+            let_in(cell, bound)
+        return commands
+
+    def go_on(self) -> None:
+        lifecycle.up(self.cell)
+        self.move.gone_on_at = now()
+
+    def discard(self) -> None:
+        if self._arrival is not None:
+            self._arrival.discard()
+
+
+def let_in(cell: Cell, bound: Bound) -> None:
+    """Some of those who waited for room may have it now."""
+    bound.count += 1
+    bound.taken(cell)
 
 
 def dispose(other: Cell) -> None:

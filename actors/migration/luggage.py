@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ..control.live_state import live_state, put_state
 from ..errors import BadMessage, HoldfastError, error_text, type_name
 from ..exit_reasons import pack_exit, unpack_exit
+from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item, ReplyHandle
 from ..kernel.links import Down, Exit, Monitor
 from ..kernel.message import message_name
@@ -195,8 +196,11 @@ def pack_items(cell: Cell, items: Any, entry: Callable[[Item], list[Any] | None]
                 packed.append(["down", watch.target.path, pack_exit(item.reason), item.recovering, watch.for_good])
         elif isinstance(item, Envelope) or not isinstance(item, Item):
             message, sender = (item.message, item.sender) if isinstance(item, Envelope) else (item, None)
-            body = cell.node.codec.encode(message, cell.path)
-            packed.append(["message", message_name(type(message)), body, None if sender is None else sender.path])
+            if isinstance(message, Parcel):
+                name, body = message.name, message.body
+            else:
+                name, body = message_name(type(message)), cell.node.codec.encode(message, cell.path)
+            packed.append(["message", name, body, None if sender is None else sender.path])
     return packed
 
 

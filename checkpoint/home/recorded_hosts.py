@@ -209,6 +209,10 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         except StartFailed:
             await worker.gone()  # The next life begins when this one is over.
             raise
+        self.is_live(cell)
+
+    def is_live(self, cell: Cell) -> None:
+        """The life in the process is the one; if it was to be stopped before, it is stopped now."""
         self.clock = None
         if self._stop_wanted is not None:
             self.stop(cell, self._stop_wanted)

@@ -10,26 +10,13 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from ...actors.errors import CannotMove, StartFailed
-from ...actors.exit_reasons import ExitReason
+from ...actors.errors import CannotMove, HoldfastError, StartFailed
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.cell import Cell
-from ...actors.kernel.envelope import Item
-from ...actors.migration.here import Arrival
-from ...actors.migration.quiesce import (
-    Settle,
-    Transit,
-    farewell,
-    now,
-    obey_commands,
-    part,
-    settle_with_queue,
-    sorted_out,
-)
-from ...actors.migration.to_process import ToProcess
-from ...actors.migration.to_task import FromProcess
-from ...actors.process.resource_limits import Limits
-from ...actors.process.worker_pool import Worker, Workers
+from ...actors.migration.here import Arrival, FromHere
+from ...actors.migration.move import Entering, Move
+from ...actors.migration.quiesce import Settle, Transit, now, part, settle_with_queue, sorted_out
+from ...actors.migration.worker import FromOwnWorker, ToWorker
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
 from ..protocol import LifePort, Live, ToHome
@@ -38,6 +25,7 @@ from .switch import Switch
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
+    from ...actors.kernel.envelope import Item
 
 
 class Detached:
@@ -79,135 +67,72 @@ def refuse_unsaved(cell: Cell, home: Switch | None) -> None:
         raise CannotMove(cell.path, "its last snapshot could not be kept, and it is not replayed")
 
 
-def leave_task(cell: Cell, host: TaskHost, reason: ExitReason) -> tuple[Cell, StopRecorded, list[Item]]:
-    """A recorded life that is at rest here is its address's no more.
+class FromRecordedHere(FromHere):
+    """A recorded life in this process comes to rest."""
 
-    Returns: where it is now, what is to end it there, and the commands that are for the new life.
-    """
-    life = host.life
-    assert life is not None
-    life.port.shut()  # type: ignore[attr-defined]  # in this process it is a LocalHome
-    old = part(cell)
-    _, commands = sorted_out(cell)
-    life.cell = old
-    return old, StopRecorded(life, reason), commands
-
-
-class RecordedToProcess(ToProcess):
-    """A recorded actor, from a task to a process of its own."""
-
-    host: RecordedProcessHost
-
-    def __init__(self, cell: Cell, host: RecordedProcessHost, timeout: float, workers: Workers, limits: Limits | None):
-        super().__init__(cell, host, timeout, workers, limits)
-        old = cell.host
-        assert isinstance(old, TaskHost)
-        self._old = old
+    def __init__(self, host: TaskHost, ignored: tuple[str, ...] = ()) -> None:
+        super().__init__(ignored)
+        self._host = host
         self._home: Detached | None = None
-        self._up: asyncio.Future[None] = self.node.loop.create_future()
+        self._life: Life | None = None
+
+    async def quiesce(self) -> None:
+        await super().quiesce()
+        refuse_unsaved(self.cell, self._host.switch)
 
     def pack(self, actor: Actor, state: bytes) -> None:
-        assert self._old.switch is not None
-        self._home = Detached(self._old.switch)
+        assert self._host.switch is not None
+        self._home = Detached(self._host.switch)
 
-    async def carry(self) -> None:
-        cell, worker, more = self.cell, self.worker, self.cell.extra()
-        assert worker is not None
-        refuse_unsaved(cell, self._old.switch)
-        switch, live, _ = self.host.open(cell)
-        take = records_of(worker, lambda record: self._from_life(switch, worker, record))
-        worker.record_taker = lambda path: take
-        port = RemoteLife(cell.path, worker)
-        for record in switch.restore_records():
-            port.to_life(record)
-        recorded = {"method": self.host.method.data(), "turn": switch.state_turn, "stash": switch.stash}
-        kept = {"suspended": more.suspended, "trap_exits": more.trap_exits}
-        launched = worker.launch(cell, self.recipe, {"recorded": {**recorded, **kept}})
-        await self.within(launched, self.timeout, lambda: "its new life was not up")
-        switch.attach(port)
-        live.add_done_callback(self._failed)
-        await self.within(self._up, self.timeout, lambda: "its new life was not up")
+    def part(self) -> list[Item]:
+        life = self._life = self._host.life
+        assert life is not None
+        life.port.shut()  # type: ignore[attr-defined]  # in this process it is a LocalHome
+        old = self._old = part(self.cell)
+        _, commands = sorted_out(self.cell)
+        life.cell = old
+        return commands
 
-    def _failed(self, live: asyncio.Future[float]) -> None:
-        error = None if live.cancelled() else live.exception()
-        if error is not None and not self._up.done():
-            self._up.set_exception(StartFailed(self.cell.path, str(error)))
+    def stop(self) -> Item:
+        assert self._life is not None
+        return StopRecorded(self._life, self.move.reason())
 
-    def _from_life(self, switch: Switch, worker: Worker, record: ToHome) -> None:
-        if isinstance(record, Live):
-            if self.given_up.done() or self._up.done():
-                return  # Too late: the process is being ended.
-            self._switch_over(switch, record, worker)
-        else:
-            switch.from_life(record)
-
-    def _switch_over(self, switch: Switch, live: Live, worker: Worker) -> None:
-        """From here on the new life is the one."""
-        cell, host, old_host = self.cell, self.host, self._old
-        assert self.transit is not None
-        with self.commit():
-            old, stop, commands = leave_task(cell, old_host, self.reason())
-            worker.adopt(cell, None, host.died)
-            host.clock = None
-        self._up.set_result(None)
-        switch.from_life(live)  # What waits is fed.
-        worker.connection.flush()
-        self.gone_on_at = now()
-        self.transit.over(cell, host)
-        obey_commands(cell, commands)
-        farewell(old, stop)
-        self.moved()
-
-    def stay(self, transit: Transit) -> None:
+    def take_back(self, transit: Transit) -> None:
         assert self._home is not None
         self._home.attach_again(transit)
-        super().stay(transit)
 
 
-class RecordedToTask(FromProcess):
-    """A recorded actor, from a process of its own to a task."""
+class FromRecordedWorker(FromOwnWorker):
+    """A recorded life leaves the process of its own."""
 
-    host: TaskHost
+    _home: Detached | None = None
 
-    def __init__(self, cell: Cell, host: TaskHost, timeout: float, worker: Worker) -> None:
-        super().__init__(cell, host, timeout, worker)
-        self._home: Detached | None = None
-        self._arrival: RecordedArrival | None = None
+    async def quiesce(self) -> None:
+        await super().quiesce()
+        refuse_unsaved(self.cell, self._old().switch)
+
+    def _old(self) -> RecordedProcessHost:
+        transit = self.move.transit
+        assert transit is not None
+        assert isinstance(transit.old, RecordedProcessHost)
+        return transit.old
 
     def left(self) -> None:
-        old = self.transit.old if self.transit is not None else None
-        assert isinstance(old, RecordedProcessHost)
-        assert old.switch is not None
-        self._home = Detached(old.switch)
+        switch = self._old().switch
+        assert switch is not None
+        self._home = Detached(switch)
         self.taken.set_result(None)
 
-    async def carry(self) -> None:
-        old = self.transit.old if self.transit is not None else None
-        refuse_unsaved(self.cell, old.switch if isinstance(old, RecordedProcessHost) else None)
-        arrival = self._arrival = RecordedArrival(self.cell, self.host)
-        await arrival.is_up(self, arrival.begin_recorded(suspended=self.suspended, trap_exits=self.trap_exits))
-        self._commit(arrival)
+    def part(self) -> list[Item]:
+        return []
 
-    def _commit(self, arrival: RecordedArrival) -> None:
-        assert self.transit is not None
-        with self.commit():
-            arrival.take_place()
-        self.transit.over(self.cell, self.host)
-        arrival.go_on()
-        self.gone_on_at = now()
-        self.leave()
-        self.moved()
-
-    def undo(self) -> None:
-        cell, worker, transit, home = self.cell, self.worker, self.transit, self._home
-        if self._arrival is not None:
-            self._arrival.discard()
+    def resume(self) -> None:
+        cell, worker, transit, home = self.cell, self.worker, self.move.transit, self._home
         if self.dead is None:
-            self.tell_old("back")
+            self.move.say_now(worker, "back")
         if transit is None or home is None:
             return
-        old = transit.old
-        assert isinstance(old, RecordedProcessHost)
+        old = self._old()
         home.attach_again(transit)
         if self.dead is None:
             worker.on_death(old.died)
@@ -217,6 +142,119 @@ class RecordedToTask(FromProcess):
         old.over(cell, -1, str(self.dead), ordered=False, noticed=worker.noticed_at, reason=self.dead)
         lifecycle.ended(cell, self.dead)
         transit.over(cell, old)
+
+
+class Beginning:
+    """A recorded life that begins in a process: it is the one at the instant at which it is live."""
+
+    def __init__(self, move: Move, switch: Switch) -> None:
+        self._move, self._switch = move, switch
+        self._is_one: asyncio.Future[None] = move.node.loop.create_future()
+        self._live: Live | None = None
+
+    def from_life(self, record: ToHome) -> None:
+        """What it says."""
+        if not isinstance(record, Live):
+            self._switch.from_life(record)
+        elif not self._move.given_up.done() and not self._is_one.done():  # Else it is too late.
+            self._live = record
+            try:
+                self._move.commit()
+            except HoldfastError as error:
+                self.fail(error)
+            else:
+                self._is_one.set_result(None)
+
+    def follow(self, live: asyncio.Future[float]) -> None:
+        """It fails as the home's own future does."""
+        live.add_done_callback(lambda done: None if done.cancelled() else self.fail(done.exception()))
+
+    def fail(self, error: BaseException | None) -> None:
+        """It will never be the one."""
+        if error is not None and not self._is_one.done():
+            is_known = isinstance(error, (StartFailed, CannotMove))
+            self._is_one.set_exception(error if is_known else StartFailed(self._move.cell.path, str(error)))
+            self._is_one.exception()  # Seen: whoever waits may have given up.
+
+    async def is_one(self) -> None:
+        """Wait until it is the one.
+
+        Raises:
+            CannotMove, StartFailed: it will never be.
+        """
+        await self._move.within(self._is_one, self._move.timeout, lambda: "its new life was not up")
+
+    def go_on(self) -> None:
+        """What waits at home is fed to it."""
+        assert self._live is not None
+        self._switch.from_life(self._live)
+        self._move.gone_on_at = now()
+
+
+class ToRecordedWorker(ToWorker):
+    """A recorded life begins in a process of its own."""
+
+    host: RecordedProcessHost
+
+    async def begin(self) -> None:
+        cell, luggage, worker = self.cell, self.move.luggage, self.worker
+        assert worker is not None
+        switch, live, _ = self.host.open(cell)
+        beginning = self._beginning = Beginning(self.move, switch)
+        take = records_of(worker, beginning.from_life)
+        worker.record_taker = lambda path: take
+        port = RemoteLife(cell.path, worker)
+        for record in switch.restore_records():
+            port.to_life(record)
+        recorded = {"method": self.host.method.data(), "turn": switch.state_turn, "stash": switch.stash}
+        kept = {"suspended": luggage.suspended, "trap_exits": luggage.traps}
+        await self.launch(worker, {"recorded": {**recorded, **kept}})
+        switch.attach(port)
+        beginning.follow(live)
+        await beginning.is_one()
+
+    def take_over(self) -> list[Item]:
+        assert self.worker is not None
+        self.worker.adopt(self.cell, None, self.host.died)
+        return []
+
+    def go_on(self) -> None:
+        assert self.worker is not None
+        self._beginning.go_on()
+        self.host.is_live(self.cell)
+        self.worker.connection.flush()
+
+    async def went_on(self) -> None:
+        """It is known."""
+
+
+class ToRecordedHere(Entering):
+    """A recorded life begins in this process."""
+
+    to = "to a task"
+
+    def __init__(self, host: TaskHost) -> None:
+        self.host: TaskHost = host
+        self._arrival: RecordedArrival | None = None
+
+    async def begin(self) -> None:
+        luggage = self.move.luggage
+        arrival = self._arrival = RecordedArrival(self.cell, self.host)
+        await arrival.is_up(self.move, arrival.begin_recorded(suspended=luggage.suspended, trap_exits=luggage.traps))
+
+    def take_over(self) -> list[Item]:
+        assert self._arrival is not None
+        self._arrival.take_place()
+        return []
+
+    def go_on(self) -> None:
+        assert self._arrival is not None
+        self._arrival.go_on()
+        self.move.gone_on_at = now()
+
+    def discard(self) -> None:
+        if self._arrival is not None:
+            self._arrival.discard()
 
 
 class RecordedArrival(Arrival):

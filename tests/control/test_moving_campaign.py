@@ -12,11 +12,16 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.migration.process_move import Move
-from holdfast.actors.migration.to_process import ToProcess
-from holdfast.actors.migration.to_task import FromProcess, ToTask
+from holdfast.actors.migration.here import FromHere, ToHere
+from holdfast.actors.migration.move import Move
+from holdfast.actors.migration.worker import FromOwnWorker, ToWorker
 from holdfast.actors.process.worker_pool import Worker
-from holdfast.checkpoint.home.recorded_moves import RecordedToProcess, RecordedToTask
+from holdfast.checkpoint.home.recorded_moves import (
+    FromRecordedHere,
+    FromRecordedWorker,
+    ToRecordedHere,
+    ToRecordedWorker,
+)
 from tests.control.movers import Count, Ledger, Note, Seen, Slow
 
 pytestmark = pytest.mark.pairs
@@ -68,7 +73,7 @@ async def test_moves_under_load_lose_nothing(system: hf.ActorSystem, name: str, 
 
 
 @pytest.mark.parametrize("here", ["task", "process"])
-@pytest.mark.parametrize("step", ["prepare", "take", "carry", "run"])
+@pytest.mark.parametrize("step", ["prepare", "quiesce", "begin", "run"])
 @pytest.mark.parametrize("name", list(KINDS))
 async def test_a_process_killed_at_any_step_of_a_move_costs_nothing(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, here: Any, step: str, name: str
@@ -105,24 +110,26 @@ def strike_at(monkeypatch: pytest.MonkeyPatch, step: str, ticks: int) -> list[as
     """SIGKILL the process of a move some ticks of the loop after one of its steps has begun ("run": has ended)."""
     strikes: list[asyncio.Task[None]] = []
 
-    async def strike(move: Any) -> None:
+    async def strike(side: Any) -> None:
         for _ in range(ticks):
             await asyncio.sleep(0)
-        worker: Worker | None = move.worker
+        move: Move = side if isinstance(side, Move) else side.move
+        worker: Worker | None = getattr(move.leaving, "worker", None) or getattr(move.entering, "worker", None)
         if worker is not None and worker.is_alive():
             os.kill(worker.pid, signal.SIGKILL)
 
     def watched(plain: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
-        async def struck(move: Any) -> None:
+        async def struck(side: Any) -> None:
             if step != "run":
-                strikes.append(asyncio.create_task(strike(move)))
-            await plain(move)
+                strikes.append(asyncio.create_task(strike(side)))
+            await plain(side)
             if step == "run":
-                strikes.append(asyncio.create_task(strike(move)))
+                strikes.append(asyncio.create_task(strike(side)))
 
         return struck
 
-    for kind in (Move, ToProcess, FromProcess, ToTask, RecordedToProcess, RecordedToTask):
+    leaving = (FromHere, FromOwnWorker, FromRecordedHere, FromRecordedWorker)
+    for kind in (Move, *leaving, ToHere, ToWorker, ToRecordedHere, ToRecordedWorker):
         if step in vars(kind):
             monkeypatch.setattr(kind, step, watched(vars(kind)[step]))
     return strikes

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.migration.process_move import Move
+from holdfast.actors.migration.move import Move
 from tests.control.movers import (
     OTHER,
     Fussy,

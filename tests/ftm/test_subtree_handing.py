@@ -16,12 +16,12 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.migration.move import Move
 from holdfast.actors.process.wire.peer import OutsideHost
 from holdfast.checkpoint.home.subtree_homes import SubtreeHost
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.migration.subtree_groups import SubtreeGroup
-from holdfast.ftm.migration.unrecorded_handover import IntoProcess, OutOfProcess
 from tests.ftm.accounts import Add, Boom, Counter, Later, Load, Tags
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
 from tests.ftm.test_subtree import Heard, Watch, Watcher, at, bank, bank_pid
@@ -322,21 +322,21 @@ async def test_the_process_dies_at_a_step_and_the_child_begins_afresh(
     system: hf.ActorSystem, step: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing of the group is left if it was not to be, and nobody who has asked waits for ever."""
-    change, mover = (attach, OutOfProcess) if step in ("take", "leave") else (detach, IntoProcess)
+    change, say = attach if step in ("take", "leave") else detach, Move.say_now
     await system.start(bank(plain(mechanism=None if change is attach else PBR())))
-    alice, pid, say = at(system, "alice"), bank_pid(system), mover._say
+    alice, pid = at(system, "alice"), bank_pid(system)
     asking: list[asyncio.Future[int]] = []
 
     async def ask(tag: int) -> int:
         return await alice.ask(Add(tag), timeout=30.0)
 
-    def said(self: Any, which: str, **told: Any) -> None:
+    def said(move: Move, worker: Any, which: str, **told: Any) -> None:
         if which == step and not asking:  # Else it is done again, of the next life.
             asking.extend(asyncio.ensure_future(ask(tag)) for tag in (1, 2))
             os.kill(pid, signal.SIGKILL)
-        say(self, which, **told)
+        say(move, worker, which, **told)
 
-    monkeypatch.setattr(mover, "_say", said)
+    monkeypatch.setattr(Move, "say_now", said)
     assert await alice.ask(Add(0)) == 1
     with contextlib.suppress(hf.TransactionFailed):
         await change(system, alice)

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.actors.migration.process_move import Move
+from holdfast.actors.migration.move import Move
 from tests.migration.travellers import KINDS, Luggage, Stream, Traveller, path, take, tree
 
 TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")

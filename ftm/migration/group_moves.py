@@ -1,0 +1,346 @@
+"""The side of a migration that is a group of replicas: attach is a move into one, detach a move out of it.
+
+A group is the new life only when a second replica has caught up. A life that leaves a group comes out of whoever leads
+when nothing is inside any more, and nothing new goes in.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections import deque
+from typing import TYPE_CHECKING, Any, cast
+
+from ...actors.errors import AskTimeout, CannotMove, HoldfastError, StartFailed
+from ...actors.exit_reasons import unpack_exit
+from ...actors.kernel.cell import Cell
+from ...actors.kernel.envelope import Ask, Envelope, Item
+from ...actors.kernel.links import Down, Exit, Monitor
+from ...actors.kernel.mailbox import Bound
+from ...actors.kernel.message import message_name
+from ...actors.migration.move import Entering, Leaving
+from ...actors.migration.quiesce import Transit, now
+from ...actors.overflow import Overflow
+from ...checkpoint.home.capacity import HomeBound
+from ...checkpoint.home.recorded_moves import Detached, refuse_unsaved
+from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK, Live
+from ...checkpoint.snapshot.key_variables import restore_state, save_state
+from ...checkpoint.snapshot.snapshot_record import meta_now
+from ..bricks.replica_orders import EXPORTED_WITHIN, Export
+from ..group.group import Group, Look
+from ..group.group_host import GroupHost
+from ..group.steering import AGAIN_AFTER
+from ..group.trial import rehearsed
+from .unrecorded_luggage import refuse
+
+if TYPE_CHECKING:
+    from ...actors.kernel.actor import Actor
+    from ...checkpoint.home.switch import Switch
+
+MADE_WITHIN = 60.0
+"""Seconds that the processes of the replicas may take to come up; the old life works on meanwhile."""
+FAILED_OVER_WITHIN = 1.0
+
+
+class ToGroup(Entering):
+    """A life begins in a group; `switch` is its home, if it has one already."""
+
+    to = "into a group of replicas"
+
+    def __init__(self, host: GroupHost, switch: Switch | None) -> None:
+        self.host: GroupHost = host
+        self._recorded = switch
+        self._group: Group | None = None
+
+    async def prepare(self) -> None:
+        cell, host, move = self.cell, self.host, self.move
+        if cell.children:
+            names = ", ".join(cell.children)
+            raise CannotMove(cell.path, f"it has children of its own ({names}): have a supervisor start them beside it")
+        self._live: asyncio.Future[Live] = move.node.loop.create_future()
+        self._joined: asyncio.Future[None] = move.node.loop.create_future()
+        switch = host.switch = self._switch = self._recorded or host.homes.made(cell, host.method)
+        group = self._group = await move.within(
+            host.build(cell, switch), MADE_WITHIN, lambda: "its replicas were not up"
+        )
+        group.on_live, group.on_joined = self._is_live, self._has_joined
+        group.on_over = move.give_up
+        # Its replicas have no part yet: one of them tries what all of them are to do.
+        rehearsal = rehearsed(group, group.names[-1])
+        await move.within(rehearsal, MADE_WITHIN, lambda: "its replicas could not try their parts")
+
+    def _is_live(self, live: Live) -> None:
+        if not self._live.done():
+            self._live.set_result(live)
+
+    def _has_joined(self) -> None:
+        if not self._joined.done():
+            self._joined.set_result(None)
+
+    def packed(self, actor: Actor) -> None:
+        if self._recorded is None:
+            self.move.luggage.data = save_state(actor)
+
+    async def begin(self) -> None:
+        move, host, group, switch = self.move, self.host, self._group, self._switch
+        assert group is not None
+        if self._recorded is None:
+            self._plant()
+        live = switch.prepare()
+        live.add_done_callback(self._failed)
+        await move.within(host.lead(group, switch), move.timeout, lambda: "its first replica did not lead")
+        switch.attach(group)
+        await move.within(self._live, move.timeout, lambda: "its new life was not up")
+        group.wake()
+        if len(group.names) > 1:
+            group.tell("join", Look())
+            await move.within(self._joined, move.timeout, lambda: "no second replica caught up")
+
+    def _plant(self) -> None:
+        """The home of an actor that had none begins with its state, and with what it has put aside."""
+        cell, luggage, switch = self.cell, self.move.luggage, self._switch
+        for item in luggage.stash:
+            message, sender = (item.message, item.sender) if isinstance(item, (Ask, Envelope)) else (item, None)
+            body = cell.node.codec.encode(message, cell.path)
+            origin = None if sender is None else sender.path
+            source = switch.record(MESSAGE, message_name(type(message)), body, origin)
+            if isinstance(item, Ask):
+                source.ask, source.chain = item, item.chain
+        switch.turn = 0
+        switch.newest = meta_now(switch, 0, list(switch.open), luggage.data)
+        switch.stash = list(switch.open)
+
+    def _failed(self, live: asyncio.Future[float]) -> None:
+        error = None if live.cancelled() else live.exception()
+        if error is not None and not self._live.done():
+            self._live.set_exception(StartFailed(self.cell.path, str(error)))
+            self._live.exception()
+
+    def take_over(self) -> list[Item]:
+        group = self._group
+        assert group is not None
+        if self._recorded is None:
+            self._move_in()
+        self.host.take_over(self.cell, group)
+        return []
+
+    def _move_in(self) -> None:
+        """What waits for an actor that had no home waits there."""
+        cell, more, luggage, switch = self.cell, self.cell.extra(), self.move.luggage, self._switch
+        bound, topics, waiting = luggage.bound, list(more.topics), luggage.waiting
+        if bound is not None:
+            waiting, bound.waiting = list(bound.waiting), deque()
+        for index, (name, body, left, interval, queued) in enumerate(luggage.rest["timers"]):
+            key = f"attached.{index}"
+            if queued:
+                switch.record(TICK, name, body, None, origin=key)
+            if not queued or interval:
+                switch.timers.start(key, name, body, left or 0.0, interval or 0.0)
+        for item in luggage.queue:
+            if isinstance(item, Item) and not isinstance(item, (Ask, Envelope)):
+                with contextlib.suppress(HoldfastError):  # What is left is of the life that ends.
+                    switch.push(item)
+            else:
+                switch.admit(cell, item)
+        self.host.homes.adopt(cell, switch, self.host.method)
+        for topic in topics:
+            switch.topics[topic] = None
+            cell.node.topics.subscribe(topic, cell)
+        for item in waiting:
+            try:
+                cell.admit(cell, item)
+            except HoldfastError as error:
+                refuse(cell, item, error)
+        if bound is not None:
+            bound.release()
+        more.stash = None
+
+    def go_on(self) -> None:
+        cell, group, luggage = self.cell, self._group, self.move.luggage
+        assert group is not None
+        if luggage.suspended:
+            group.is_suspended = cell.extra().suspended = True
+        self.host.attached(cell, group)
+        self._switch.from_life(self._live.result())  # What waits is fed.
+        group.go_on()
+        self.move.gone_on_at = now()
+
+    def settled(self) -> None:
+        group = self._group
+        assert group is not None
+        if group.is_over:  # No replica is left meanwhile.
+            group.on_over(group.why)
+
+    def discard(self) -> None:
+        self.move.ending = asyncio.ensure_future(self.host.dismantle(self.cell))
+        if self._group is None:
+            return
+        if self._live.done() and not self._live.cancelled():
+            self._live.exception()
+        if self._recorded is None:
+            switch = self._switch
+            switch.timers.replace({})
+            if switch.live is not None and not switch.live.done():
+                switch.live.cancel()
+
+
+class FromRecordedGroup(Leaving):
+    """A recorded life comes out of a group."""
+
+    def __init__(self, cell: Cell) -> None:
+        old = cell.host
+        if not isinstance(old, GroupHost) or old.group is None or old.switch is None:
+            raise CannotMove(cell.path, "it is being recovered; try again")
+        self.host, self._group, self._switch = old, old.group, old.switch
+        self._home: Detached | None = None
+        self._over = self._group.on_over
+        self._has_fallen = False
+
+    async def quiesce(self) -> None:
+        group, move = self._group, self.move
+        group.is_stopping = True
+        move.rest_at = now()
+        end = move.rest_at + move.timeout
+        while True:
+            await move.within(group.quiet(), end - now(), lambda: "a turn of it has not ended")
+            if move.given_up.done():
+                raise CannotMove(self.cell.path, move.given_up.result())
+            epoch = group.epoch
+            try:
+                await self.collect(epoch, end)
+            except CannotMove:
+                raise
+            except AskTimeout:
+                continue  # It is asked again: until its time is over, or the move is given up.
+            except HoldfastError:
+                if await self._has_died(epoch):
+                    continue
+                raise
+            if group.epoch == epoch and group.primary is not None and group.out is None and not group.inside:
+                break
+        move.luggage.suspended = group.is_suspended
+        move.at_rest()
+        group.on_over = self._fell
+        self.detach()
+
+    async def _has_died(self, epoch: int) -> bool:
+        """Whether it was for a failover that no state came: it shows within a second."""
+        group = self._group
+        for _ in range(round(FAILED_OVER_WITHIN / AGAIN_AFTER)):
+            if group.epoch != epoch or group.is_over:
+                break
+            await asyncio.sleep(AGAIN_AFTER)
+        return group.epoch != epoch and not group.is_over
+
+    async def collect(self, epoch: int, end: float) -> None:
+        """Get the state as it is now from whoever leads; after a failover it is done again."""
+        if self._switch.method.snapshots:
+            await self.move.within(self._switch.due.wish(), end - now(), lambda: "its state was not saved")
+
+    def _fell(self, why: str) -> None:
+        """No replica is left meanwhile: the life ends when it is known where it is."""
+        self._has_fallen = True
+        self.move.give_up(why)
+
+    def detach(self) -> None:
+        """Nothing is inside any more: take the life from its home.
+
+        Raises:
+            CannotMove: its state could not be kept.
+        """
+        self._home = Detached(self._switch)
+        refuse_unsaved(self.cell, self._switch)
+
+    def part(self) -> list[Item]:
+        self.move.luggage.suspended = self._group.is_suspended
+        return []
+
+    def retire(self) -> None:
+        """The replicas are not needed any more."""
+        host, group = self.host, self.host.group
+        if group is not None:
+            group.is_over = True
+        if host.probation is not None:
+            host.probation.left()
+        self.move.ending = asyncio.ensure_future(host.dismantle(self.cell))
+
+    def resume(self) -> None:
+        group, transit = self._group, self.move.transit
+        group.is_stopping = False
+        if transit is not None:
+            self.take_back(transit)
+            transit.over(self.cell, self.host)
+            group.on_over = self._over
+            if self._has_fallen:
+                self._over(group.why)
+        group.poke()
+
+    def take_back(self, transit: Transit) -> None:
+        """What had been given away."""
+        if self._home is not None:
+            self._home.attach_again(transit)
+
+
+class FromGroup(FromRecordedGroup):
+    """A life without recovery comes out of a group; it has no home any more."""
+
+    def __init__(self, cell: Cell) -> None:
+        super().__init__(cell)
+        self._stash: list[int] = []
+
+    async def collect(self, epoch: int, end: float) -> None:
+        group, luggage, promised = self._group, self.move.luggage, self._switch.later
+        if promised:  # Nothing is handled any more: they will not become fewer.
+            raise CannotMove(self.cell.path, f"{len(promised)} asks wait for replies that only its handles can give")
+        primary = group.primary
+        if primary is not None:
+            ask = group.protocol(primary).ask(Export(epoch, EXPORTED_WITHIN), EXPORTED_WITHIN)
+            exported = await self.move.within(ask, end - now(), lambda: "its state did not come")
+            data = luggage.data = exported.data
+            luggage.restore = lambda actor: restore_state(actor, data)
+            self._stash, luggage.traps = list(exported.stash), exported.traps
+
+    def detach(self) -> None:
+        """Its home goes when it does."""
+
+    def part(self) -> list[Item]:
+        """What waits at the home: what the actor has put aside, and its messages, as a mailbox has them."""
+        cell, node, luggage, switch = self.cell, self.move.node, self.move.luggage, self._switch
+        for source in switch.open.values():
+            if source.kind in (MESSAGE, TICK, PIPE):
+                item: Any = source.ask
+                if item is None:
+                    message = node.codec.message_in(cell, source.name, source.body)
+                    sender = node.cell_at(source.sender) if source.sender and source.kind == MESSAGE else None
+                    item = message if sender is None else Envelope(message, sender)
+                else:
+                    item.started = False
+                (luggage.stash if source.id in self._stash else luggage.queue).append(item)
+            elif source.kind in (EXIT, DOWN):
+                luggage.queue.append(arrived(cell, source.kind, source.body))
+            else:
+                assert source.kind == START
+        homed, switch.bound = switch.bound, None
+        if homed is not None and homed.capacity:
+            luggage.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
+        luggage.waiting = [ask for ask, _, _, _ in getattr(homed, "waiting", ())]
+        luggage.timers = [list(timer) for timer in switch.timers.saved().values()]
+        switch.open.clear()
+        switch.timers.replace({})
+        self._homed = homed
+        self.host.homes.released(cell.path)
+        return super().part()
+
+    def retire(self) -> None:
+        if isinstance(self._homed, HomeBound):
+            self._homed.senders.release()
+        super().retire()
+
+
+def arrived(cell: Cell, kind: str, body: bytes) -> Exit | Down:
+    """An EXIT or DOWN at a mailbox again."""
+    data = cell.node.codec.decode(dict[str, Any], body)
+    source, reason = cell.node.cell_at(data["source"]), unpack_exit(data["reason"])
+    if kind == EXIT:
+        return Exit(source, reason)
+    return Down(Monitor(cell, source, for_good=data["verb"] == "watch"), reason, bool(data["recovering"]))

@@ -1,0 +1,78 @@
+"""Which sides a migration into a group of replicas has, and one out of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import CannotMove
+from ...actors.kernel.lifecycle import LOCAL
+from ...actors.migration.here import FromHere, ToHere
+from ...actors.migration.move import Move
+from ...actors.process.wire.peer import OutsideHost
+from ...checkpoint.home.recorded_hosts import TaskHost
+from ...checkpoint.home.recorded_moves import FromRecordedHere, ToRecordedHere
+from ...checkpoint.home.subtree_homes import SubtreeHome
+from ..group.group_host import GroupHost
+from ..group.transient_homes import UNKEPT, is_unkept
+from .group_moves import FromGroup, FromRecordedGroup, ToGroup
+from .subtree_groups import SubtreeGroup
+from .subtree_moves import (
+    FromRecordedSubtree,
+    FromRecordedSubtreeGroup,
+    FromSubtree,
+    FromSubtreeGroup,
+    ToRecordedSubtree,
+    ToSubtree,
+    group_for,
+    place_of,
+    spec_of,
+)
+
+if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell, Host
+    from ...checkpoint.home.homes import Homes
+
+PART = ("ftm",)
+"""What a group's parts are children of: no children of the actor's own."""
+
+
+def into_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> Move:
+    """The move of an actor into a group.
+
+    Raises:
+        CannotMove: it lives somewhere else.
+    """
+    old = cell.host
+    if isinstance(old, TaskHost):
+        group = GroupHost(homes, old.method, mechanism)
+        return Move(cell, FromRecordedHere(old, PART), ToGroup(group, old.switch), timeout)
+    if old is LOCAL:
+        return Move(cell, FromHere(PART), ToGroup(GroupHost(homes, None, mechanism), None), timeout)
+    if isinstance(old, SubtreeHome):
+        spec = spec_of(cell)
+        below = group_for(old, spec, old.method, mechanism)
+        return Move(cell, FromRecordedSubtree(cell, old, spec, below), ToGroup(below, old.switch), timeout)
+    if isinstance(old, OutsideHost):
+        spec, place = spec_of(cell), place_of(cell, old)
+        below = group_for(place, spec, UNKEPT, mechanism)
+        return Move(cell, FromSubtree(cell, place, spec, below), ToGroup(below, None), timeout)
+    raise CannotMove(cell.path, "only an actor that lives as a task can be given a mechanism")
+
+
+def out_of_group(cell: Cell, host: Host, timeout: float) -> Move:
+    """The move of a group's life to where its supervisor is; in this process `host` lives it.
+
+    Raises:
+        CannotMove: it is being recovered.
+    """
+    old = cell.host
+    is_plain = isinstance(old, GroupHost) and is_unkept(old.method)
+    if isinstance(old, SubtreeGroup):
+        if is_plain:
+            return Move(cell, FromSubtreeGroup(cell), ToSubtree(cell, old), timeout)
+        return Move(cell, FromRecordedSubtreeGroup(cell), ToRecordedSubtree(cell, old), timeout)
+    if is_plain:
+        return Move(cell, FromGroup(cell), ToHere(LOCAL), timeout)
+    if not isinstance(host, TaskHost):
+        raise CannotMove(cell.path, "it is being recovered; try again")
+    return Move(cell, FromRecordedGroup(cell), ToRecordedHere(host), timeout)

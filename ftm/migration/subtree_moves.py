@@ -1,0 +1,415 @@
+"""The side of a migration that is the process of the actor's supervisor, as the root sees it.
+
+The supervisor there has the child running all the while. The home of a recorded child is here already. One without
+recovery has a home only while a group lives it: what is in the mailbox there goes along as the last that leaves, so
+nobody's messages overtake each other. If the process dies meanwhile, the child begins afresh with the subtree.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any, cast
+
+import msgspec
+
+from ...actors.errors import CannotMove, HoldfastError, StartFailed, error_text
+from ...actors.exit_reasons import ExitReason, unpack_exit
+from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.envelope import Item
+from ...actors.kernel.mailbox import Bound, Bounded
+from ...actors.kernel.message import message_name
+from ...actors.migration.move import Entering, Leaving
+from ...actors.migration.quiesce import now
+from ...actors.migration.worker import BUSY
+from ...actors.overflow import Overflow
+from ...actors.process.wire import frames
+from ...actors.process.wire.peer import OutsideHost
+from ...actors.process.wire.start_codec import pack_recipe
+from ...actors.process.worker_pool import Worker
+from ...checkpoint.home.held_messages import inlet
+from ...checkpoint.home.recorded_hosts import RemoteLife
+from ...checkpoint.home.recorded_moves import Beginning, Detached, refuse_unsaved
+from ...checkpoint.home.subtree_homes import SubtreeHome, SubtreeHost
+from ...checkpoint.method import Method
+from ...checkpoint.protocol import Closed, Protected, ToHome, Wanted
+from ...supervision.respec import recipe_spec
+from ..group.transient_homes import UNKEPT
+from ..model.mechanism import compose
+from .group_moves import FromGroup, FromRecordedGroup
+from .subtree_groups import SubtreeGroup
+from .unrecorded_luggage import pack, refuse, unpack
+
+if TYPE_CHECKING:
+    from ...actors.kernel.cell import Admit
+    from ...supervision.spec import ChildSpec
+
+NUMBER = 0
+"""Under which the supervisor there wants a life that it has not asked for: it counts its own from 1."""
+MADE_OF = Protected(b"", [], {})
+"""What a life is made of that is known at the root."""
+
+
+def spec_of(cell: Cell) -> ChildSpec:
+    """What the root knows of how the child begins. Raises CannotMove: nothing."""
+    spec = recipe_spec(cell)
+    if spec is None:
+        raise CannotMove(cell.path, "no recipe at the root has its spec")
+    for port, path in spec.bindings.items():
+        cell.extra().bindings.setdefault(port, cell.node.cell_at(path))
+    return spec
+
+
+def worker_of(place: SubtreeHome, cell: Cell) -> Worker:
+    """The process of the supervisor. Raises CannotMove: it has just died."""
+    if place.worker is None:
+        raise CannotMove(cell.path, "the process of its supervisor has ended; try again")
+    return place.worker
+
+
+def place_of(cell: Cell, host: OutsideHost) -> SubtreeHome:
+    """Where the supervisor of such a child is heard.
+
+    Raises:
+        CannotMove: it is no child of one that has a process of its own.
+    """
+    worker = host.peer
+    top = worker.cell if isinstance(worker, Worker) else None
+    if not isinstance(worker, Worker) or top is None or not isinstance(top.host, SubtreeHost):
+        raise CannotMove(cell.path, "only a child of a supervisor can be given a mechanism")
+    worker.record_taker(cell.path)  # From now on it is heard.
+    return top.host.at(cell.path)
+
+
+def group_for(place: SubtreeHome, spec: ChildSpec, method: Method, mechanism: Any) -> SubtreeGroup:
+    """The host of a life that is to be lived by a group."""
+    host = SubtreeGroup(place, method, compose(mechanism))
+    host.prepare(pack_recipe(spec.start, place.path), list(spec.start.kind._topics))
+    return host
+
+
+class FromRecordedSubtree(Leaving):
+    """A recorded life leaves the process of its supervisor, for a group."""
+
+    def __init__(self, cell: Cell, place: SubtreeHome, spec: ChildSpec, group: SubtreeGroup) -> None:
+        self._place, self._spec, self._group = place, spec, group
+        self._worker = worker_of(place, cell)
+        self._home: Detached | None = None
+
+    async def quiesce(self) -> None:
+        move = self.move
+        self._taken: asyncio.Future[None] = move.node.loop.create_future()
+        move.hear(self._worker, self._heard)
+        move.say_now(self._worker, "take")
+        await move.within(self._taken, move.timeout, lambda: BUSY)
+        refuse_unsaved(self.cell, self._place.switch)
+
+    def _heard(self, step: str, told: dict[str, Any]) -> None:
+        move = self.move
+        if step == "refused":
+            move.give_up(str(told["why"]))
+        elif step == "taken" and not move.given_up.done():
+            assert self._place.switch is not None
+            move.rest_at = float(told["at"])
+            move.luggage.suspended = bool(told["suspended"])
+            self.cell.extra().trap_exits = bool(told["trap_exits"])  # The replicas will know.
+            self._home = Detached(self._place.switch)
+            move.at_rest()
+            self._taken.set_result(None)
+
+    def part(self) -> list[Item]:
+        cell, host, worker = self.cell, self._group, self._worker
+        wanted = self._place.hand_over(host)
+        host.found(msgspec.structs.replace(wanted, protected=MADE_OF), RemoteLife(cell.path, worker))
+        self.move.say_now(worker, "leave", number=wanted.number, layers=host.described())
+        cell.extra().trap_exits, cell.extra().start = False, self._spec.start  # Its replicas know.
+        return []
+
+    def resume(self) -> None:
+        cell, move = self.cell, self.move
+        cell.extra().trap_exits = False
+        if move.is_late:
+            settle_in(self)
+            return
+        move.say_now(self._worker, "back")
+        if move.transit is not None:
+            assert self._home is not None
+            self._home.attach_again(move.transit)
+            move.transit.over(cell, move.transit.old)
+        cell.scheduled = True  # Nothing of it runs here.
+
+
+class FromSubtree(Leaving):
+    """A life without recovery leaves the process of its supervisor, for a group."""
+
+    def __init__(self, cell: Cell, place: SubtreeHome, spec: ChildSpec, group: SubtreeGroup) -> None:
+        self._place, self._spec, self._group = place, spec, group
+        self._worker = worker_of(place, cell)
+        self._admit: Admit = cell.admit
+        self._held: list[Any] = []  # what has been sent to it here meanwhile
+        self._told: dict[str, Any] = {}
+        cell.table = spec.start.kind._table
+
+    async def quiesce(self) -> None:
+        move, place = self.move, self._place
+        self._taken: asyncio.Future[None] = move.node.loop.create_future()
+        self._left: asyncio.Future[None] = move.node.loop.create_future()
+        place.arriving, place.on_lost = lambda record: None, self._lost
+        move.hear(self._worker, self._heard)
+        move.say_now(self._worker, "take")
+        await move.within(self._taken, move.timeout, lambda: BUSY)
+
+    def _heard(self, step: str, told: dict[str, Any]) -> None:
+        move = self.move
+        match step:
+            case "refused":
+                move.give_up(str(told["why"]))
+            case "taken" if not move.given_up.done():
+                try:
+                    self._has_come_to_rest(told)
+                except Exception as error:  # What a message of its own raises when it is read.
+                    move.give_up(error_text(error))
+            case "left" if move.is_bound and not self._left.done():
+                self._told = told
+                try:
+                    move.commit()
+                except HoldfastError as error:
+                    self._left.set_exception(error)
+                else:
+                    self._left.set_result(None)
+            case _:
+                pass
+
+    def _has_come_to_rest(self, told: dict[str, Any]) -> None:
+        cell, move, luggage = self.cell, self.move, self.move.luggage
+        move.rest_at, luggage.rest, luggage.data = float(told["at"]), told["rest"], told["state"]
+        luggage.suspended = bool(luggage.rest["suspended"])
+        luggage.stash = unpack(self._worker, cell, told["stash"])
+        cell.extra().trap_exits = bool(luggage.rest["trap_exits"])  # The replicas will know.
+        cell.admit = self._hold
+        move.at_rest()
+        self._taken.set_result(None)
+
+    def _hold(self, cell: Cell, item: Any) -> None:
+        """Stands in `cell.admit`: what waits in the process is ahead of it."""
+        if not isinstance(item, Item) and type(item) not in cell.table:
+            cell.require(item)
+        self._held.append(item)
+
+    async def let_go(self) -> None:
+        self.move.is_bound = True
+        self.move.say_now(self._worker, "leave", number=NUMBER, layers=self._group.described())
+        await asyncio.shield(self._left)
+
+    def part(self) -> list[Item]:
+        cell, luggage, more, told, host = self.cell, self.move.luggage, self.cell.extra(), self._told, self._group
+        self._quit()
+        chosen = None
+        if told["bound"] is not None:
+            capacity, overflow = told["bound"]
+            chosen = Bounded(capacity, cast("Overflow", overflow))
+            more.bound = Bound(capacity, chosen.overflow)
+        luggage.queue = unpack(self._worker, cell, told["queue"])
+        luggage.waiting, self._held = self._held, []
+        kind = self._spec.start.kind
+        wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen, MADE_OF)
+        host.found(wanted, RemoteLife(cell.path, self._worker))
+        self._place.found(cell, host)
+        more.trap_exits, more.start = False, self._spec.start
+        return []
+
+    def _let_go(self, held: list[Any]) -> None:
+        """What has waited here goes where the actor lives."""
+        cell = self.cell
+        self._held = []
+        for item in held:
+            try:
+                cell.admit(cell, item)
+            except HoldfastError as error:
+                refuse(cell, item, error)
+
+    def _quit(self) -> None:
+        self._place.arriving = self._place.on_lost = None
+
+    def _lost(self, reason: ExitReason) -> None:
+        """The process has died: so has the child."""
+        cell, move, held = self.cell, self.move, self._held
+        self._quit()
+        if move.transit is not None:
+            move.transit.over(cell, self._worker.inner.lived_there(cell))
+        self._worker.inner.gone(cell.path, reason)
+        move.is_late = True
+        why = f"its process has died ({reason})"
+        move.give_up(why)
+        if not self._left.done():
+            self._left.set_exception(CannotMove(cell.path, why))
+            self._left.exception()
+        self._let_go(held)
+
+    def resume(self) -> None:
+        cell, move = self.cell, self.move
+        cell.extra().trap_exits = False
+        self._quit()
+        if cell.state is GONE or move.is_bound:
+            return
+        if move.transit is not None:
+            cell.admit = self._admit
+            self._let_go(self._held)
+        move.say_now(self._worker, "back")
+        if move.transit is not None:
+            move.transit.over(cell, move.transit.old)
+        cell.scheduled = True  # Nothing of it runs here.
+
+
+class IntoSubtree(Entering):
+    """A life enters the process of its supervisor, from a group: what both kinds have in common."""
+
+    to = "to the process of its supervisor"
+
+    def __init__(self, cell: Cell, group: SubtreeGroup) -> None:
+        self._group, self.place = group, group.place
+        self.worker = worker_of(group.place, cell)
+
+    def discard(self) -> None:
+        self.place.arriving = None
+        if self.move.transit is not None:
+            self.move.say_now(self.worker, "stay")
+
+
+class ToRecordedSubtree(IntoSubtree):
+    """A recorded life enters it."""
+
+    def __init__(self, cell: Cell, group: SubtreeGroup) -> None:
+        super().__init__(cell, group)
+        self.host = self.place
+        if not self.place.slot:
+            raise CannotMove(cell.path, "its process holds as many recorded actors as it can")
+
+    async def begin(self) -> None:
+        cell, move, place = self.cell, self.move, self.place
+        place.method = self._group.method
+        switch, live, _ = place.open(cell)
+        beginning = self._beginning = Beginning(move, switch)
+        place.arriving = self._said
+        port = RemoteLife(cell.path, self.worker)
+        for record in switch.restore_records():
+            port.to_life(record)
+        told = {"number": self._group.number, "turn": switch.state_turn, "stash": switch.stash, "slot": place.slot}
+        move.say_now(self.worker, "come", is_suspended=move.luggage.suspended, **told)
+        switch.attach(port)
+        beginning.follow(live)
+        await beginning.is_one()
+
+    def _said(self, record: ToHome) -> None:
+        """From the life that begins in the process."""
+        if isinstance(record, Closed):
+            self._beginning.fail(StartFailed(self.cell.path, str(unpack_exit(record.reason))))
+        else:
+            self._beginning.from_life(record)
+
+    def take_over(self) -> list[Item]:
+        self.place.arriving = None
+        self._wanted = msgspec.structs.replace(self._group.hand_over(), protected=None)
+        self.move.say_now(self.worker, "settle")
+        return []
+
+    def go_on(self) -> None:
+        for port, target in self.cell.extra().bindings.items():
+            self.place.told(self.cell, "bind", {"port": port, "target": target.path})
+        self._beginning.go_on()
+
+    def settled(self) -> None:
+        self.place.take_back(self.cell, self._wanted)
+
+
+class ToSubtree(IntoSubtree):
+    """A life without recovery enters it."""
+
+    async def begin(self) -> None:
+        move, luggage = self.move, self.move.luggage
+        self._up: asyncio.Future[None] = move.node.loop.create_future()
+        self.place.arriving = self._said
+        move.hear(self.worker, self._heard)
+        move.say_now(self.worker, "come", state=luggage.data, traps=luggage.traps)
+        await move.within(self._up, move.timeout, lambda: "its new life was not up")
+
+    def _said(self, record: ToHome) -> None:
+        if isinstance(record, Closed):
+            self._fail(StartFailed(self.cell.path, str(unpack_exit(record.reason))))
+
+    def _heard(self, step: str, told: dict[str, Any]) -> None:
+        if self._up.done() or self.move.given_up.done():
+            return
+        if step == "failed":
+            self._fail(StartFailed(self.cell.path, str(told["why"])))
+        elif step == "up":
+            try:
+                self.move.commit()
+            except HoldfastError as error:
+                self._fail(error)
+            else:
+                self._up.set_result(None)
+
+    def _fail(self, error: HoldfastError) -> None:
+        if not self._up.done():
+            self._up.set_exception(error)
+            self._up.exception()
+
+    def take_over(self) -> list[Item]:
+        """What waits at the home goes there, with all that ties the actor to others."""
+        cell, move, luggage, more, worker = self.cell, self.move, self.move.luggage, self.cell.extra(), self.worker
+        switch, node = self._group.switch, cell.node
+        assert switch is not None
+        self.place.arriving = None
+        topics = dict.fromkeys([*self._group.topics(cell), *switch.topics])
+        for topic in topics:
+            node.topics.unsubscribe(topic, inlet(switch, topic))
+            node.topics.subscribe(topic, cell)
+        told = {
+            "stash": pack(worker, cell, luggage.stash),
+            "queue": pack(worker, cell, [*luggage.queue, *luggage.waiting]),
+            "timers": luggage.timers,
+            "is_suspended": luggage.suspended,
+            "links": [peer.path for peer in more.links],
+            "monitors": [[watch.watcher.path, watch.for_good] for watch in more.monitors],
+            "watches": [[watch.target.path, watch.for_good] for watch in more.watching],
+            "topics": list(topics),
+        }
+        for watch in list(more.watching):
+            watch.cancel()  # It begins to watch again, there.
+        move.say_now(worker, "settle", **told)
+        self._group.hand_over()
+        self.place.forget()
+        more.outlet, more.suspended = None, False
+        self.host = worker.inner.lived_there(cell)
+        return []
+
+    def go_on(self) -> None:
+        cell, worker = self.cell, self.worker
+        for port, target in cell.extra().bindings.items():
+            data = {"port": port, "target": target.path}
+            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), "bind", data))
+        self.move.gone_on_at = now()
+
+    def settled(self) -> None:
+        self.cell.spec = None  # Its supervisor is not here.
+
+
+class FromRecordedSubtreeGroup(FromRecordedGroup):
+    """A recorded life comes out of a group, and its supervisor is in another process."""
+
+    def resume(self) -> None:
+        settle_in(self) if self.move.is_late else super().resume()
+
+
+class FromSubtreeGroup(FromGroup):
+    """The same, without recovery."""
+
+    def resume(self) -> None:
+        settle_in(self) if self.move.is_late else super().resume()
+
+
+def settle_in(side: Leaving) -> None:
+    """The life that was on its way has ended: the next one, if it has begun already, has its own place."""
+    cell, transit = side.cell, side.move.transit
+    if transit is not None:
+        transit.over(cell, transit.old if cell.host is transit else cell.host)
