@@ -387,7 +387,7 @@ CHECKS = {
         "test_what_waits_goes_along",
     ),
     "a detach that has the state looks whether that still counts": Check(
-        "ftm/migration/detach.py",
+        "ftm/migration/group_moves.py",
         "            if group.epoch == epoch and group.primary is not None and group.out is None and not",
         "            if not",
         "tests/ftm/test_attach.py",
@@ -413,6 +413,13 @@ CHECKS = {
         "            if False and silent <",
         "tests/ftm/test_deaf_joiner.py",
         "60",
+    ),
+    "a move that was given up does not commit": Check(
+        "actors/migration/move.py",
+        "        if self.given_up.done() and not self.is_bound:\n",
+        "        if False:\n",
+        "tests/migration/test_move.py",
+        "test_a_move_that_is_given_up",
     ),
     "a word of a migration has an end": Check(
         "actors/migration/words.py",
