@@ -115,7 +115,9 @@ class Moves:
             if probation is not None:
                 probation.detach = lambda: self.unprotect(cell, timeout)
 
-        if place_of(cell) == "process":
+        # Without recovery, only what lives in this process has what a group needs of its state.
+        is_by_way_of_a_task = place_of(cell) == "process" and not isinstance(cell.host, RecordedProcessHost)
+        if is_by_way_of_a_task:
             await self._settle_in(cell, "task", before.limits, timeout)
         try:
             move = await self._moved(
@@ -125,7 +127,7 @@ class Moves:
                 moved,
             )
         except BaseException:
-            if before.isolation == "process":
+            if is_by_way_of_a_task:
                 await self._settle_in(cell, "process", before.limits, timeout)
             raise
         if self._node.watched:
@@ -142,21 +144,27 @@ class Moves:
 
     async def _unprotected(self, cell: Cell, timeout: float) -> None:
         from ..ftm.events import MechanismDetached
-        from ..ftm.migration.protection import out_of_group
+        from ..ftm.migration.protection import is_plain, out_of_group
         from ..ftm.model.mechanism import compose
 
         before: ChildSpec = cell.spec
-        wanted = dataclasses.replace(before, mechanism=None, isolation="task")
+        is_by_way_of_a_task = before.isolation == "process" and is_plain(cell)
+        wanted = dataclasses.replace(
+            before,
+            mechanism=None,
+            isolation="task" if is_by_way_of_a_task else before.isolation,
+            limits=None if is_by_way_of_a_task else before.limits,
+        )
         move = await self._moved(
             cell,
             timeout,
-            lambda: out_of_group(cell, self._node.host_for(wanted), timeout),
+            lambda: out_of_group(cell, self._entering(self._node.host_for(wanted), wanted.limits), timeout),
             lambda: replace_mechanism(cell, wanted),
         )
         if self._node.watched:
             names = tuple(layer.name for layer in compose(before.mechanism))
             self._node.emit(MechanismDetached(cell.path, names, move.gone_on_at - move.rest_at))
-        if before.isolation == "process":
+        if is_by_way_of_a_task:
             await self._settle_in(cell, "process", before.limits, timeout)
 
     async def adapt(self, cell: Cell, mechanism: Any, timeout: float) -> None:

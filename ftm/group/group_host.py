@@ -386,8 +386,8 @@ class GroupHost(Steered):
         if self.on_step is not None:
             self.on_step(name)
 
-    async def lead(self, group: Group, switch: Switch) -> None:
-        """Give the first replica what there is, and have it lead.
+    async def lead(self, group: Group, switch: Switch, *, traps: bool = False) -> None:
+        """Give the first replica what there is, and have it lead; `traps`: the life that comes to it traps exits.
 
         Raises:
             StartFailed: it could not.
@@ -396,7 +396,7 @@ class GroupHost(Steered):
         life = group.life_of(first)
         if not life:
             raise StartFailed(group.path, f"{first} has ended")
-        protocol, traps = group.protocol(first), group.cell.extra().trap_exits  # of the life that has come to rest
+        protocol = group.protocol(first)
         try:
             pieces = switch.restore_records()
             if not pieces and switch.state_turn >= 0:

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import CannotMove
 from ...actors.kernel.lifecycle import LOCAL
-from ...actors.migration.here import FromHere, ToHere
+from ...actors.migration.here import FromHere
 from ...actors.migration.move import Move
 from ...actors.process.wire.peer import OutsideHost
-from ...checkpoint.home.recorded_hosts import TaskHost
-from ...checkpoint.home.recorded_moves import FromRecordedHere, ToRecordedHere
+from ...checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
+from ...checkpoint.home.recorded_moves import FromRecordedHere, FromRecordedWorker
 from ...checkpoint.home.subtree_homes import SubtreeHome
 from ..group.group_host import GroupHost
 from ..group.transient_homes import UNKEPT, is_unkept
@@ -29,7 +29,8 @@ from .subtree_moves import (
 )
 
 if TYPE_CHECKING:
-    from ...actors.kernel.cell import Cell, Host
+    from ...actors.kernel.cell import Cell
+    from ...actors.migration.move import Entering
     from ...checkpoint.home.homes import Homes
 
 PART = ("ftm",)
@@ -46,6 +47,12 @@ def into_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> Move
     if isinstance(old, TaskHost):
         group = GroupHost(homes, old.method, mechanism)
         return Move(cell, FromRecordedHere(old, PART), ToGroup(group, old.switch), timeout)
+    if isinstance(old, RecordedProcessHost):
+        worker = old.worker_of(cell)
+        if worker is None:
+            raise CannotMove(cell.path, "its process has ended")
+        group = GroupHost(homes, old.method, mechanism)
+        return Move(cell, FromRecordedWorker(worker), ToGroup(group, old.switch), timeout)
     if old is LOCAL:
         return Move(cell, FromHere(PART), ToGroup(GroupHost(homes, None, mechanism), None), timeout)
     if isinstance(old, SubtreeHome):
@@ -59,20 +66,20 @@ def into_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> Move
     raise CannotMove(cell.path, "only an actor that lives as a task can be given a mechanism")
 
 
-def out_of_group(cell: Cell, host: Host, timeout: float) -> Move:
-    """The move of a group's life to where its supervisor is; in this process `host` lives it.
+def out_of_group(cell: Cell, entering: Entering, timeout: float) -> Move:
+    """The move of a group's life to where its supervisor is; if that is the root, it enters there.
 
     Raises:
         CannotMove: it is being recovered.
     """
     old = cell.host
-    is_plain = isinstance(old, GroupHost) and is_unkept(old.method)
-    if isinstance(old, SubtreeGroup):
-        if is_plain:
-            return Move(cell, FromSubtreeGroup(cell), ToSubtree(cell, old), timeout)
-        return Move(cell, FromRecordedSubtreeGroup(cell), ToRecordedSubtree(cell, old), timeout)
-    if is_plain:
-        return Move(cell, FromGroup(cell), ToHere(LOCAL), timeout)
-    if not isinstance(host, TaskHost):
-        raise CannotMove(cell.path, "it is being recovered; try again")
-    return Move(cell, FromRecordedGroup(cell), ToRecordedHere(host), timeout)
+    if not isinstance(old, SubtreeGroup):
+        return Move(cell, FromGroup(cell) if is_plain(cell) else FromRecordedGroup(cell), entering, timeout)
+    if is_plain(cell):
+        return Move(cell, FromSubtreeGroup(cell), ToSubtree(cell, old), timeout)
+    return Move(cell, FromRecordedSubtreeGroup(cell), ToRecordedSubtree(cell, old), timeout)
+
+
+def is_plain(cell: Cell) -> bool:
+    """Whether the actor has no recovery, and a home only as long as a group lives it."""
+    return isinstance(cell.host, GroupHost) and is_unkept(cell.host.method)

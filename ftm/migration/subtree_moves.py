@@ -110,8 +110,7 @@ class FromRecordedSubtree(Leaving):
         elif step == "taken" and not move.given_up.done():
             assert self._place.switch is not None
             move.rest_at = float(told["at"])
-            move.luggage.suspended = bool(told["suspended"])
-            self.cell.extra().trap_exits = bool(told["trap_exits"])  # The replicas will know.
+            move.luggage.suspended, move.luggage.traps = bool(told["suspended"]), bool(told["trap_exits"])
             self._home = Detached(self._place.switch)
             move.at_rest()
             self._taken.set_result(None)
@@ -121,12 +120,11 @@ class FromRecordedSubtree(Leaving):
         wanted = self._place.hand_over(host)
         host.found(msgspec.structs.replace(wanted, protected=MADE_OF), RemoteLife(cell.path, worker))
         self.move.say_now(worker, "leave", number=wanted.number, layers=host.described())
-        cell.extra().trap_exits, cell.extra().start = False, self._spec.start  # Its replicas know.
+        cell.extra().start = self._spec.start
         return []
 
     def resume(self) -> None:
         cell, move = self.cell, self.move
-        cell.extra().trap_exits = False
         if move.is_late:
             settle_in(self)
             return
@@ -182,9 +180,8 @@ class FromSubtree(Leaving):
     def _has_come_to_rest(self, told: dict[str, Any]) -> None:
         cell, move, luggage = self.cell, self.move, self.move.luggage
         move.rest_at, luggage.rest, luggage.data = float(told["at"]), told["rest"], told["state"]
-        luggage.suspended = bool(luggage.rest["suspended"])
+        luggage.suspended, luggage.traps = bool(luggage.rest["suspended"]), bool(luggage.rest["trap_exits"])
         luggage.stash = unpack(self._worker, cell, told["stash"])
-        cell.extra().trap_exits = bool(luggage.rest["trap_exits"])  # The replicas will know.
         cell.admit = self._hold
         move.at_rest()
         self._taken.set_result(None)
@@ -214,7 +211,7 @@ class FromSubtree(Leaving):
         wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen, MADE_OF)
         host.found(wanted, RemoteLife(cell.path, self._worker))
         self._place.found(cell, host)
-        more.trap_exits, more.start = False, self._spec.start
+        more.start = self._spec.start
         return []
 
     def _let_go(self, held: list[Any]) -> None:
@@ -247,7 +244,6 @@ class FromSubtree(Leaving):
 
     def resume(self) -> None:
         cell, move = self.cell, self.move
-        cell.extra().trap_exits = False
         self._quit()
         if cell.state is GONE or move.is_bound:
             return
