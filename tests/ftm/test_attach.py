@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import pytest
 
 import holdfast as hf
+from holdfast.actors.events import Moved
 from holdfast.actors.process.process_host import ProcessHost
 from holdfast.checkpoint.protocol import Snapshot
 from holdfast.ftm.bricks.brick_messages import Done, Work
@@ -448,9 +449,10 @@ class Busy(Counter):
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
+@pytest.mark.parametrize("isolation", ["task", "process"])
 @pytest.mark.parametrize("method", ["without recovery", "hybrid"])
-async def test_whether_it_traps_exits_comes_along(system: hf.ActorSystem, method: str) -> None:
-    ref = await system.start(hf.child("alice", hf.start(Busy), recovery=METHODS[method]()))
+async def test_whether_it_traps_exits_comes_along(system: hf.ActorSystem, method: str, isolation: Any) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Busy), recovery=METHODS[method](), isolation=isolation))
     assert await ref.ask(Hold(0.0)) is False
     await attach(system, ref)
     assert await ref.ask(Hold(0.0)) is True
@@ -458,6 +460,24 @@ async def test_whether_it_traps_exits_comes_along(system: hf.ActorSystem, method
     assert primary is not None
     os.kill(pid_of(system, ref, primary), signal.SIGKILL)
     assert await ref.ask(Hold(0.0), timeout=30) is True
+    await two_again(ref)
+    await detach(system, ref)
+    assert await ref.ask(Hold(0.0), timeout=30) is True
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_a_recorded_actor_goes_between_its_process_and_a_group_in_one_move(system: hf.ActorSystem) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), recovery=hf.hybrid(), isolation="process"))
+    assert await ref.ask(Add(1)) == 1
+    with system.events() as events:
+        await attach(system, ref)
+        assert await ref.ask(Add(2)) == 2
+        await detach(system, ref)
+        assert await ref.ask(Add(3)) == 3
+        assert not [one for one in events.take() if isinstance(one, Moved)]  # to a task and from there
+    assert system.pid_of(ref) != os.getpid()
+    os.kill(system.pid_of(ref), signal.SIGKILL)
+    assert await ref.ask(Tags(), timeout=30) == [1, 2, 3]
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
