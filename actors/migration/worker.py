@@ -39,7 +39,7 @@ class ToWorker(Entering):
     to = "to a process"
 
     def __init__(self, host: ProcessHost, workers: Workers, limits: Limits | None) -> None:
-        self.host: ProcessHost = host
+        self.host, self._died = host, host.died
         self._workers, self._limits = workers, limits
         self.worker: Worker | None = None
         self.recipe = b""
@@ -86,7 +86,7 @@ class ToWorker(Entering):
         if luggage.bound is not None:
             more.bound = RemoteBound(luggage.bound).inherit(luggage.bound)
             cell.admit = admit_remote_bounded
-        worker.adopt(cell, None, self.host.died)
+        worker.adopt(cell, None, self._died)
         if luggage.stash:
             self.move.say(worker, "stash")
             for item in luggage.stash:

@@ -26,6 +26,8 @@ from .switch import Switch
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
     from ...actors.kernel.envelope import Item
+    from ...actors.process.resource_limits import Limits
+    from ...actors.process.worker_pool import Workers
 
 
 class Detached:
@@ -194,19 +196,21 @@ class Beginning:
 class ToRecordedWorker(ToWorker):
     """A recorded life begins in a process of its own."""
 
-    host: RecordedProcessHost
+    def __init__(self, host: RecordedProcessHost, workers: Workers, limits: Limits | None) -> None:
+        super().__init__(host, workers, limits)
+        self._recorded = host
 
     async def begin(self) -> None:
         cell, luggage, worker = self.cell, self.move.luggage, self.worker
         assert worker is not None
-        switch, live, _ = self.host.open(cell)
+        switch, live, _ = self._recorded.open(cell)
         beginning = self._beginning = Beginning(self.move, switch)
         take = records_of(worker, beginning.from_life)
         worker.record_taker = lambda path: take
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
-        recorded = {"method": self.host.method.data(), "turn": switch.state_turn, "stash": switch.stash}
+        recorded = {"method": self._recorded.method.data(), "turn": switch.state_turn, "stash": switch.stash}
         kept = {"suspended": luggage.suspended, "trap_exits": luggage.traps}
         await self.launch(worker, {"recorded": {**recorded, **kept}})
         switch.attach(port)
@@ -215,13 +219,13 @@ class ToRecordedWorker(ToWorker):
 
     def take_over(self) -> list[Item]:
         assert self.worker is not None
-        self.worker.adopt(self.cell, None, self.host.died)
+        self.worker.adopt(self.cell, None, self._recorded.died)
         return []
 
     def go_on(self) -> None:
         assert self.worker is not None
         self._beginning.go_on()
-        self.host.is_live(self.cell)
+        self._recorded.is_live(self.cell)
         self.worker.connection.flush()
 
     async def went_on(self) -> None:
@@ -234,12 +238,12 @@ class ToRecordedHere(Entering):
     to = "to a task"
 
     def __init__(self, host: TaskHost) -> None:
-        self.host: TaskHost = host
+        self.host = self._recorded = host
         self._arrival: RecordedArrival | None = None
 
     async def begin(self) -> None:
         luggage = self.move.luggage
-        arrival = self._arrival = RecordedArrival(self.cell, self.host)
+        arrival = self._arrival = RecordedArrival(self.cell, self._recorded)
         await arrival.is_up(self.move, arrival.begin_recorded(suspended=luggage.suspended, trap_exits=luggage.traps))
 
     def take_over(self) -> list[Item]:

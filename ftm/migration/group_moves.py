@@ -48,12 +48,12 @@ class ToGroup(Entering):
     to = "into a group of replicas"
 
     def __init__(self, host: GroupHost, switch: Switch | None) -> None:
-        self.host: GroupHost = host
+        self.host = self._host = host
         self._recorded = switch
         self._group: Group | None = None
 
     async def prepare(self) -> None:
-        cell, host, move = self.cell, self.host, self.move
+        cell, host, move = self.cell, self._host, self.move
         if cell.children:
             names = ", ".join(cell.children)
             raise CannotMove(cell.path, f"it has children of its own ({names}): have a supervisor start them beside it")
@@ -82,7 +82,7 @@ class ToGroup(Entering):
             self.move.luggage.data = save_state(actor)
 
     async def begin(self) -> None:
-        move, host, group, switch = self.move, self.host, self._group, self._switch
+        move, host, group, switch = self.move, self._host, self._group, self._switch
         assert group is not None
         if self._recorded is None:
             self._plant()
@@ -122,7 +122,7 @@ class ToGroup(Entering):
         assert group is not None
         if self._recorded is None:
             self._move_in()
-        self.host.take_over(self.cell, group)
+        self._host.take_over(self.cell, group)
         return []
 
     def _move_in(self) -> None:
@@ -143,7 +143,7 @@ class ToGroup(Entering):
                     switch.push(item)
             else:
                 switch.admit(cell, item)
-        self.host.homes.adopt(cell, switch, self.host.method)
+        self._host.homes.adopt(cell, switch, self._host.method)
         for topic in topics:
             switch.topics[topic] = None
             cell.node.topics.subscribe(topic, cell)
@@ -161,7 +161,7 @@ class ToGroup(Entering):
         assert group is not None
         if luggage.suspended:
             group.is_suspended = cell.extra().suspended = True
-        self.host.attached(cell, group)
+        self._host.attached(cell, group)
         self._switch.from_life(self._live.result())  # What waits is fed.
         group.go_on()
         self.move.gone_on_at = now()
@@ -173,7 +173,7 @@ class ToGroup(Entering):
             group.on_over(group.why)
 
     def discard(self) -> None:
-        self.move.ending = asyncio.ensure_future(self.host.dismantle(self.cell))
+        self.move.ending = asyncio.ensure_future(self._host.dismantle(self.cell))
         if self._group is None:
             return
         if self._live.done() and not self._live.cancelled():

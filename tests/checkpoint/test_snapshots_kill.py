@@ -71,7 +71,9 @@ async def test_the_forked_writer_dies_in_the_middle_of_a_snapshot(system: hf.Act
     ref = await canvas(system, "process", MANY)
     killed = 0
     with system.events() as stream:
-        for number in range(20):
+        for number in range(400):
+            if number >= 20 and killed >= 3:
+                break  # On a busy machine a writer has often written all before it is seen.
             paint = Paint(moments.randrange(MANY), MANY // 2)
             want.paint(paint)
             await ref.ask(paint, timeout=30.0)
