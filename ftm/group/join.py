@@ -127,9 +127,8 @@ class Joiner(Actor):
             if first is None or first.life != life:
                 first = Deaf(life, 0, begin, starved)
             deaf = self._deaf[name] = first._replace(times=first.times + 1)
-            starved = min(group.starved(name) - first.starved, group.detection.hopeless)
-            silent = time.monotonic() - first.since - starved
-            if isinstance(error, AskTimeout) and silent < DEAF_AFTER * FOLLOWED_WITHIN + group.at_work(name):
+            silent = time.monotonic() - first.since - group.excused(name, first.starved)
+            if isinstance(error, AskTimeout) and silent < DEAF_AFTER * FOLLOWED_WITHIN:
                 raise  # It got no processor, or goes through a large state.
             if deaf.times < DEAF_AFTER:
                 raise

@@ -230,6 +230,13 @@ class Members(Securing):
         pid = self._pid_of(name)
         return 0.0 if pid is None else min(work_on_state(pid), self.detection.hopeless)
 
+    def excused(self, name: str, starved: float) -> float:
+        """Seconds of a silence that need not be a replica's fault: it got no processor, or goes through its state.
+
+        `starved`: for how long it had got none when the silence began. Never more than until it is hopeless, of each.
+        """
+        return min(max(0.0, self.starved(name) - starved), self.detection.hopeless) + self.at_work(name)
+
     def _pid_of(self, name: str) -> int | None:
         cell = self.cell_of(name)
         worker = cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None

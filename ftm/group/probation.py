@@ -74,7 +74,8 @@ class Probation:
         self.moved(group)
         self._begun = group.node.loop.time()
         self._begin_anew()
-        self._last_turn, self._moved_at, self._looked_at = self._turn, self._since, self._since
+        self._last_turn, self._looked_at = self._turn, self._since
+        self._has_moved(self._since)
         self._timer = group.node.loop.call_later(LOOK_EVERY, self._look)
         self._asking: asyncio.Task[None] | None = None
         self._again_at, self._pause = 0.0, LOOK_EVERY  # when going back is tried again
@@ -190,12 +191,26 @@ class Probation:
         if group.members != self._members:
             self._begin_anew()
         if group.switch.turn != self._last_turn or (group.out is None and not group.waiting):
-            self._last_turn, self._moved_at = group.switch.turn, now
+            self._last_turn = group.switch.turn
+            self._has_moved(now)
         if now - self._moved_at >= STUCK_AFTER:  # Whoever has led meanwhile: nothing has passed.
-            if self._asking is None and group.primary is not None:
-                self._asking = loop.create_task(self._ask(group, group.primary))
+            name = group.primary
+            if self._asking is None and name is not None and now - self._moved_at - self._excused() >= STUCK_AFTER:
+                self._asking = loop.create_task(self._ask(group, name))
         elif self._is_long_enough() and self._asking is None:
             self._asking = loop.create_task(self._look_at_others(group))
+
+    def _has_moved(self, now: float) -> None:
+        """A turn has ended, or nothing waits for one."""
+        group = self._group
+        self._moved_at, self._starved = now, {name: group.starved(name) for name in group.names}
+
+    def _excused(self) -> float:
+        """Seconds since then for which it is no fault of the bricks that nothing has passed.
+
+        Those of whoever leads wait for the others: that one of them goes through its state is excuse enough.
+        """
+        return max(self._group.excused(name, self._starved.get(name, 0.0)) for name in self._group.names)
 
     async def _ask(self, group: Group, name: str) -> None:
         """Something has waited for long, and no turn has ended: is the actor at work, or do the bricks keep it?"""
@@ -207,7 +222,8 @@ class Probation:
         finally:
             self._asking = None
         if doing.computes or group.is_suspended or group.is_stopping:
-            self._moved_at = self._looked_at = group.node.loop.time()
+            self._looked_at = group.node.loop.time()
+            self._has_moved(self._looked_at)
             return
         if group.switch.turn != self._last_turn or group.primary != name or not group.is_well(name):
             return  # It goes on, or another one is asked.
@@ -228,8 +244,9 @@ class Probation:
         """Nobody waits for the bricks of those that do not lead: it stays if they too have let pass what has come."""
         try:
             for name in group.backups():
-                life, order = group.members.get(name, 0), Computes(group.switch.turn, STUCK_AFTER)
-                doing: Doing = await group.protocol(name).ask(order, STUCK_AFTER + ASKED_WITHIN)
+                seconds = STUCK_AFTER + group.at_work(name)
+                life, order = group.members.get(name, 0), Computes(group.switch.turn, seconds)
+                doing: Doing = await group.protocol(name).ask(order, seconds + ASKED_WITHIN)
                 if not doing.passes and not doing.computes and name != group.primary and group.is_well(name):
                     why = f"its bricks have let nothing pass for {STUCK_AFTER:g} s"
                     group.at_fault(name, why)

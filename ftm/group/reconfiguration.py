@@ -381,7 +381,7 @@ class AdaptationEngine(Actor):
         group.is_resting = group.is_changing = True
         self._step("commit")
         order = Commit(change.config)
-        turns, found = await self._ask_all(change.prepared, order, COMMITTED_WITHIN)
+        turns, found = await self._ask_until_silent(change, order)
         if found and group.link is not None:  # Done for an earlier life of ours, their links have ended.
             done, _ = await self._ask_all(found, order, COMMITTED_WITHIN, reach=group.entry)
             turns |= done
@@ -404,6 +404,27 @@ class AdaptationEngine(Actor):
                 group.lost(name, "it had not got all when the mechanism was changed")
                 group.dropped.add(name)
         self._go_on()
+
+    async def _ask_until_silent(
+        self, change: Reconfiguration, order: Commit
+    ) -> tuple[dict[str, Any], dict[str, BaseException]]:
+        """Order all that are prepared, and those again that may not have heard it yet: twice is as good as once."""
+        group, begin = self._group, self._now()
+        starved = {name: group.starved(name) for name in change.prepared}
+        turns: dict[str, Any] = {}
+        found: dict[str, BaseException] = {}
+        left = list(change.prepared)
+        while left:
+            done, errors = await self._ask_all(left, order, COMMITTED_WITHIN)
+            turns |= done
+            found |= errors
+            silent = self._now() - begin
+            left = [
+                name
+                for name, error in errors.items()
+                if isinstance(error, AskTimeout) and silent - group.excused(name, starved[name]) < COMMITTED_WITHIN
+            ]
+        return turns, {name: error for name, error in found.items() if name not in turns}
 
     # -- while requests flow again ------------------------------------------------------------------------------------
 

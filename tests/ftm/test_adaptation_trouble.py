@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.ftm.group import reconfiguration
+from holdfast.ftm.group.membership import Members
 from holdfast.ftm.group.reconfiguration import STEPS, CannotAdapt
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
@@ -145,6 +147,30 @@ async def test_a_stopped_replica_is_replaced_and_the_change_is_made(system: hf.A
     await load.reached(10)
     await load.stop()
     load.check(await ref.ask(Tags()))
+
+
+@pytest.mark.parametrize("works", [True, False])
+async def test_a_replica_that_goes_through_its_state_has_more_time_to_change_over(
+    system: hf.ActorSystem, works: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It holds still as one that goes through a large state does; that it does, and how long it may, is told here."""
+    ref = await protected(system)
+    group, still = group_of(ref), 1.5
+    (name,) = group.backups()
+    pid = pid_of(system, ref, name)
+    monkeypatch.setattr(reconfiguration, "COMMITTED_WITHIN", 0.3)
+    monkeypatch.setattr(Members, "at_work", lambda group, of: 30.0 if works and of == name else 0.0)
+
+    def hold_still() -> None:
+        os.kill(pid, signal.SIGSTOP)
+        asyncio.get_running_loop().call_later(still, os.kill, pid, signal.SIGCONT)
+
+    seen = struck(ref, "commit", hold_still)
+    await transition(system, ref, LFR())
+    assert "commit" in seen
+    assert await ref.ask(Add(1)) == 1
+    assert await consistent(system, ref) == ("lfr",)
+    assert (pid_of(system, ref, name) == pid) is works
 
 
 async def test_a_change_of_a_life_that_ends_is_refused(system: hf.ActorSystem) -> None:
