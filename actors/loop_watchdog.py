@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 from .errors import SpecError, type_name
 from .events import LoopLagged, TurnSlow
 from .kernel import loop as run_loop
+from .kernel.envelope import message_in
 
 if TYPE_CHECKING:
     from .kernel.node import Node
@@ -125,5 +126,4 @@ def _running(frame: types.FrameType | None) -> tuple[types.FrameType, str, str] 
 
 
 def _named(cell: Any, item: Any) -> tuple[str, str]:
-    message = getattr(item, "message", None)
-    return cell.path, type_name(type(item if message is None else message))
+    return cell.path, type_name(type(message_in(item)))

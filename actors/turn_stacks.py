@@ -7,6 +7,8 @@ from collections.abc import Coroutine, Iterator
 from types import CodeType, FrameType
 from typing import TYPE_CHECKING, Any
 
+from .kernel.envelope import message_in
+
 if TYPE_CHECKING:
     from .kernel.cell import Cell
 
@@ -28,7 +30,7 @@ def _cells(top: Cell) -> Iterator[Cell]:
 def _of(cell: Cell) -> Iterator[str]:
     turn = cell.more.turn if cell.more is not None else None
     if turn is not None:
-        what = "its end" if turn.item is None else type(getattr(turn.item, "message", turn.item)).__name__
+        what = "its end" if turn.item is None else type(message_in(turn.item)).__name__
         seconds = cell.node.loop.time() - turn.since
         yield f"{cell.path} ({cell.state}) has been in the turn of {what} for {seconds:.1f} s:"
         yield from stack_of(turn.coroutine)

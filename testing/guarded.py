@@ -9,6 +9,7 @@ from ..actors.errors import HoldfastError
 from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
 from ..actors.exit_reasons import Exited, Hung, OutOfMemory, Signal
 from ..actors.kernel.cell import Host
+from ..actors.kernel.envelope import message_in
 from ..supervision.spec import ChildSpec
 from ..system.system import ActorSystem
 from .clock import RealTimeNeeded, VirtualClockLoop
@@ -149,7 +150,7 @@ def describe(event: Event) -> str:
 
 
 def _brief(item: Any) -> str:
-    text = repr(getattr(item, "message", item))
+    text = repr(message_in(item))
     return text if len(text) <= 200 else text[:200] + "..."
 
 

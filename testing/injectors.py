@@ -22,6 +22,7 @@ from ..checkpoint.group_commit import Submission
 from ..checkpoint.home.outputs import switch_of
 from ..checkpoint.inputs import HomeJournal
 from ..checkpoint.journal import Saved, StoreFailed
+from ..checkpoint.life.recorded_inbox import Fed
 from ..system.system import ActorSystem
 from .damage import damaged
 from .faults import Strikes
@@ -204,7 +205,7 @@ class TurnFaults(TurnWatcher):
         self._hung: list[asyncio.Future[None]] = []
 
     def begins(self, cell: Cell, item: Any) -> Substitute | None:
-        if cell is not self._cell or not (message_of(item) is not None or hasattr(item, "feed")):
+        if cell is not self._cell or not (message_of(item) is not None or isinstance(item, Fed)):
             return None
         return self._before if self._strikes.at == "turn begin" else self._after
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, cast
 from ..errors import ControlFailed, NotSuspended, SpecError, error_text, type_name
 from ..kernel import mailbox
 from ..kernel.actor import Actor, Start
+from ..kernel.envelope import message_in
 from ..kernel.message import message_name
 from ..process.wire.start_codec import pack_recipe, unpack_recipe
 from ..values import UnsavableValue
@@ -265,7 +266,7 @@ def status_of(cell: Cell) -> Status:
         None if parent is None else parent.path,
         cell.life,
         cell.host.backlog(cell),
-        None if turn is None else type_name(type(getattr(item, "message", None) or item)),
+        None if turn is None else type_name(type(message_in(item))),
         0.0 if turn is None else cell.node.loop.time() - turn.since,
         0 if more is None else len(more.links),
         0 if more is None else len(more.monitors),

@@ -16,7 +16,7 @@ from ..events import EventHub, EventStream, MessageIn, MessageOut, TurnBegan, Tu
 from ..kernel import mailbox
 from ..kernel.codec import Parcel
 from ..kernel.context import ActorContext
-from ..kernel.envelope import Handler, Item, Table, unhandled
+from ..kernel.envelope import Handler, Item, Table, message_in, unhandled
 from ..kernel.message import Message, Refusal
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ def tap_of(cell: Cell) -> Tap:
 
 
 def _message(item: Any) -> object:
-    message = item if isinstance(item, (Message, Parcel)) else getattr(item, "message", item)
+    message = message_in(item)
     return message.name.replace(":", ".") if isinstance(message, Parcel) else message
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 from ..errors import ActorStopped, AskDeadlock, HoldfastError, remote_crash
 from ..exit_reasons import NORMAL, ExitReason
 from . import links, mailbox
-from .envelope import Ask, Chain, Envelope, Item, ReplyHandle
+from .envelope import Ask, Chain, Envelope, Item, ReplyHandle, chain_of, message_in
 from .links import Monitor
 from .message import Message, require_message
 from .timers import Timer
@@ -79,8 +79,9 @@ class ActorContext:
     @property
     def sender(self) -> ActorRef[Any] | None:
         """Who sent the message in hand; None if it was no actor."""
-        sender = getattr(self.item, "sender", None)
-        return None if sender is None else cast("Cell", sender).ref
+        item = self.item
+        sender: Cell | None = item.sender if isinstance(item, Item) else None
+        return None if sender is None else sender.ref
 
     def now(self) -> float:
         """Unix time in seconds; in a journaled actor, that of the input in hand."""
@@ -145,7 +146,7 @@ class ActorContext:
         if self._asking is not self.item:
             self._asking = self.item
             self._turn = self.cell.node.next_turn()
-        return ((self.path, self._turn), *getattr(self.item, "chain", ()))
+        return ((self.path, self._turn), *chain_of(self.item))
 
     def turn_in(self, chain: Chain) -> bool:
         """Whether this actor's suspended turn is one of those in the chain."""
@@ -179,8 +180,8 @@ class ActorContext:
             cell.admit(cell, item)
         elif isinstance(item, Envelope):
             to._cell.admit(to._cell, Envelope(item.message, item.sender))
-        elif (message := getattr(item, "message", item)) is not None:  # A timer's or a pipe's is an item of this life.
-            to._cell.admit(to._cell, message)
+        else:
+            to._cell.admit(to._cell, message_in(item))  # The item of a timer or a pipe is of this life.
 
     def reply_handle(self) -> ReplyHandle[Any]:
         """The right to answer the ask in hand later: `return self.ctx.reply_handle()`, keep it, call `reply`."""
@@ -469,7 +470,7 @@ class Stashed(Envelope, eq=False):
     @classmethod
     def of(cls, item: Any) -> Stashed:
         """In place of `item`."""
-        return cls(getattr(item, "message", item), getattr(item, "sender", None))
+        return cls(message_in(item), item.sender if isinstance(item, Item) else None)
 
 
 class Piped(Item):

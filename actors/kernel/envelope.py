@@ -16,6 +16,7 @@ from ..errors import AskTimeout, HoldfastError, UnknownMessage, type_name
 from .message import Message, MessageText, Refusal, by_name, message_of
 
 if TYPE_CHECKING:
+    from ..exit_reasons import ExitReason
     from .cell import Cell
     from .context import ActorContext
 
@@ -38,6 +39,14 @@ class Item:
     """Whether it stands at the front of the queue for a command, ahead of all messages."""
     ends_turn: ClassVar[bool] = False
     """Whether it is what is left of the turn before: nothing, not even a command, comes between the two."""
+    message: Any = None
+    """The message that it brings, if it does."""
+    sender: Any = None
+    """The cell of the actor that has sent it, if one has."""
+    chain: Chain = ()
+    """The turns that wait for its turn."""
+    stops: ExitReason | None = None
+    """Why the life has to end in good order, if that is what it commands."""
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -53,6 +62,13 @@ class Item:
 
     def stashed(self) -> None:
         """Its turn puts it aside: it will come again, out of its order."""
+
+    def fail(self, error: Any) -> None:
+        """Its turn has crashed the actor: whoever waits for it hears of that."""
+
+    def ignored(self, cell: Cell, why: str) -> bool:
+        """Its turn has said that the actor does not want to live; False: it may not say that."""
+        return False
 
     def is_start(self) -> bool:
         """Whether its turn is the start of a life: if that fails, there is nothing that `on_stop` could take down."""
@@ -115,6 +131,19 @@ class AnyTable(Table):
 
     def knows(self, kind: type) -> bool:
         return True
+
+
+def message_in(item: Any) -> Any:
+    """What an entry of a mailbox brings: a message is its own item, and its fields may have any names.
+
+    What brings none is that itself.
+    """
+    return item.message if isinstance(item, Item) and item.message is not None else item
+
+
+def chain_of(item: Any) -> Chain:
+    """The turns that wait for the turn of an entry of a mailbox."""
+    return item.chain if isinstance(item, Item) else ()
 
 
 def unhandled(actor: Any, message: Any) -> object:

@@ -264,6 +264,10 @@ class Stop(Item):
     def __init__(self, reason: ExitReason) -> None:
         self.reason = reason
 
+    @property
+    def stops(self) -> ExitReason:  # type: ignore[override]  # others have it as None
+        return self.reason
+
     @staticmethod
     def run(actor: Any, item: Any) -> object:
         stop(actor.ctx.cell, item.reason, item)
@@ -298,15 +302,15 @@ def _raise(error: BaseException) -> None:
 def crash(cell: Cell, item: Any, error: BaseException) -> None:
     """User code raised in the turn of `item`: its asker hears of it, and the life ends."""
     pass_on(cell, error)
-    if isinstance(error, Ignore) and hasattr(item, "ignored") and item.ignored(cell, error.why):
+    is_item = isinstance(item, Item)  # Else it is the user's message, whose fields may have any names.
+    if isinstance(error, Ignore) and is_item and item.ignored(cell, error.why):
         finish(cell, NORMAL, is_orderly=False)  # No crash: it does not want to live.
         return
-    is_start = isinstance(item, Item) and item.is_start()
+    is_start = is_item and item.is_start()
     reason = exit_reasons.crash(error)
-    fail = getattr(item, "fail", None)
-    if fail is not None:
-        fail(remote_crash(error))
-    elif isinstance(item, FirstTurn):
+    if is_item:
+        item.fail(remote_crash(error))
+    if isinstance(item, FirstTurn):
         start_fails(cell, item, StartFailed(cell.path, str(reason)))
         if isinstance(error, StartFailed) and getattr(type(cell.actor), "_supervises", False):
             finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).

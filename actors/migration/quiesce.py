@@ -87,7 +87,7 @@ class Take(Item):
 
 def _ends(command: Item) -> bool:
     """Whether a command is one to stop or to be killed."""
-    return isinstance(command, Kill) or hasattr(command, "reason")
+    return isinstance(command, Kill) or command.stops is not None
 
 
 def _busy(cell: Cell) -> str:
@@ -301,8 +301,8 @@ def obey_commands(cell: Cell, commands: list[Item]) -> None:
             cell.host.control(cell, command)
         elif isinstance(command, Kill):
             cell.host.kill(cell)
-        elif _ends(command):
-            cell.host.stop(cell, command.reason)  # type: ignore[attr-defined]  # each kind of stop has one
+        elif command.stops is not None:
+            cell.host.stop(cell, command.stops)
 
 
 def decoded(cell: Cell, item: Any) -> Any:

@@ -34,7 +34,7 @@ class Fed(Item):
         self.is_stashed = False
 
     @property
-    def chain(self) -> tuple[tuple[str, int], ...]:
+    def chain(self) -> tuple[tuple[str, int], ...]:  # type: ignore[override]  # others have it as an attribute
         """Who waits for this turn."""
         return self.feed.chain
 
@@ -232,6 +232,10 @@ class StopRecorded(Item):
 
     def __init__(self, life: Life, reason: ExitReason) -> None:
         self.life, self.reason = life, reason
+
+    @property
+    def stops(self) -> ExitReason:  # type: ignore[override]  # others have it as None
+        return self.reason
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:

@@ -12,7 +12,7 @@ from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.context import Stashed
-from ...actors.kernel.envelope import Ask, Envelope, Table
+from ...actors.kernel.envelope import Ask, Envelope, Table, chain_of, message_in
 from ...actors.kernel.message import Message, Refusal
 from ..admin import NotSupported
 from ..children import STOPPED, Child
@@ -60,7 +60,7 @@ class Router(Actor):
         if self._routing == "broadcast":
             self._to_all(item)
             return
-        chain = getattr(item, "chain", ())
+        chain = chain_of(item)
         waiting = {path for path, _ in chain}  # Their turns wait for this very ask.
         crew = [one.cell for one in self._candidates() if one.cell is not None]
         free = [cell for cell in crew if cell.path not in waiting] if waiting else crew
@@ -98,7 +98,7 @@ class Router(Actor):
 
     def _key_of(self, item: Any) -> Any:
         """The key of a message. Raises NoRoute."""
-        message = getattr(item, "message", item)
+        message = message_in(item)
         assert self._key is not None
         try:
             key = getattr(message, self._key) if isinstance(self._key, str) else self._key(message)
@@ -151,7 +151,7 @@ class Router(Actor):
         if isinstance(item, Ask):
             item.fail(error)
         else:
-            cell.node.dead_letter(cell, getattr(item, "message", item), str(error))
+            cell.node.dead_letter(cell, message_in(item), str(error))
 
     def _to_all(self, item: Any) -> None:
         if isinstance(item, Ask):

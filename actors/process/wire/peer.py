@@ -60,7 +60,7 @@ class Peer:
             if isinstance(item, Ask):
                 self._send_ask(cell, path, item, number)
                 return
-            source, message = item.sender, item.message  # type: ignore[attr-defined]  # an envelope, or as one
+            source, message = item.sender, item.message
         # Names are numbered by first use: here in the order in which the other side reads them.
         to = connection.name_out(path)
         name, body = self._payload(message)
