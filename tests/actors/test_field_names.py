@@ -10,7 +10,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.events import ActorCrashed
 
-NAMES = (
+NAMES = {
     "sender",
     "message",
     "chain",
@@ -23,7 +23,7 @@ NAMES = (
     "feed",
     "stops",
     "started",
-)
+}
 
 
 class Odd(hf.Message[str]):
