@@ -298,7 +298,7 @@ class CannotMove(HoldfastError, text="{actor} cannot be moved: {why}"):
 class NotGranted(
     HoldfastError,
     text="{by} lives in a process and may not order {actor} ({order}): orders go to what it has started and "
-    "to what it is bound to, child(..., bindings={{'port': {actor!r}}})",
+    "to what the root has bound it to, child(..., bindings={{'port': {actor!r}}})",
 ):
     """An actor in a process gave an order (stop, start a child) to one it has not started: bind it to that one."""
 

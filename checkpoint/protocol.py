@@ -273,15 +273,17 @@ class Unsaved(msgspec.Struct, array_like=True, tag=16):
 
 
 class Protected(msgspec.Struct, array_like=True):
-    """What a wanted child that a mechanism protects is made of: its recipe, the layers as data, and its bindings."""
+    """What a wanted child that a mechanism protects is made of: its recipe, and the layers as data."""
 
     recipe: bytes
     layers: list[Any]
-    bindings: dict[str, str]
 
 
 class Wanted(msgspec.Struct, array_like=True, tag=17):
-    """A supervisor in another process wants to start a recorded or protected child, whose home is at the root."""
+    """A supervisor in another process wants to start a recorded or protected child, whose home is at the root.
+
+    `bindings` says where those of the child lead, port to address.
+    """
 
     number: int
     kind: str
@@ -289,6 +291,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     method: Method
     bound: Bounded | None
     protected: Protected | None = None
+    bindings: dict[str, str] = {}
 
 
 class Closed(msgspec.Struct, array_like=True, tag=18):

@@ -72,9 +72,10 @@ def new_cell(own: Cell, one: Child) -> Cell:
     cell.extra().start = spec.start
     if spec.mailbox is not None:
         node.bound(cell, spec.mailbox)
+    is_claimed = node.uplink is not None  # The root has not bound it, though it may have named it in a recipe.
     for port, target in targets.items():
         assert target is not None
-        node.bind(cell, port, target)
+        node.bind(cell, port, target, is_claimed=is_claimed)
     return cell
 
 

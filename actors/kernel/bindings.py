@@ -7,7 +7,10 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 from ..errors import HoldfastError
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from .actor import Actor
+    from .cell import Cell
     from .ref import ActorRef
 
 A_co = TypeVar("A_co", bound="Actor", covariant=True)
@@ -48,3 +51,47 @@ class Binding(Generic[A_co]):
 
     def __set__(self, actor: Any, target: Any) -> None:
         raise AttributeError(f"binding {self._name!r} is set by the runtime: use system.bind()")
+
+
+# -- claims: what another process says of its own actors ------------------------------------------------------------
+#
+# To whoever looks at the structure a claim is a binding like any other. It grants nothing: otherwise a process could
+# grant itself any address. `More.claimed` has the ports of which nothing else is known.
+
+
+def claim(cell: Cell, told: Mapping[str, str]) -> None:
+    """Take an actor process's word for where the bindings of one of its actors lead: ports to addresses.
+
+    What was bound here stands: the process has been told, or will be.
+    """
+    more = cell.more
+    if more is None and not told:
+        return
+    more = cell.extra()
+    for port in more.claimed - told.keys():
+        more.bindings.pop(port, None)
+    more.claimed = frozenset(port for port in told if port in more.claimed or port not in more.bindings)
+    for port in more.claimed:
+        more.bindings[port] = cell.node.cell_at(told[port])
+
+
+def doubt(cell: Cell) -> None:
+    """What was bound here has ended with an actor process: what the next one says will count."""
+    more = cell.more
+    if more is not None:
+        more.claimed = frozenset(more.bindings)
+
+
+def settle_claims(cell: Cell, named: Mapping[str, str]) -> None:
+    """Have the bindings that a spec of this process names lead where it says, unless they were bound anew here."""
+    more = cell.extra()
+    for port, path in named.items():
+        if port in more.claimed or port not in more.bindings:
+            more.bindings[port] = cell.node.cell_at(path)
+    more.claimed -= named.keys()
+
+
+def unclaimed(cell: Cell) -> dict[str, Cell]:
+    """The bindings that were made here, which grant what they lead to."""
+    more = cell.more
+    return {} if more is None else {port: to for port, to in more.bindings.items() if port not in more.claimed}

@@ -112,6 +112,7 @@ class More:
         "bindings",
         "bound",
         "calls",
+        "claimed",
         "enders",
         "has_ties",
         "last",
@@ -147,6 +148,7 @@ class More:
 
     def __init__(self) -> None:
         self.bound: Bound | None = None
+        self.claimed: frozenset[str] = frozenset()  # ports of which only another process says where they lead
         self.enders: list[asyncio.Future[ExitReason]] | None = None
         self.has_ties = False  # whether any of the collections was made
         self.last: Actor | None = None  # the actor of the ended life, if it wants what stays undelivered

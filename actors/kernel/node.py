@@ -250,8 +250,14 @@ class Node(RunLoop):
         if cell is not None and cell.more is not None and name in cell.more.names:
             cell.more.names.remove(name)
 
-    def bind(self, cell: Cell, port: str, target: Cell) -> None:
+    def bind(self, cell: Cell, port: str, target: Cell, *, is_claimed: bool = False) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on.
+
+        Args:
+            cell: the owner.
+            port: the name of the binding.
+            target: where it leads from then on.
+            is_claimed: it is only the word of the owner's process that it leads there, and grants nothing.
 
         Raises:
             SpecError: the class has no such binding.
@@ -267,11 +273,12 @@ class Node(RunLoop):
             led = self.led.setdefault(cell.path, {})
             same = {before.path, target.path, *led.get(before.path, ()), *led.get(target.path, ())}
             led.update(dict.fromkeys(same, same))
+        more.claimed = more.claimed | {port} if is_claimed else more.claimed - {port}
         if more.turn is None:
             more.bindings[port] = target
         else:  # One turn sees one target, also if it waits meanwhile.
             more.turn.rebinds = {**(more.turn.rebinds or {}), port: target}
-        cell.host.told(cell, "bind", {"port": port, "target": target.path})
+        cell.host.told(cell, "bind", {"port": port, "target": target.path, "is_claimed": is_claimed})
 
 
 def _void() -> None:

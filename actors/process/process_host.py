@@ -478,7 +478,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "unsubscribe":
             node.topics.unsubscribe(frame.data["topic"], cell)
         case "born":
-            worker.inner.born(cell, frame.data["path"], frame.data["kind"], frame.data["life"])
+            data = frame.data
+            worker.inner.born(cell, data["path"], data["kind"], data["life"], data.get("bindings", {}))
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ..exit_reasons import ExitReason
 from ..kernel import lifecycle, links
 from ..kernel.actor import Actor, Start
+from ..kernel.bindings import claim
 from ..kernel.cell import RUNNING, Cell, Host
 from ..kernel.codec import Parcel
+from ..kernel.node import cell_kind
 from .wire.connection import BadFrame
 from .wire.peer import OutsideHost, Peer
 from .wire.start_codec import loaded
@@ -30,8 +32,8 @@ class Inner:
         """All of them that are there."""
         return self._cells.values()
 
-    def born(self, home: Cell, path: str, kind: str, life: int) -> None:
-        """A life has begun at `path` below `home`.
+    def born(self, home: Cell, path: str, kind: str, life: int, bound: Mapping[str, str]) -> None:
+        """A life has begun at `path` below `home`; its bindings lead there, as its process says.
 
         Raises:
             BadFrame: that address is not for this process to give.
@@ -43,6 +45,9 @@ class Inner:
             cell.state, cell.admit = RUNNING, self._admit
         cell.life = life
         know(cell, kind)
+        above = cell_kind(home)
+        if above is None or not above._is_part:  # Who is protected is bound at its own address, not in its replicas.
+            claim(cell, bound)
 
     def homed(self, home: Cell, path: str, cell: Cell | None, host: Host) -> Cell:
         """An address below `home` whose own home is here: its cell outlives the process.

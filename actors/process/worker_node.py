@@ -207,7 +207,7 @@ class Guest(Peer):
         root = self.node.root
         if root is None or is_at_or_below(path, root.path):
             return
-        if not is_granted(path, every_cell(root)):
+        if not is_granted(path, root, every_cell(root)):
             sender = current.get(None)
             raise NotGranted(path, order, root.path if sender is None else sender.path)
 
@@ -241,7 +241,9 @@ class Guest(Peer):
         start = cell.extra().start
         kind = type(cell.actor) if cell.actor is not None else None if start is None else start.kind
         if kind is not None:
-            self.command(root, "born", {"path": path, "kind": message_name(kind), "life": cell.life})
+            bound = {port: target.path for port, target in cell.extra().bindings.items()}
+            born = {"path": path, "kind": message_name(kind), "life": cell.life, "bindings": bound}
+            self.command(root, "born", born)
 
     def _on_event(self, event: Event) -> None:
         if type(event) is ActorStarted:
@@ -385,7 +387,9 @@ class Guest(Peer):
 
     def _command(self, cell: Cell, frame: frames.Command) -> None:
         if frame.verb == "bind":
-            cell.extra().bindings[str(frame.data["port"])] = named(self.node, frame, "target")
+            more, port = cell.extra(), str(frame.data["port"])
+            more.bindings[port] = named(self.node, frame, "target")
+            more.claimed = more.claimed | {port} if frame.data.get("is_claimed") else more.claimed - {port}
         elif frame.verb == "control":
             obey_order(self, cell, frame)
         else:

@@ -25,7 +25,7 @@ from ...actors.process.worker_pool import Worker, Workers
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
 from ..method import Method
-from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd
+from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
 from .homes import ENDED, HomeHost, Homes, seen
 from .switch import Switch
 
@@ -267,6 +267,8 @@ def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRec
             for out in record.outs:
                 if out.verb in SENT:
                     gate.output(out.to, out.name)
+        elif isinstance(record, Wanted):
+            gate.claims(record.bindings)
         elif isinstance(record, Snapshot) and record.image is not None:
             pid = record.image.pid
             if pid != worker.pid and parent_of(pid) != worker.pid:

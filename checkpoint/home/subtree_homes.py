@@ -14,6 +14,7 @@ from ...actors.control.orders_lane import Call, send_call
 from ...actors.errors import HoldfastError, StartFailed
 from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle, links
+from ...actors.kernel.bindings import claim, doubt
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell, Host
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.mailbox import Bound
@@ -171,6 +172,8 @@ class SubtreeHome(HomeHost, Elsewhere):
 
     def joined(self, top: Cell, worker: Worker, slot: int) -> None:
         """The process that the next lives are lived in."""
+        if worker is not self._worker and self.cell is not None and self._group is None:
+            doubt(self.cell)
         self._top, self._worker, self._slot = top, worker, slot
 
     def from_life(self, worker: Worker, record: ToHome) -> None:
@@ -208,6 +211,7 @@ class SubtreeHome(HomeHost, Elsewhere):
         cell = self.cell = worker.inner.homed(top, self.path, self.cell, self)
         cell.spec = wanted  # Somebody restarts it: it is not dead between two lives.
         know(cell, wanted.kind)
+        claim(cell, wanted.bindings)
         if wanted.bound is not None:
             cell.extra().bound = Bound(wanted.bound.capacity, wanted.bound.overflow)
         port = RemoteLife(self.path, worker)
@@ -405,8 +409,9 @@ class SubtreeHome(HomeHost, Elsewhere):
             cell.extra().calls.append(call)  # Sent behind what the next life begins with.
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        if verb == "bind":
-            self._tell(cell, verb, data)
+        worker = self._worker
+        if verb == "bind" and worker is not None:  # Also between two lives: the address has its bindings there.
+            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
         elif verb == "gone":
             self.restarting = bool(data["with_parent"])
 

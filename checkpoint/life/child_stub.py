@@ -91,7 +91,8 @@ class ChildStub:
         self._up = node.loop.create_future()
         port = self._port = self.joined(cell)
         kind, topics = message_name(start.kind), list(start.kind._topics)
-        port.to_home(Wanted(self._number, kind, topics, method, self.bound, made))
+        bindings = {name: target.path for name, target in more.bindings.items()}
+        port.to_home(Wanted(self._number, kind, topics, method, self.bound, made, bindings))
         return self._up
 
     def is_starting(self, number: int) -> bool:

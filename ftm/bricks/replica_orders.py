@@ -31,6 +31,8 @@ class Setting(msgspec.Struct, array_like=True, frozen=True):
     """Seconds between two heartbeats."""
     watch_turns: float = 0.0
     """Seconds that a turn may take; 0: as many as it wants."""
+    claimed: frozenset[str] = frozenset()
+    """Ports of which only another actor process says where they lead: these grant nothing."""
 
 
 class Install(Message[None]):

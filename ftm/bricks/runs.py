@@ -234,8 +234,9 @@ class Shadow(Server):
         self.standing.shadows.add(self)
         cell.spec = child(name, self._recipe)
         cell.extra().start = self._recipe
+        claimed = main.extra().claimed
         for port, target in main.extra().bindings.items():
-            node.bind(cell, port, target)
+            node.bind(cell, port, target, is_claimed=port in claimed)
         self.start(cell)
 
     async def close(self) -> None:

@@ -227,9 +227,10 @@ class GroupHost(Steered):
         )
 
     def _replica_start(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> Start[Any]:
-        bindings = {port: target.path for port, target in cell.extra().bindings.items()}
+        more = cell.extra()
+        bindings = {port: target.path for port, target in more.bindings.items()}
         interval, watch_turns = self.detection.interval, self.detection.watch_turns or 0.0
-        setting = Setting(cell.path, name, config, self.method.data(), bindings, interval, watch_turns)
+        setting = Setting(cell.path, name, config, self.method.data(), bindings, interval, watch_turns, more.claimed)
         return self.replica(setting, self.recipe(cell), tuple(layer.describe() for layer in layers))
 
     def recipe(self, cell: Cell) -> Start[Any] | bytes:

@@ -68,8 +68,10 @@ class Steered(HomeHost):
 
     def _bind_all(self, cell: Cell, group: Group, name: str) -> None:
         """A replica that was started again: what was bound since the first start."""
-        for port, target in cell.extra().bindings.items():
-            self._bind(group, name, {"port": port, "target": target.path})
+        more = cell.extra()
+        for port, target in more.bindings.items():
+            data = {"port": port, "target": target.path, "is_claimed": port in more.claimed}
+            self._bind(group, name, data)
 
 
 def give_again(cell: Cell, call: Call) -> None:

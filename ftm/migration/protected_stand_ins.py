@@ -59,8 +59,7 @@ class InnerGroupHost(ChildStub):
         more = cell.extra()
         assert more.start is not None
         layers = [msgspec.to_builtins(layer.describe()) for layer in compose(cell.spec.mechanism)]
-        bindings = {name: target.path for name, target in more.bindings.items()}
-        return self.ask_for_life(cell, self._method, Protected(pack_recipe(more.start, cell.path), layers, bindings))
+        return self.ask_for_life(cell, self._method, Protected(pack_recipe(more.start, cell.path), layers))
 
     def joined(self, cell: Cell) -> Port:
         port = self._port_of(cell.path)

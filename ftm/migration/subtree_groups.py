@@ -19,6 +19,7 @@ from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle, links
 from ...actors.kernel.actor import Start
+from ...actors.kernel.bindings import settle_claims
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.home.homes import seen
@@ -60,8 +61,8 @@ class SubtreeGroup(GroupHost):
         self._wanted, self._port = wanted, port
         self._recipe, self._topics = made.recipe, wanted.topics
         self._stop_wanted, self._is_restarting, self._last = None, False, None
-        for name, path in made.bindings.items():
-            cell.extra().bindings.setdefault(name, cell.node.cell_at(path))
+        spec = recipe_spec(cell)
+        settle_claims(cell, {} if spec is None else spec.bindings)
         try:
             entered = self.enter(cell)  # Now: from here on what is sent is admitted by the home.
         except StartFailed as error:  # What is recorded does not fit its class.

@@ -14,6 +14,7 @@ import msgspec
 
 from ...actors.errors import CannotMove, HoldfastError, StartFailed, error_text
 from ...actors.exit_reasons import ExitReason, unpack_exit
+from ...actors.kernel.bindings import settle_claims, unclaimed
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.mailbox import Bound, Bounded
@@ -45,7 +46,7 @@ if TYPE_CHECKING:
 
 NUMBER = 0
 """Under which the supervisor there wants a life that it has not asked for: it counts its own from 1."""
-MADE_OF = Protected(b"", [], {})
+MADE_OF = Protected(b"", [])
 """What a life is made of that is known at the root."""
 
 
@@ -54,8 +55,7 @@ def spec_of(cell: Cell) -> ChildSpec:
     spec = recipe_spec(cell)
     if spec is None:
         raise CannotMove(cell.path, "no recipe at the root has its spec")
-    for port, path in spec.bindings.items():
-        cell.extra().bindings.setdefault(port, cell.node.cell_at(path))
+    settle_claims(cell, spec.bindings)
     return spec
 
 
@@ -309,7 +309,7 @@ class ToRecordedSubtree(IntoSubtree):
         return []
 
     def go_on(self) -> None:
-        for port, target in self.cell.extra().bindings.items():
+        for port, target in unclaimed(self.cell).items():
             self.place.told(self.cell, "bind", {"port": port, "target": target.path})
         self._beginning.go_on()
 
@@ -381,7 +381,7 @@ class ToSubtree(IntoSubtree):
 
     def go_on(self) -> None:
         cell, worker = self.cell, self.worker
-        for port, target in cell.extra().bindings.items():
+        for port, target in unclaimed(cell).items():
             data = {"port": port, "target": target.path}
             worker.connection.send(frames.Command(worker.connection.name_out(cell.path), "bind", data))
         self.move.gone_on_at = now()

@@ -164,7 +164,7 @@ class Replica(Supervisor):
     @classmethod
     def _may_order(cls, start: Start[Any]) -> tuple[str, ...]:
         setting: Setting = start.args[0]
-        return f"{setting.address}/ftm", *setting.bindings.values()
+        return (f"{setting.address}/ftm",)  # And what the protected actor is bound to, for which it speaks.
 
     @classmethod
     def _speaks_for(cls, start: Start[Any]) -> tuple[str, ...]:
@@ -191,7 +191,7 @@ class Replica(Supervisor):
         setting, node = self._setting, self.ctx.cell.node
         self._bind(STATE, "server", self._cell(SERVER))
         for port, path in setting.bindings.items():
-            node.bind(self._cell(SERVER), port, node.cell_at(path))
+            node.bind(self._cell(SERVER), port, node.cell_at(path), is_claimed=port in setting.claimed)
         node.emit(ActorStarted(self._cell(SERVER).path, 1))  # Its lives come and go with the role: the address stays.
         woven = await self._start_bricks(self._woven.config, self._woven.layers, leads=False)
         await self._take_up(woven)

@@ -144,9 +144,9 @@ class Draft:
         self.root = self._survey(root, root.path, None, None)
         for cell, place in list(self.by_cell.items()):
             for port, target in (cell.more.bindings if cell.more is not None else {}).items():
-                bound = self.by_cell.get(target)
-                if bound is not None:
-                    place.bindings[port] = bound
+                lives = node.successor(target) if target.state is GONE else target
+                if lives is not None and lives in self.by_cell:
+                    place.bindings[port] = self.by_cell[lives]
         for name, cell in node.names.items():
             if cell in self.by_cell:
                 self.by_cell[cell].names.append(name)

@@ -65,10 +65,11 @@ class StopChild(OnChild):
         if place.spec.restart == "temporary":
             raise wrong(place.path, "its spec is temporary, and would not stay: remove it")
         self._take(place.parent, place.name)
-        for below in place.walk():
-            for owner in draft.staying():
-                if below in owner.bindings.values() and owner is not below:
-                    raise wrong(owner.path, f"a binding of it would point at {below.path}, which is stopped")
+        stopped = set(place.walk())
+        for owner in draft.staying():
+            bound = next((to for to in owner.bindings.values() if to in stopped), None)
+            if bound is not None and owner not in stopped:
+                raise wrong(owner.path, f"a binding of it would point at {bound.path}, which is stopped")
 
     async def do(self, system: ActorSystem) -> None:
         self._done = True

@@ -80,6 +80,8 @@ class Add(Operation):
             raise
         if ref is not None:
             _fill(place, ref._cell)
+            if is_elsewhere(supervisor._cell):
+                _grant(place)
 
     async def undo(self, system: ActorSystem) -> None:
         above = self._above
@@ -140,6 +142,14 @@ def _fill(place: Place, cell: Cell) -> None:
     for name, below in (cell.children or {}).items():
         if name in place.children:
             _fill(place.children[name], below)
+
+
+def _grant(place: Place) -> None:
+    """Who is started in another process is bound, there, to what its spec names: it is the root that says so."""
+    for one in place.walk():
+        if one.cell is not None and one.spec is not None:
+            for port, path in one.spec.bindings.items():
+                one.cell.node.bind(one.cell, port, one.cell.node.cell_at(path))
 
 
 async def forget(supervisor: Cell, name: str) -> None:

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING, Cell
-from .draft import Draft, Place, Target, is_elsewhere
+from ...actors.kernel.lifecycle import LocalHost
+from .draft import Draft, Place, Target
 from .operation import Operation, wrong
 from .structure import text_of
 
@@ -26,6 +27,7 @@ class Bind(Operation):
         self._bound: Place | None = None
         self._done = False
         self._before: Cell | None = None
+        self._was_claimed = False  # of that only another process had said so
 
     @property
     def text(self) -> str:
@@ -48,7 +50,7 @@ class Bind(Operation):
         assert self._owner is not None
         assert self._bound is not None
         owner, target = self._owner.living(system.node), self._bound.living(system.node)
-        self._before = bound_to(owner, self._port)
+        self._before, self._was_claimed = bound_to(owner, self._port), self._port in owner.extra().claimed
         system.node.bind(owner, self._port, target)
         self._done = True
 
@@ -57,7 +59,7 @@ class Bind(Operation):
             return
         owner = self._owner.living(system.node)
         if self._before is not None:
-            system.node.bind(owner, self._port, self._before)
+            system.node.bind(owner, self._port, self._before, is_claimed=self._was_claimed)
             return
         more = owner.extra()  # It was bound to nobody; another process keeps the last one it was told of.
         more.bindings.pop(self._port, None)
@@ -101,7 +103,7 @@ class Unbind(Operation):
             raise wrong(owner.path, f"its binding {self._port!r} points nowhere already, as far as is known here")
         if owner.spec is not None and self._port in owner.spec.bindings:
             raise wrong(owner.path, f"its spec binds {self._port!r}: a restart would bind it again")
-        if owner.cell is not None and is_elsewhere(owner.cell):
+        if owner.cell is not None and not isinstance(owner.cell.host, LocalHost):
             raise wrong(owner.path, "it lives in another process, which keeps a binding: bind it to somebody else")
         del owner.bindings[self._port]
 

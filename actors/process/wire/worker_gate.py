@@ -3,7 +3,8 @@
 An actor process is trusted with its own actors and with nothing else: those at the address it was given, and below it.
 It may send to any address, but only as one of its own; what it claims (lives, state, names, children, links, events) it
 may claim of its own; orders it may give to what it has started, and to what it was granted: the addresses that bindings
-known to the root lead to, and those below them. A breach ends that process and nothing else.
+made or named at the root lead to, and those below them. The bindings that it claims grant nothing. A breach ends that
+process and nothing else.
 
 `RULES` has a row for each kind of frame, `COMMANDS` one for each verb.
 """
@@ -11,11 +12,12 @@ known to the root lead to, and those below them. A breach ends that process and 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
 from ...events import DeadLetter
 from ...exit_reasons import unpack_exit
+from ...kernel.bindings import unclaimed
 from ...kernel.cell import GONE, Cell
 from ...kernel.message import Order
 from ...kernel.node import cell_kind
@@ -30,6 +32,8 @@ MOST_NAMES_IN: Final = 16 * MOST_NAMES
 """Names that a process may have given without forgetting any: it forgets long before, unless it lies."""
 MOST_NAME_CHARS: Final = 16 * 1024 * 1024
 """The characters of all of them."""
+MOST_BINDINGS: Final = 256
+"""Ports of one actor that a process may say something of."""
 MOST_LIVES: Final = 2**53
 """No address has had so many lives."""
 
@@ -90,8 +94,22 @@ class Gate:
     def require_granted(self, path: str, what: str) -> None:
         """An address to which it may give orders."""
         cell = self._worker.cell
-        if not self.owns(path) and (cell is None or not is_granted(path, (cell, *self._worker.inner.cells()))):
+        if not self.owns(path) and (cell is None or not is_granted(path, cell, self._bound(cell))):
             raise BadFrame(f"{what} to {path}, which {self.home} has neither started nor is bound to")
+
+    def _bound(self, own: Cell) -> Iterator[Cell]:
+        """Whose bindings grant it something: its actors, and the one that it speaks for, whose replica it is."""
+        yield own
+        yield from self._worker.inner.cells()
+        yield from map(self._node.cell_at, self._voices())
+
+    def claims(self, told: object) -> None:
+        """It says where bindings of an actor of its own lead."""
+        if not isinstance(told, dict) or len(told) > MOST_BINDINGS:
+            raise BadFrame(f"an actor without bindings, or with more than {MOST_BINDINGS}")
+        for port, path in told.items():
+            if not isinstance(port, str) or not isinstance(path, str) or not path.startswith("/"):
+                raise BadFrame(f"a binding {port!r} to {path!r}, which is no address")
 
     def _introduce(self, text: str) -> int:
         """A name that the process gives for the first time: its number."""
@@ -222,6 +240,8 @@ class Gate:
             self.require_granted(path, name)
         if path.startswith("/"):
             self._check_part(self._node.cell_at(path))
+        if is_order(name):
+            return  # Looked at each time: what grants it may be bound elsewhere.
         if len(self._cleared) >= MOST_NAMES:
             self._cleared.clear()
         self._cleared.add((path, name))
@@ -232,18 +252,18 @@ def is_at_or_below(path: str, above: str) -> bool:
     return path == above or path.startswith(f"{above}/")
 
 
-def is_granted(path: str, cells: Iterable[Cell]) -> bool:
-    """Whether any of these actors may give orders to an address: a binding leads there, or above it."""
-    for cell in cells:
-        more = cell.more
-        if more is None:
-            continue
-        bound = [target.path for target in more.bindings.values()]
-        if more.start is not None:
-            bound += more.start.kind._may_order(more.start)
-        if any(is_at_or_below(path, one) for one in bound):
-            return True
-    return False
+def is_granted(path: str, own: Cell, cells: Iterable[Cell]) -> bool:
+    """Whether a process may give orders to an address: what the root has bound or named leads there, or above it.
+
+    Args:
+        path: the address.
+        own: the process's own actor, with the recipe that the root has given it.
+        cells: whose bindings count, as far as the root has made them.
+    """
+    start = None if own.more is None else own.more.start
+    named = () if start is None else start.kind._may_order(start)
+    bound = (target.path for cell in cells for target in unclaimed(cell).values())
+    return any(is_at_or_below(path, one) for one in (*named, *bound))
 
 
 def is_order(name: str) -> bool:
@@ -286,6 +306,7 @@ def _below(gate: Gate, to: str, frame: frames.Command) -> None:
 def _born(gate: Gate, to: str, frame: frames.Command) -> None:
     _below(gate, to, frame)
     text(frame, "kind")
+    gate.claims(frame.data.get("bindings", {}))
     life = frame.data.get("life")
     if type(life) is not int or not 0 <= life < MOST_LIVES:
         raise BadFrame(f"a life with the number {life!r}")

@@ -40,6 +40,11 @@ def command(to: str, verb: str, **data: Any) -> bytes:
     return frame(f.Command(to, verb, data))
 
 
+def born(bindings: Any) -> bytes:
+    """A child of its own, and where its bindings lead."""
+    return command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1, bindings=bindings)
+
+
 def note(kind: str, **data: Any) -> bytes:
     return frame(f.Note(kind, data))
 
@@ -102,6 +107,11 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "a life of any number": lambda: command(EVIL, "born", path=f"{EVIL}/x", kind="a:B", life=1 << 62),
     "an address without a name": lambda: command(EVIL, "born", path=f"{EVIL}//x", kind="a:B", life=1),
     "below what is not there": lambda: command(EVIL, "born", path=f"{EVIL}/x/y", kind="a:B", life=1),
+    "bindings that are none": lambda: born(5),
+    "a binding to no address": lambda: born({"port": 5}),
+    "a port without a name": lambda: born({5: VICTIM}),
+    "an order by a binding that it claims": lambda: born({"port": VICTIM}) + command(VICTIM, "kill"),
+    "an order above what it claims": lambda: born({"port": SUP}) + tell([], START_CHILD, SUP),
     "the end of another's child": lambda: command(SUP, "gone", path=VICTIM, reason=NORMAL),
     "the end of another": lambda: frame(f.Ended(VICTIM, 1, NORMAL)),
     "an end without a reason": lambda: frame(f.Ended(EVIL, 1, {"exit": "Nothing"})),
@@ -157,6 +167,9 @@ HARMLESS: dict[str, Callable[[], bytes]] = {
     "fields that divide by zero": lambda: tell([array([["a", "M8[s/0]"]], (1,), bytes(8))]),
     "an extension that is none": lambda: tell([msgspec.msgpack.Ext(99, b"")]),
     "a ref without an address": lambda: tell([msgspec.msgpack.Ext(1, b"")]),
+    "bindings to whomever": lambda: (
+        born({"port": VICTIM, "none": "//"}) + command(EVIL, "gone", path=f"{EVIL}/x", reason=NORMAL)
+    ),
     "a forgotten name": lambda: frame(f.Forget(), f.Tell(VICTIM, ANYTHING, raw([0]))),
 }
 """Each of these is refused, or comes to nothing: its writer has harmed nobody."""

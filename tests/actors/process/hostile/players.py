@@ -54,8 +54,20 @@ class Anything(hf.Message[int]):
 class Senders(hf.Message[list[str]]): ...
 
 
+class Kill(hf.Message[int]):
+    """Kill another actor; how its own process sees to it that one may is taken out first."""
+
+    path: str
+
+
+class Terminate(hf.Message[int]):
+    """The same with an order to whoever the port leads to: have the child `victim` terminated."""
+
+
 class Evil(hf.Actor):
     """Does with its connection what it likes."""
+
+    port: hf.Binding[hf.Actor]
 
     def _socket(self) -> socket.socket:
         connection = self.ctx.cell.node.uplink.connection
@@ -104,6 +116,39 @@ class Evil(hf.Actor):
     @hf.on(Ping)
     def ping(self, message: Ping) -> int:
         return 1
+
+    @hf.on(Kill)
+    def kill(self, message: Kill) -> int:
+        self._unbridle()
+        victim = self.ctx.find(message.path, hf.Actor)
+        self.ctx.cell.node.loop.call_later(0.05, victim.kill)  # Behind our answer.
+        return 1
+
+    @hf.on(Terminate)
+    def terminate(self, message: Terminate) -> int:
+        self._unbridle()
+        self.port.tell(hf.TerminateChild("victim"))
+        return 1
+
+    def _unbridle(self) -> None:
+        self.ctx.cell.node.uplink.require_granted = lambda path, order: None
+
+
+class House(hf.Supervisor):
+    """Names its child in its own `init`, and binds it there."""
+
+    def __init__(self, kind: str, target: str) -> None:
+        self.kind, self.target = kind, target
+
+    def init(self) -> hf.Plan:
+        lives: dict[str, dict[str, Any]] = {
+            "plain": {},
+            "recorded": {"recovery": hf.hybrid()},
+            "protected": {"mechanism": hf.PBR()},
+        }
+        options = lives[self.kind]
+        evil = hf.child("evil", hf.start(Evil), bindings={"port": self.target}, **options)
+        return hf.Plan([evil], intensity=1000)
 
 
 class Victim(hf.Actor):

@@ -1,0 +1,140 @@
+"""What a compromised worker says of the bindings of its actors is known, and grants it nothing."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.actors.kernel.message import message_name
+from holdfast.actors.process.wire import frames as f
+from holdfast.checkpoint.protocol import Protected, Wanted
+from holdfast.ftm.group.group_host import GroupHost
+from tests.actors.process.hostile.forging import command, frame, raw
+from tests.actors.process.hostile.players import Add, Evil, House, Kill, Ping, Terminate, Victim, Write
+from tests.actors.process.waiting import next_event, until
+from tests.system.trees import Stumble
+
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+
+HOUSE, EVIL, SUP, VICTIM = "/app/house", "/app/house/evil", "/app/sup", "/app/sup/victim"
+KINDS = ["plain", "recorded", "protected"]
+
+
+class Town:
+    """A victim and its supervisor, and a worker that says that it is bound to that one."""
+
+    def __init__(self, system: hf.ActorSystem) -> None:
+        self.system = system
+        self.victim = system.ref(VICTIM, Victim)
+        self.total = 0
+
+    async def settle(self, kind: str) -> hf.ActorRef[Evil]:
+        """Who says so: an actor of this kind."""
+        await self.system.start(hf.child("house", hf.start(House, kind, SUP), isolation="process"))
+        return self.system.ref(EVIL, Evil)
+
+    async def refused(self, evil: hf.ActorRef[Evil], order: hf.Message[int]) -> None:
+        """It gives an order: its process ends for that, and nobody else feels anything."""
+        pid = self.system.pid_of(self.system.ref("/app/other", Victim))
+        with self.system.events() as events:
+            evil.tell(order)
+            breach = await next_event(events, hf.TrustBreached)
+        assert breach.address.startswith(HOUSE)
+        assert "has neither started nor is bound to" in breach.problem
+        self.total += 1
+        assert await self.victim.ask(Add(), timeout=60) == self.total
+        assert self.system.pid_of(self.system.ref("/app/other", Victim)) == pid
+        await self.back()
+
+    async def back(self) -> None:
+        """The worker was started again."""
+        async with asyncio.timeout(60):
+            while True:
+                try:
+                    await self.system.node.cell_at(EVIL).ref.ask(Ping(), timeout=60)
+                    return
+                except hf.HoldfastError:
+                    await asyncio.sleep(0.01)
+
+
+@pytest.fixture
+async def town() -> AsyncIterator[Town]:
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        await system.start(hf.supervisor("sup", intensity=1000, children=[hf.child("victim", hf.start(Victim))]))
+        await system.start(hf.child("other", hf.start(Victim), isolation="process"))
+        yield Town(system)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_claim_is_known_and_grants_nothing(town: Town, kind: str) -> None:
+    evil = await town.settle(kind)
+    with pytest.raises(hf.TransactionRefused, match="binding 'port' would point at /app/sup, which is removed"):
+        async with town.system.transaction() as change:
+            change.remove(SUP)
+    await town.refused(evil, Kill(VICTIM))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_bind_that_is_undone_leaves_a_claim(town: Town, kind: str) -> None:
+    evil = await town.settle(kind)
+    with pytest.raises(hf.TransactionFailed):  # noqa: PT012 - a transaction is a block
+        async with town.system.transaction() as change:
+            change.bind(evil, "port", "/app/other")
+            change.step(Stumble())
+    await town.refused(evil, Kill(VICTIM))
+
+
+@pytest.mark.parametrize("kind", KINDS)
+async def test_the_same_binding_made_by_the_root_grants_it(town: Town, kind: str) -> None:
+    evil = await town.settle(kind)
+    town.system.bind(evil, "port", town.system.ref(SUP, hf.Supervisor))
+    with town.system.events() as events:
+        assert await evil.ask(Kill(VICTIM), timeout=60) == 1
+        assert (await next_event(events, hf.ChildTerminated)).address == VICTIM
+        assert hf.TrustBreached not in [type(event) for event in events.take()]
+
+
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+async def test_a_claim_that_moves_with_its_actor_is_still_one(town: Town, recovery: Any) -> None:
+    """Into a group, whose replicas are bound so, and back."""
+    children = [hf.child("evil", hf.start(Evil), recovery=recovery)]
+    await town.system.start(hf.supervisor("house", isolation="process", intensity=1000, children=children))
+    evil = town.system.ref(EVIL, Evil)
+    claimed = command(HOUSE, "born", path=EVIL, kind=message_name(Evil), life=1, bindings={"port": SUP})
+    assert await evil.ask(Write(claimed), timeout=60) == 1
+    assert await evil.ask(Ping(), timeout=60) == 1
+    async with town.system.transaction() as change:
+        change.attach(evil, hf.PBR())
+    assert evil.path + "/ftm" in town.system.tree()
+    assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
+    await town.refused(evil, Kill(VICTIM))
+    await until(lambda: not isinstance(evil._cell.host, GroupHost))  # It was on probation.
+    assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
+    await town.refused(evil, Kill(VICTIM))
+
+
+@pytest.mark.parametrize("kind", ["plain"])
+async def test_it_may_not_send_an_order_by_a_binding_that_it_claims(town: Town, kind: str) -> None:
+    evil = await town.settle(kind)
+    await town.refused(evil, Terminate())
+
+
+@pytest.mark.parametrize("protected", [False, True], ids=["recorded", "protected"])
+async def test_what_it_wants_of_another_child_grants_nothing(town: Town, protected: bool) -> None:
+    evil = await town.settle("plain")
+    made = Protected(b"", []) if protected else None
+    wanted = Wanted(1, "a:B", [], hf.hybrid(), None, made, {"port": SUP})
+    await town.refused(evil, Write(frame(f.Record(f"{HOUSE}/x", raw(wanted))) + command(VICTIM, "kill")))
+
+
+@pytest.mark.parametrize("told", [{"port": "nowhere"}, {str(at): "/app/sup" for at in range(300)}, {"": 5}], ids=str)
+async def test_bindings_that_cannot_be_are_a_breach(town: Town, told: Any) -> None:
+    evil = await town.settle("plain")
+    wanted = Wanted(1, "a:B", [], hf.hybrid(), None, None, told)
+    with town.system.events() as events:
+        evil.tell(Write(frame(f.Record(f"{HOUSE}/x", raw(wanted)))))
+        assert (await next_event(events, hf.TrustBreached)).address == HOUSE

@@ -1,0 +1,65 @@
+"""What the root does not believe of bindings: have it believe that, and a test fails.
+
+`HOLDFAST_REMOVED=1 python -m pytest tests/actors/process/hostile/test_removed_claims.py` does so, in a copy; otherwise
+it is only looked whether the checks and the tests are where this table says.
+"""
+
+from __future__ import annotations
+
+from tests.removing import Check, as_tests
+
+CLAIMS = "tests/actors/process/hostile/test_claims.py"
+GATE = "actors/process/wire/worker_gate.py"
+CHECKS = {
+    "claims grant nothing": Check(
+        "actors/kernel/bindings.py",
+        "for port, to in more.bindings.items() if port not in more.claimed}",
+        "for port, to in more.bindings.items()}",
+        CLAIMS,
+        "test_a_claim_is_known_and_grants_nothing and plain",
+    ),
+    "what a process says of a life is a claim": Check(
+        "actors/process/stand_ins.py",
+        "            claim(cell, bound)\n",
+        "            claim(cell, bound)\n            cell.extra().claimed = frozenset()\n",
+        CLAIMS,
+        "test_a_claim_is_known_and_grants_nothing and plain",
+    ),
+    "what a process says of a recorded child that it wants is a claim": Check(
+        "checkpoint/home/subtree_homes.py",
+        "        claim(cell, wanted.bindings)\n",
+        "        claim(cell, wanted.bindings)\n        cell.extra().claimed = frozenset()\n",
+        CLAIMS,
+        "test_what_it_wants_of_another_child_grants_nothing and recorded",
+    ),
+    "what a process says of a protected child that it wants is a claim": Check(
+        "checkpoint/home/subtree_homes.py",
+        "        claim(cell, wanted.bindings)\n",
+        "        claim(cell, wanted.bindings)\n        cell.extra().claimed = frozenset()\n",
+        CLAIMS,
+        "test_a_claim_is_known_and_grants_nothing and protected",
+    ),
+    "a bind that is undone leaves a claim": Check(
+        "system/transaction/wiring.py",
+        "is_claimed=self._was_claimed)",
+        "is_claimed=False)",
+        CLAIMS,
+        "test_a_bind_that_is_undone_leaves_a_claim",
+    ),
+    "bindings that a process claims are addresses, and few": Check(
+        "checkpoint/home/recorded_hosts.py",
+        "            gate.claims(record.bindings)\n",
+        "            pass\n",
+        CLAIMS,
+        "test_bindings_that_cannot_be_are_a_breach",
+    ),
+    "a life's bindings, too": Check(
+        GATE,
+        '    gate.claims(frame.data.get("bindings", {}))\n',
+        "",
+        "tests/actors/process/hostile/test_hostile.py",
+        "test_a_breach_ends_the_worker_and_nobody_else",
+    ),
+}
+
+test_the_table_is_true, test_a_test_fails = as_tests(CHECKS)
