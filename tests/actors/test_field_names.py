@@ -52,7 +52,10 @@ class Other(hf.Actor):
         self.said: list[str] = []
 
     @hf.on(Odd)
-    def odd(self, message: Odd) -> str:
+    async def odd(self, message: Odd) -> str:
+        return self.note(message)
+
+    def note(self, message: Odd) -> str:
         sender = self.ctx.sender
         self.said.append(f"{message.how} from {'outside' if sender is None else sender.path.rpartition('/')[2]}")
         return message.message
@@ -83,8 +86,8 @@ class One(Other):
                 self.ctx.tell_after(0.0, Odd("timer"))
                 return ""
         elif message.how == "timer":
-            self.ctx.unstash_all()
-        return super().odd(message)
+            self.ctx.unstash()
+        return self.note(message)
 
 
 def test_the_names_are_those_of_the_message() -> None:
@@ -116,6 +119,10 @@ async def test_a_message_with_such_fields_is_handled_as_any_other(
                     if isinstance(event, ActorCrashed):
                         break
         assert await ref.ask(Odd("plain"), timeout=30.0) == "b"
+    if how == "stash":
+        async with asyncio.timeout(30.0):
+            while "stash" not in " ".join(await ref.ask(Said())).replace("stashed", ""):
+                await asyncio.sleep(0.01)
     said = await other.ask(Said())
     expected = {
         "ask": ["ask from one"],
