@@ -94,6 +94,7 @@ class ChildSpec(Generic[A_co]):
     mechanism: Any = None
     comes_back: bool = True  # whether its supervisor starts it again when that has itself been restarted
     start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
+    autostart: bool = True  # whether its supervisor starts it with the others, or only by order
 
     def __post_init__(self) -> None:
         where = f"child {self.id!r}"

@@ -138,7 +138,7 @@ class Supervisor(Inquiries):
 
     async def _start_all(self) -> None:
         """Start the children of the plan."""
-        row = Row(self._children.values(), STARTING)
+        row = Row((one for one in self._children.values() if one.spec.autostart), STARTING)
         while (one := row.next()) is not None:
             try:
                 await self._come_up_in(row, one)
@@ -363,7 +363,12 @@ class Supervisor(Inquiries):
             node.emit(ChildRestarted(self._path_of(one), reason, len(window), flags.intensity))
         order = list(self._children.values())
         group = affected(flags.strategy, order, order.index(one))
-        self._errand(self._restart_group(one, [other for other in group if other.state != STARTING], reason))
+        wanted = [
+            other
+            for other in group
+            if other is one or (other.state != STARTING and (other.spec.autostart or other.is_running))
+        ]
+        self._errand(self._restart_group(one, wanted, reason))
 
     def _give_up(self, one: Child, reason: ExitReason, told: ExitReason) -> None:
         """We end: too many restarts, or a rule says that this end is one for whoever is above us."""

@@ -17,7 +17,7 @@ from ..actors.kernel.lifecycle import LOCAL
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
 from ..actors.migration.here import FromHere, ToHere
-from ..actors.migration.move import Entering, Leaving, Move
+from ..actors.migration.move import Entering, Gate, Leaving, Move
 from ..actors.migration.worker import FromWorker, ToWorker
 from ..actors.process.process_host import ProcessHost
 from ..actors.process.resource_limits import Limits
@@ -42,8 +42,12 @@ class Moves:
         self._tasks: set[asyncio.Task[None]] = set()
         self._under_way: dict[Cell, Move] = {}  # of mechanisms
 
-    async def move(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
+    async def move(
+        self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None = None
+    ) -> None:
         """Move an actor; if whoever wants it does not wait any more, the move comes to its end all the same.
+
+        With a gate it waits there when all is ready.
 
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable.
@@ -52,7 +56,7 @@ class Moves:
         if caller is not None and caller.cell is cell and caller.in_turn():
             raise CannotMove(cell.path, "a turn of its own waits for it; call this from outside, or from a task")
         task = self._node.loop.create_task(
-            self._in_turn(cell, isolation, limits, timeout),
+            self._in_turn(cell, isolation, limits, timeout, gate),
             name=f"move of {cell.path}",
             context=self._node.base_context.copy(),
         )
@@ -72,37 +76,33 @@ class Moves:
         if self._tasks:
             await asyncio.wait(self._tasks)
 
-    async def _in_turn(self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float) -> None:
-        lock = self._turns.setdefault(cell, asyncio.Lock())
-        async with lock:
+    def lock(self, cell: Cell) -> asyncio.Lock:
+        """Whoever has it is the only one who changes where an actor lives."""
+        return self._turns.setdefault(cell, asyncio.Lock())
+
+    async def _in_turn(
+        self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None
+    ) -> None:
+        async with self.lock(cell):
             origin = place_of(cell)
             if origin == isolation:
                 return
             spec = _spec_there(cell, isolation, limits)
-            end = self._node.loop.time() + timeout
-            while True:
-                if not cell.host.is_up(cell):
-                    await order(cell, Ready(), timeout)  # It is being restarted: its next life is moved.
-                move = self._made(cell, spec, timeout)
-                move.moved = lambda: replace_place(cell, spec)
-                try:
-                    await move.run()
-                    break
-                except CannotMove:
-                    if not move.is_late or cell.is_dead or self._node.loop.time() > end:
-                        raise
+            move = await self._moved(
+                cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
+            )
             if self._node.watched:
                 self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
 
-    async def protect(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> None:
-        """Have a group of replicas live an actor's life.
+    async def protect(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None = None) -> None:
+        """Have a group of replicas live an actor's life. With a gate it waits there when all is ready.
 
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it goes on as it was.
         """
-        await self._alone(cell, self._protected(cell, homes, mechanism, timeout), f"attach to {cell.path}")
+        await self._alone(cell, self._protected(cell, homes, mechanism, timeout, gate), f"attach to {cell.path}")
 
-    async def _protected(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> None:
+    async def _protected(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None) -> None:
         from ..ftm.events import MechanismAttached
         from ..ftm.migration.protection import into_group
 
@@ -125,6 +125,7 @@ class Moves:
                 timeout,
                 lambda: into_group(cell, homes, mechanism, timeout),
                 moved,
+                gate,
             )
         except BaseException:
             if is_by_way_of_a_task:
@@ -134,15 +135,15 @@ class Moves:
             names = tuple(layer.name for layer in move.entering.host.layers)
             self._node.emit(MechanismAttached(cell.path, names, move.gone_on_at - move.rest_at))
 
-    async def unprotect(self, cell: Cell, timeout: float) -> None:
-        """Have a protected actor live as its spec says without the mechanism.
+    async def unprotect(self, cell: Cell, timeout: float, gate: Gate | None = None) -> None:
+        """Have a protected actor live as its spec says without the mechanism. With a gate it waits there when ready.
 
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it stays protected.
         """
-        await self._alone(cell, self._unprotected(cell, timeout), f"detach from {cell.path}")
+        await self._alone(cell, self._unprotected(cell, timeout, gate), f"detach from {cell.path}")
 
-    async def _unprotected(self, cell: Cell, timeout: float) -> None:
+    async def _unprotected(self, cell: Cell, timeout: float, gate: Gate | None) -> None:
         from ..ftm.events import MechanismDetached
         from ..ftm.migration.protection import is_plain, out_of_group
         from ..ftm.model.mechanism import compose
@@ -160,6 +161,7 @@ class Moves:
             timeout,
             lambda: out_of_group(cell, self._entering(self._node.host_for(wanted), wanted.limits), timeout),
             lambda: replace_mechanism(cell, wanted),
+            gate,
         )
         if self._node.watched:
             names = tuple(layer.name for layer in compose(before.mechanism))
@@ -167,15 +169,15 @@ class Moves:
         if is_by_way_of_a_task:
             await self._settle_in(cell, "process", before.limits, timeout)
 
-    async def adapt(self, cell: Cell, mechanism: Any, timeout: float) -> None:
-        """Have a protected actor go on with another stack of mechanisms, all of it given.
+    async def adapt(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None = None) -> None:
+        """Have a protected actor go on with another stack of mechanisms, all of it given. With a gate it waits there.
 
         Raises:
             CannotAdapt, ActorStopped, AskTimeout: it stays as it was.
         """
-        await self._alone(cell, self._adapted(cell, mechanism, timeout), f"adaptation of {cell.path}")
+        await self._alone(cell, self._adapted(cell, mechanism, timeout, gate), f"adaptation of {cell.path}")
 
-    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float) -> None:
+    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None) -> None:
         from ..ftm.events import MechanismChanged
         from ..ftm.group.group_host import GroupHost
         from ..ftm.group.reconfiguration import CannotAdapt
@@ -191,7 +193,7 @@ class Moves:
                 raise CannotAdapt(cell.path, "it has no mechanism")
             old, life = host.layers, cell.life
             try:
-                change = await host.adapt(cell, mechanism, lambda: replace_mechanism(cell, wanted))
+                change = await host.adapt(cell, mechanism, lambda: replace_mechanism(cell, wanted), gate=gate)
                 break
             except CannotAdapt:
                 if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
@@ -205,7 +207,7 @@ class Moves:
         """Carry out a change of where an actor lives while no other is; it comes to its end in any case."""
 
         async def in_turn() -> None:
-            async with self._turns.setdefault(cell, asyncio.Lock()):
+            async with self.lock(cell):
                 await change
 
         task = self._node.loop.create_task(in_turn(), name=name, context=self._node.base_context.copy())
@@ -223,15 +225,25 @@ class Moves:
         move = self._under_way.get(cell)
         if move is not None:
             move.give_up(why)
+        group = getattr(cell.host, "group", None)
+        if group is not None and group.change is not None:
+            group.change.give_up(why)
 
-    async def _moved(self, cell: Cell, timeout: float, made: Callable[[], Move], moved: Callable[[], None]) -> Any:
+    async def _moved(
+        self,
+        cell: Cell,
+        timeout: float,
+        made: Callable[[], Move],
+        moved: Callable[[], None],
+        gate: Gate | None = None,
+    ) -> Any:
         """Carry out a move; if the life ends before it is at rest, its next life is moved."""
         end = self._node.loop.time() + timeout
         while True:
             if not cell.host.is_up(cell):
                 await order(cell, Ready(), timeout)
             move = self._under_way[cell] = made()
-            move.moved = moved
+            move.moved, move.gate = moved, gate
             try:
                 await move.run()
             except CannotMove:

@@ -23,7 +23,8 @@ from ..actors.kernel.node import Node, cell_kind
 from ..actors.kernel.ref import ActorRef, current
 from ..actors.kernel.topics import publish
 from ..actors.loop_watchdog import LoopWatch, check_limits
-from ..actors.process.process_host import ProcessHost, on_frame
+from ..actors.migration.quiesce import Transit
+from ..actors.process.process_host import Elsewhere, ProcessHost, on_frame
 from ..actors.process.worker_pool import Workers
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
@@ -485,10 +486,11 @@ class ActorSystem(Recorded, Controls):
         """
         cell: Cell | None = ref._cell
         while cell is not None:
-            worker = self._workers.of(cell)
+            host = cell.host.old if isinstance(cell.host, Transit) else cell.host  # It is moved, and at rest there.
+            worker = host.worker_of(cell) if isinstance(host, Elsewhere) else None
             if worker is not None:
                 return worker.pid
-            if isinstance(cell.host, ProcessHost):
+            if isinstance(host, ProcessHost):
                 raise NoSuchActor(ref.path)
             cell = cell.parent
         return os.getpid()

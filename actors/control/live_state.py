@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, cast
 
 from ..errors import ControlFailed, error_text, portable, type_name
@@ -100,15 +101,34 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
     Raises:
         ControlFailed: `change` raised, or what it returned is no state, or cannot be kept.
     """
+    with _changing(actor, "replace_state", is_trial=False):
+        put_state(actor, change(state_to_change(actor)))
+        actor.ctx.replaced()
+
+
+def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> Any:
+    """The state that the actor would have with these changes, one after the other; it has what it had.
+
+    Raises:
+        ControlFailed: one of them raised, or what it returned is no state, or cannot be kept.
+    """
+    with _changing(actor, verb, is_trial=True):
+        for change in changes:
+            put_state(actor, change(state_to_change(actor)))
+        actor.ctx.check_saving()
+        return state_to_change(actor)
+
+
+@contextlib.contextmanager
+def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Iterator[None]:
+    """Have the state as it was before, behind a trial and behind whatever raises."""
     ctx = actor.ctx
     ctx.may_replace()
     kind, before = type(actor), dict(vars(actor))
     hooked = state_to_change(actor) if hasattr(actor, "set_state") else None
     values = None if hasattr(actor, "get_state") else live_state(actor)
-    try:
-        put_state(actor, change(state_to_change(actor)))
-        ctx.replaced()
-    except BaseException as error:
+
+    def put_back() -> None:
         actor.__class__ = kind
         vars(actor).clear()
         vars(actor).update(before)
@@ -116,6 +136,13 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
             put_state(actor, values)  # They may be another object's than the actor's.
         if hooked is not None:
             actor.set_state(hooked)  # type: ignore[attr-defined]  # it has one, see above
+
+    try:
+        yield
+    except BaseException as error:
+        put_back()
         if not isinstance(error, Exception) or isinstance(error, ControlFailed):
             raise
-        raise ControlFailed(ctx.path, "replace_state", f"{type_name(type(error))}: {error_text(error)}") from error
+        raise ControlFailed(ctx.path, verb, f"{type_name(type(error))}: {error_text(error)}") from error
+    if is_trial:
+        put_back()

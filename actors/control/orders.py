@@ -20,7 +20,7 @@ from ..kernel.envelope import message_in
 from ..kernel.message import message_name
 from ..process.wire.start_codec import pack_recipe, unpack_recipe
 from ..values import UnsavableValue
-from .live_state import change_state, state_to_show
+from .live_state import change_state, state_to_show, tried_state
 from .tracing import Statistics, tap_of
 
 if TYPE_CHECKING:
@@ -57,10 +57,7 @@ class Suspend(Order):
     verb = "suspend"
 
     def run(self, cell: Cell, actor: Actor) -> None:
-        more = cell.extra()
-        if not more.suspended:
-            more.suspended = True
-            mailbox.hold(cell)
+        mailbox.suspend(cell)
 
 
 class Resume(Order):
@@ -69,10 +66,7 @@ class Resume(Order):
     verb = "resume"
 
     def run(self, cell: Cell, actor: Actor) -> None:
-        more = cell.extra()
-        if more.suspended:
-            more.suspended = False
-            mailbox.release(cell)
+        mailbox.resume(cell)
 
 
 class GetState(Order):
@@ -116,32 +110,28 @@ class ReplaceCode(Order):
     migrate: Migrate | None
 
     def run(self, cell: Cell, actor: Actor) -> bytes | None:
-        more = cell.extra()
-        if not more.suspended:
+        if not cell.extra().suspended:
             raise NotSuspended(cell.path, self.verb)
-        start = next_start(cell, self.start, keeps_arguments=self.keeps_arguments)
-        old, new = type(actor), start.kind
+        start, old = next_start(cell, self.start, keeps_arguments=self.keeps_arguments), type(actor)
+        try:
+            change_state(actor, self.becoming(actor))
+        except ControlFailed as error:
+            raise ControlFailed(cell.path, self.verb, error.problem) from error
+        return has_become(cell, old, start)
+
+    def becoming(self, actor: Actor) -> Change:
+        """Takes the actor's state, makes the actor one of the new class, and returns the state as that wants it."""
+        new = self.start.kind
         migrate = self.migrate or getattr(new, "migrate", None)
-        change: Change = (lambda state: state) if migrate is None else (lambda state: migrate(state, old))
 
         def become(state: Any) -> Any:
-            state = change(state)
+            old = type(actor)
+            if migrate is not None:
+                state = migrate(state, old)
             cast("Any", actor).__class__ = new
             return state
 
-        try:
-            change_state(actor, become)
-        except ControlFailed as error:
-            raise ControlFailed(cell.path, self.verb, error.problem) from error
-        cell.table = new._table
-        if more.tap is not None:
-            more.tap.attach()
-        for topic in set(old._topics) - set(new._topics):
-            cell.node.topics.unsubscribe(topic, cell)
-        for topic in new._topics:
-            cell.node.topics.subscribe(topic, cell)
-        cell.node.respec(cell, start)
-        return None if cell.node.uplink is None else pack_recipe(start, cell.path)
+        return become
 
     def pack(self, where: str) -> dict[str, Any]:
         try:
@@ -158,6 +148,20 @@ class ReplaceCode(Order):
     def unpack(cls, data: dict[str, Any]) -> ReplaceCode:
         migrate = data["migrate"]
         return cls(unpack_recipe(data["start"]), data["keeps"], None if migrate is None else unpack_function(migrate))
+
+
+def has_become(cell: Cell, old: type[Actor], start: Start[Any]) -> bytes | None:
+    """The actor is of another class than before; the recipe of its next lives, packed, for the root of a process."""
+    new = start.kind
+    cell.table = new._table
+    if cell.more is not None and cell.more.tap is not None:
+        cell.more.tap.attach()
+    for topic in set(old._topics) - set(new._topics):
+        cell.node.topics.unsubscribe(topic, cell)
+    for topic in new._topics:
+        cell.node.topics.subscribe(topic, cell)
+    cell.node.respec(cell, start)
+    return None if cell.node.uplink is None else pack_recipe(start, cell.path)
 
 
 def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[Any]:
@@ -178,6 +182,104 @@ def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[A
         raise SpecError(cell.path, f"{problem}; give start({start.kind.__name__}, ...)") from error
     dataclasses.replace(spec, start=start)  # Raises what the spec does not allow.
     return start
+
+
+# -- what a transaction orders: it is prepared beside what runs, and then put in force at once ------------------------
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Prepared:
+    """What an actor will go on with: its state, and its recipe if its class is another one."""
+
+    state: Any
+    start: Start[Any] | None
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Prepare(Order):
+    """Handle no message from now on, for a transaction, and try what it wants: nothing is changed by it.
+
+    Returns the recipe of the next lives, packed, if there is another one, and if it is carried out in another process.
+    """
+
+    verb: ClassVar[str] = "prepare"
+    attempt: int
+    wanted: tuple[ReplaceState | ReplaceCode, ...]
+
+    def run(self, cell: Cell, actor: Actor) -> bytes | None:
+        mailbox.suspend(cell, mailbox.BY_TRANSACTION)
+        hold = mailbox.held(cell)
+        assert hold is not None
+        hold.attempt, hold.prepared = self.attempt, None
+        if not self.wanted:
+            return None
+        start: Start[Any] | None = None
+        for one in self.wanted:
+            if isinstance(one, ReplaceCode):
+                start = next_start(cell, one.start, keeps_arguments=one.keeps_arguments)
+        changes = [one.change if isinstance(one, ReplaceState) else one.becoming(actor) for one in self.wanted]
+        hold.prepared = Prepared(tried_state(actor, changes, self.wanted[0].verb), start)
+        return None if start is None or cell.node.uplink is None else pack_recipe(start, cell.path)
+
+    def pack(self, where: str) -> dict[str, Any]:
+        return {"attempt": self.attempt, "wanted": [[one.verb, one.pack(where)] for one in self.wanted]}
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> Prepare:
+        kinds: dict[str, Any] = {kind.verb: kind for kind in (ReplaceState, ReplaceCode)}
+        return cls(data["attempt"], tuple(kinds[verb].unpack(fields) for verb, fields in data["wanted"]))
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Conclude(Order):
+    """The transaction is over: go on with what it has prepared, or as before.
+
+    Raises NotSuspended: this life was not prepared for it.
+    """
+
+    verb: ClassVar[str] = "conclude"
+    attempt: int
+    is_in_force: bool
+    suspended: bool | None
+    """Whether it is suspended from now on; None: as before."""
+
+    def run(self, cell: Cell, actor: Actor) -> None:
+        hold = mailbox.held(cell)
+        if hold is None or hold.attempt != self.attempt:
+            if not self.is_in_force:
+                return
+            raise NotSuspended(cell.path, self.verb, "its life is not the one that was prepared")
+        prepared, hold.attempt, hold.prepared = hold.prepared, 0, None
+        try:
+            if prepared is not None and self.is_in_force:
+                go_on_with(cell, actor, prepared)
+        finally:
+            if self.suspended:
+                mailbox.suspend(cell)
+            elif self.suspended is not None:
+                mailbox.resume(cell)
+            mailbox.resume(cell, mailbox.BY_TRANSACTION)
+
+    def pack(self, where: str) -> dict[str, Any]:
+        return {"attempt": self.attempt, "is_in_force": self.is_in_force, "suspended": self.suspended}
+
+    @classmethod
+    def unpack(cls, data: dict[str, Any]) -> Conclude:
+        return cls(data["attempt"], data["is_in_force"], data["suspended"])
+
+
+def go_on_with(cell: Cell, actor: Actor, prepared: Prepared) -> None:
+    """Have an actor between two turns go on with what was prepared for it. Raises ControlFailed."""
+    old, start = type(actor), prepared.start
+
+    def put(_: Any) -> Any:
+        if start is not None:
+            cast("Any", actor).__class__ = start.kind
+        return prepared.state
+
+    change_state(actor, put)
+    if start is not None:
+        has_become(cell, old, start)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -218,7 +320,8 @@ class Ready(Order):
 
 
 ORDERS: dict[str, type[Order]] = {
-    kind.verb: kind for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Look, Mark, Ready)
+    kind.verb: kind
+    for kind in (Suspend, Resume, GetState, ReplaceState, ReplaceCode, Prepare, Conclude, Look, Mark, Ready)
 }
 
 
@@ -280,7 +383,8 @@ def _state(cell: Cell) -> str:
         return "ending"
     if not cell.host.is_up(cell):
         return "restarting"
-    return "suspended" if cell.more is not None and cell.more.suspended else "running"
+    suspended = cell.more.suspended if cell.more is not None else 0
+    return "suspended" if suspended & ~mailbox.BY_ITSELF else "running"
 
 
 # -- functions by name ------------------------------------------------------------------------------------------------

@@ -158,7 +158,7 @@ class More:
         self.start_error: StartFailed | None = None  # why `on_start` of this life failed; told when it has ended
         self.starting: asyncio.Future[None] | None = None  # whoever waits for `on_start` of this life waits for it
         self.stash: deque[Any] | None = None
-        self.suspended = False
+        self.suspended = 0  # by whom, see `control/orders.py`
         self.tap: Tap | None = None  # whoever counts or follows what the actor does
         self.trap_exits = False
         self.turn: Suspended | None = None

@@ -420,6 +420,9 @@ class ActorContext:
         Raises whatever keeps it from being saved.
         """
 
+    def check_saving(self) -> None:
+        """Raises whatever would keep the present state from being saved, if it has to be."""
+
     def close(self) -> None:
         """The life is over."""
         self.closed = True

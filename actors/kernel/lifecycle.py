@@ -504,7 +504,7 @@ def _undo(cell: Cell) -> None:
             cell.node.names.pop(name, None)
         more.names.clear()
         more.watching.clear()
-    more.suspended = more.trap_exits = False
+    more.suspended, more.trap_exits = 0, False
     queue = cell.queue
     if queue:
         kept = deque.copy(queue) if type(queue) is deque else deque(queue)

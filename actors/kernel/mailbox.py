@@ -249,11 +249,15 @@ class _Nothing(Item):
 NOTHING = _Nothing()
 
 
-class _Hold(Item):
+class Hold(Item):
     """Stands between the commands and the messages of a suspended actor: none of those is run, none is out of order."""
 
-    __slots__ = ()
+    __slots__ = ("attempt", "prepared")
     is_command = True
+
+    def __init__(self) -> None:
+        self.attempt = 0  # of a transaction that holds the actor too
+        self.prepared: Any = None  # and what it has prepared for it
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
@@ -263,21 +267,36 @@ class _Hold(Item):
         return LEAVE
 
 
-HOLD = _Hold()
+BY_USER, BY_TRANSACTION, BY_ITSELF = 1, 2, 4
+"""Who suspends an actor: bits of `suspended`."""
 
 
-def hold(cell: Cell) -> None:
-    """Suspend: called between two turns."""
-    put_back(cell, (HOLD,))
+def suspend(cell: Cell, who: int = BY_USER) -> None:
+    """Have an actor handle no message until all who suspend it have resumed it. Called between two turns."""
+    more = cell.extra()
+    if not more.suspended:
+        put_back(cell, (Hold(),))
+    more.suspended |= who
 
 
-def release(cell: Cell) -> None:
-    """Resume: called between two turns."""
+def resume(cell: Cell, who: int = BY_USER) -> None:
+    """It handles messages again, as far as this one is concerned, in order. Called between two turns."""
+    more = cell.extra()
+    if not more.suspended:
+        return
+    more.suspended &= ~who
+    if more.suspended:
+        return
     queue = queue_of(cell)
     for index, item in enumerate(queue):  # Not removed: the run loop has counted it.
-        if item is HOLD:
+        if type(item) is Hold:
             queue[index] = NOTHING
             return
+
+
+def held(cell: Cell) -> Hold | None:
+    """What holds the messages of an actor of this process; None if it is not suspended."""
+    return next((item for item in cell.queue or () if type(item) is Hold), None)
 
 
 class BoundedQueue(deque[Any]):

@@ -55,7 +55,11 @@ class FromHere(Leaving):
             raise CannotMove(move.cell.path, "its code was replaced meanwhile; try again")
         move.rest_at = now()
         luggage = move.luggage
-        luggage.suspended, luggage.traps, luggage.stash = more.suspended, more.trap_exits, list(more.stash or ())
+        luggage.suspended, luggage.traps, luggage.stash = (
+            bool(more.suspended & mailbox.BY_USER),
+            more.trap_exits,
+            list(more.stash or ()),
+        )
         # What belongs to the address: a new life that fails may have added to it.
         self._topics, self._links, self._watches = set(more.topics), set(more.links), set(more.watching)
         self.pack(actor, state)
@@ -169,9 +173,8 @@ class Arrival:
             bound.count = sum(map(mailbox.counts, waiting))
         kept = deque(item for one in stash if (item := decoded(cell, one)) is not None)
         more.stash = kept or None
-        more.suspended = suspended
         if suspended:
-            mailbox.hold(cell)
+            mailbox.suspend(cell)
         return commands
 
     def discard(self) -> None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ..control.live_state import live_state, put_state
 from ..errors import BadMessage, HoldfastError, error_text, type_name
 from ..exit_reasons import pack_exit, unpack_exit
+from ..kernel import mailbox
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item, ReplyHandle
 from ..kernel.links import Down, Exit, Monitor
@@ -127,7 +128,7 @@ def pack_rest(actor: Actor) -> dict[str, Any]:
     return {
         "timers": timers,
         "trap_exits": more.trap_exits,
-        "suspended": more.suspended,
+        "suspended": bool(more.suspended & mailbox.BY_USER),
         "links": [peer.path for peer in more.links],
         "watches": watches,
     }

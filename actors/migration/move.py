@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from ..errors import CannotMove, StartFailed
@@ -29,6 +29,33 @@ if TYPE_CHECKING:
     from ..process.worker_pool import Worker
 
 T = TypeVar("T")
+
+
+class Gate:
+    """Where a change that is ready waits for leave to be made, so that several are made at the same instant."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self.opened: asyncio.Future[None] = loop.create_future()
+        self.reached: asyncio.Future[None] = loop.create_future()
+        self.is_waiting = False
+
+    def open(self) -> None:
+        """All that comes may pass from now on."""
+        if not self.opened.done():
+            self.opened.set_result(None)
+
+    @contextlib.contextmanager
+    def waiting(self) -> Iterator[asyncio.Future[None]]:
+        """A change is ready, and waits for the future that it is given, or gives up."""
+        self.is_waiting = True
+        if not self.reached.done():
+            self.reached.set_result(None)
+        try:
+            yield self.opened
+        finally:
+            self.is_waiting = False
+            if self.reached.done():
+                self.reached = self.opened.get_loop().create_future()
 
 
 @dataclasses.dataclass
@@ -146,6 +173,7 @@ class Move:
         self.is_bound = False  # the old place has let the life go: there is no way back
         self.is_done = False
         self.is_late = False  # its life has ended before it was at rest
+        self.gate: Gate | None = None  # it waits there when all is ready
         self.moved: Callable[[], None] = lambda: None  # called at once when the new life is the one
         self.ending: asyncio.Future[None] | None = None  # of what is not needed any more
         self._hearing = contextlib.ExitStack()
@@ -164,6 +192,7 @@ class Move:
             await entering.prepare()
             await leaving.quiesce()
             await entering.begin()
+            await self._allowed()
             await leaving.let_go()
             if not self.is_done:
                 self.commit()
@@ -180,6 +209,14 @@ class Move:
             enders = self.cell.extra().enders
             if enders is not None and ended in enders:
                 enders.remove(ended)
+
+    async def _allowed(self) -> None:
+        """Wait for leave to go on, for as long as it takes. Raises CannotMove: it was given up meanwhile."""
+        if self.gate is not None and not self.gate.opened.done():
+            with self.gate.waiting() as opened:
+                await asyncio.wait((opened, self.given_up), return_when=asyncio.FIRST_COMPLETED)
+            if self.given_up.done():
+                raise CannotMove(self.cell.path, self.given_up.result())
 
     def commit(self) -> None:
         """From here on the new life is the one: nowhere else is it decided where an address lives.

@@ -262,7 +262,7 @@ def part(cell: Cell) -> Cell:
         timer.belongs_to(old)
         timer.cancel()
     cell.actor = cell.ctx = cell.context = None
-    more.trap_exits = more.suspended = False
+    more.trap_exits, more.suspended = False, 0
     more.stash = None
     return old
 
@@ -284,7 +284,7 @@ def sorted_out(cell: Cell, *, ticks: bool = False) -> tuple[list[Any], list[Item
     more = cell.extra()
     items: list[Any] = []
     for item in list(cell.queue or ()):
-        if isinstance(item, Item) and (item is mailbox.HOLD or item is mailbox.NOTHING or item.is_command):
+        if isinstance(item, Item) and (type(item) is mailbox.Hold or item is mailbox.NOTHING or item.is_command):
             continue
         if isinstance(item, Settle) or (isinstance(item, Tick) and not ticks):
             continue  # Ticks of an actor that leaves are with its timers.

@@ -168,8 +168,7 @@ class GuestMove:
         if self._stash:
             more.stash, self._stash = deque(self._stash), []
         if suspended:
-            more.suspended = True
-            mailbox.hold(cell)
+            mailbox.suspend(cell)
         lifecycle.up(cell)
         self._say("began", at=now())
 
@@ -178,7 +177,7 @@ class GuestMove:
     def _taken(self, actor: Actor, state: bytes) -> None:
         self._state = state
         more = actor.ctx.cell.extra()
-        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=more.suspended)
+        self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=bool(more.suspended & mailbox.BY_USER))
 
     def _pack(self, cell: Cell) -> None:
         """Nothing comes any more: send what there is."""

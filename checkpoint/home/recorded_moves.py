@@ -10,7 +10,7 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING
 
-from ...actors.errors import CannotMove, HoldfastError, StartFailed
+from ...actors.errors import CannotMove, StartFailed
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.cell import Cell
 from ...actors.migration.here import Arrival, FromHere
@@ -147,25 +147,22 @@ class FromRecordedWorker(FromOwnWorker):
 
 
 class Beginning:
-    """A recorded life that begins in a process: it is the one at the instant at which it is live."""
+    """A recorded life that begins in a process. From when it is live to the commit, its home hears nothing of it."""
 
     def __init__(self, move: Move, switch: Switch) -> None:
         self._move, self._switch = move, switch
-        self._is_one: asyncio.Future[None] = move.node.loop.create_future()
-        self._live: Live | None = None
+        self._is_live: asyncio.Future[None] = move.node.loop.create_future()
+        self._unheard: list[ToHome] = []  # that it is live, and what it has said since
+        self._is_one = False
 
     def from_life(self, record: ToHome) -> None:
         """What it says."""
-        if not isinstance(record, Live):
+        if self._is_one or not (self._unheard or isinstance(record, Live)):
             self._switch.from_life(record)
-        elif not self._move.given_up.done() and not self._is_one.done():  # Else it is too late.
-            self._live = record
-            try:
-                self._move.commit()
-            except HoldfastError as error:
-                self.fail(error)
-            else:
-                self._is_one.set_result(None)
+            return
+        self._unheard.append(record)
+        if not self._is_live.done():
+            self._is_live.set_result(None)
 
     def follow(self, live: asyncio.Future[float]) -> None:
         """It fails as the home's own future does."""
@@ -173,23 +170,28 @@ class Beginning:
 
     def fail(self, error: BaseException | None) -> None:
         """It will never be the one."""
-        if error is not None and not self._is_one.done():
-            is_known = isinstance(error, (StartFailed, CannotMove))
-            self._is_one.set_exception(error if is_known else StartFailed(self._move.cell.path, str(error)))
-            self._is_one.exception()  # Seen: whoever waits may have given up.
+        if error is None or self._is_one:
+            return
+        if self._is_live.done():
+            self._move.give_up(f"its new life has ended ({error})")
+            return
+        is_known = isinstance(error, (StartFailed, CannotMove))
+        self._is_live.set_exception(error if is_known else StartFailed(self._move.cell.path, str(error)))
+        self._is_live.exception()  # Seen: whoever waits may have given up.
 
-    async def is_one(self) -> None:
-        """Wait until it is the one.
+    async def is_live(self) -> None:
+        """Wait until it has caught up.
 
         Raises:
             CannotMove, StartFailed: it will never be.
         """
-        await self._move.within(self._is_one, self._move.timeout, lambda: "its new life was not up")
+        await self._move.within(self._is_live, self._move.timeout, lambda: "its new life was not up")
 
     def go_on(self) -> None:
         """What waits at home is fed to it."""
-        assert self._live is not None
-        self._switch.from_life(self._live)
+        self._is_one = True
+        for record in self._unheard:
+            self._switch.from_life(record)
         self._move.gone_on_at = now()
 
 
@@ -215,7 +217,7 @@ class ToRecordedWorker(ToWorker):
         await self.launch(worker, {"recorded": {**recorded, **kept}})
         switch.attach(port)
         beginning.follow(live)
-        await beginning.is_one()
+        await beginning.is_live()
 
     def take_over(self) -> list[Item]:
         assert self.worker is not None

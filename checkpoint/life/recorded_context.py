@@ -19,6 +19,7 @@ from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
 from ..protocol import Feed, PipeDone
+from ..snapshot.key_variables import save_state
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
@@ -306,6 +307,11 @@ class RecordedContext(ActorContext):
 
     def replaced(self) -> None:
         self.recorded.replaced()
+
+    def check_saving(self) -> None:
+        actor = self.cell.actor
+        assert actor is not None
+        save_state(actor)
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
         if self.recorded.is_live:

@@ -351,9 +351,6 @@ class Life:
     def go_live(self) -> None:
         """Replay is over."""
         self.is_live = True
-        if self.begins_suspended:
-            self.cell.extra().suspended = True
-            mailbox.hold(self.cell)
         self.stash = [fed for fed in self.stash if fed.feed.id not in self.gone]
         for key in self.gone:
             self.returned.pop(key, None)
@@ -361,6 +358,8 @@ class Life:
             queue = mailbox.queue_of(self.cell)
             queue.extendleft(reversed(self.returned.values()))
             self.returned.clear()
+        if self.begins_suspended:  # Behind what comes first: it is not handled either.
+            mailbox.suspend(self.cell)
         self.port.to_home(Live(self._restore_seconds))
         if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
             self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.

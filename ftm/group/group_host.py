@@ -18,6 +18,7 @@ from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
 from ...actors.kernel.envelope import Item
+from ...actors.migration.move import Gate
 from ...checkpoint.home.homes import Homes, seen
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import Restore
@@ -242,7 +243,12 @@ class GroupHost(Steered):
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
     async def adapt(
-        self, cell: Cell, mechanism: Any, switched: Callable[[], None], rest_within: float = REST_WITHIN
+        self,
+        cell: Cell,
+        mechanism: Any,
+        switched: Callable[[], None],
+        rest_within: float = REST_WITHIN,
+        gate: Gate | None = None,
     ) -> Reconfiguration:
         """Go on with another stack of mechanisms.
 
@@ -251,6 +257,7 @@ class GroupHost(Steered):
             mechanism: the whole new stack.
             switched: called at the instant from which on it is the one.
             rest_within: seconds within which what is inside has to come to its end.
+            gate: where it waits when all is ready.
 
         Raises:
             CannotAdapt: why it stays as it was.
@@ -261,11 +268,12 @@ class GroupHost(Steered):
         for back in (group.change, group.gone_back):
             if back is not None and back.is_back and not back.outcome.done():  # It is told as settled, and ends soon.
                 await asyncio.wait((back.outcome,))
-                return await self.adapt(cell, mechanism, switched, rest_within)
+                return await self.adapt(cell, mechanism, switched, rest_within, gate)
         if group.change is not None:
             raise CannotAdapt(cell.path, "it is being changed already")
         self.last_config += 1
         change = group.change = Reconfiguration(group, self.last_config, compose(mechanism), rest_within)
+        change.gate = gate
         self.on_switched = switched
         group.tell("adapt", Look())
         await asyncio.shield(change.outcome)

@@ -31,6 +31,7 @@ from .trial import TRIAL, TrialFailed, tried, until_given_up
 from .trial import ended as ended_trial
 
 if TYPE_CHECKING:
+    from ...actors.migration.move import Gate
     from ..bricks.sealed_frames import SecuredLink
     from ..model.mechanism import Mechanism
     from .group import Group
@@ -64,6 +65,8 @@ PREPARING, RESTING, COMMITTING, TIDYING, UNDOING, OVER = (
     "undoing",
     "over",
 )
+ALLOWED_WITHIN = 3600.0
+"""Seconds that it waits for a transaction whose time limit is shorter."""
 STEPS = ("try", "start", "prepare", "rest", "quiesce", "commit", "switch", "tidy")
 """Where the engine may be struck by a test; undoing has `abort` instead of the last three."""
 
@@ -87,6 +90,7 @@ class Reconfiguration:
         self.is_preparing = False  # replicas start its bricks
         self.is_tried = False
         self.broken_off = 0  # how often a replica has ended, or has changed its part, while it prepared
+        self.gate: Gate | None = None  # it waits there when all is ready
         self.link: SecuredLink | None = None  # that of the new stack, if it is another one
         self.given_up: asyncio.Future[str] = group.node.loop.create_future()
         self.prepared: dict[str, int] = {}  # name to life, of those that have the new bricks
@@ -362,6 +366,10 @@ class AdaptationEngine(Actor):
                 return False
         stands: dict[str, Stand] = {name: future.result() for name, future in asked.items()}
         self._check_stands(change, stands, primary)
+        if change.gate is not None and not change.gate.opened.done():
+            with change.gate.waiting() as opened:
+                if not await self._ends(opened, change, self._now() + ALLOWED_WITHIN, "nobody has said that it may be"):
+                    return False
         return not change.why and self._is_as_prepared(change)
 
     def _check_stands(self, change: Reconfiguration, stands: dict[str, Stand], primary: str) -> None:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 from ...actors.control.orders import Ready, ReplaceCode, ReplaceState, Resume, Suspend
 from ...actors.control.orders_lane import Call, send_call
 from ...actors.errors import ControlFailed
+from ...actors.kernel import mailbox
 from ...actors.kernel.cell import Cell
 from ...actors.process.process_host import ProcessHost
 from ...actors.process.wire import frames
@@ -49,7 +50,8 @@ class Steered(HomeHost):
         send_call(worker, group.place(f"{group.primary}/server"), call)
 
     def _hold(self, cell: Cell, group: Group, *, is_suspended: bool) -> None:
-        group.is_suspended = cell.extra().suspended = is_suspended
+        group.is_suspended = is_suspended
+        cell.extra().suspended = mailbox.BY_USER if is_suspended else 0
         group.poke()
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:

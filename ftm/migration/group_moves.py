@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from ...actors.errors import AskTimeout, CannotMove, HoldfastError, StartFailed
 from ...actors.exit_reasons import unpack_exit
+from ...actors.kernel import mailbox
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.links import Down, Exit, Monitor
@@ -160,7 +161,7 @@ class ToGroup(Entering):
         cell, group, luggage = self.cell, self._group, self.move.luggage
         assert group is not None
         if luggage.suspended:
-            group.is_suspended = cell.extra().suspended = True
+            group.is_suspended, cell.extra().suspended = True, mailbox.BY_USER
         self._host.attached(cell, group)
         self._switch.from_life(self._live.result())  # What waits is fed.
         group.go_on()

@@ -21,6 +21,7 @@ from ...actors.kernel import lifecycle, links
 from ...actors.kernel.actor import Start
 from ...actors.kernel.bindings import settle_claims
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
+from ...actors.migration.move import Gate
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.home.homes import seen
 from ...checkpoint.protocol import Closed, Over, Respec, Started, Wanted
@@ -163,7 +164,7 @@ class SubtreeGroup(GroupHost):
         if is_unkept(self.method) and self.switch is not None:
             forget_later(self.switch, str(reason))
         more = cell.extra()
-        cell.state, more.reason, more.suspended = DOWN, reason, False
+        cell.state, more.reason, more.suspended = DOWN, reason, 0
         links.announce(cell, reason, recovering=recovers)
         lifecycle.tell_enders(more, reason)
 
@@ -201,13 +202,18 @@ class SubtreeGroup(GroupHost):
         return self._recipe
 
     async def adapt(
-        self, cell: Cell, mechanism: Any, switched: Callable[[], None], rest_within: float = REST_WITHIN
+        self,
+        cell: Cell,
+        mechanism: Any,
+        switched: Callable[[], None],
+        rest_within: float = REST_WITHIN,
+        gate: Gate | None = None,
     ) -> Reconfiguration:
         def also_there() -> None:
             switched()
             self._say_spec()
 
-        return await super().adapt(cell, mechanism, also_there, rest_within)
+        return await super().adapt(cell, mechanism, also_there, rest_within, gate)
 
     def respecified(self, cell: Cell) -> None:
         super().respecified(cell)

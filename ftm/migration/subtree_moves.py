@@ -293,7 +293,7 @@ class ToRecordedSubtree(IntoSubtree):
         move.say_now(self.worker, "come", is_suspended=move.luggage.suspended, **told)
         switch.attach(port)
         beginning.follow(live)
-        await beginning.is_one()
+        await beginning.is_live()
 
     def _said(self, record: ToHome) -> None:
         """From the life that begins in the process."""
@@ -338,15 +338,12 @@ class ToSubtree(IntoSubtree):
         if step == "failed":
             self._fail(StartFailed(self.cell.path, str(told["why"])))
         elif step == "up":
-            try:
-                self.move.commit()
-            except HoldfastError as error:
-                self._fail(error)
-            else:
-                self._up.set_result(None)
+            self._up.set_result(None)
 
     def _fail(self, error: HoldfastError) -> None:
-        if not self._up.done():
+        if self._up.done():
+            self.move.give_up(str(error))
+        else:
             self._up.set_exception(error)
             self._up.exception()
 
@@ -375,7 +372,7 @@ class ToSubtree(IntoSubtree):
         move.say_now(worker, "settle", **told)
         self._group.hand_over()
         self.place.forget()
-        more.outlet, more.suspended = None, False
+        more.outlet, more.suspended = None, 0
         self.host = worker.inner.lived_there(cell)
         return []
 

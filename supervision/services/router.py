@@ -173,7 +173,7 @@ class Router(Actor):
         if cell.more is not None and cell.more.bound is not None and mailbox.counts(item):
             cell.more.bound.count += 1
         mailbox.put_back(cell, (item,))
-        mailbox.hold(cell)
+        mailbox.suspend(cell, mailbox.BY_ITSELF)
         self._is_held = True
         for one in full:
             self._wait_for_room(one)
@@ -202,7 +202,7 @@ class Router(Actor):
             room.cancel()
         self._rooms.clear()
         cell = self.ctx.cell
-        mailbox.release(cell)
+        mailbox.resume(cell, mailbox.BY_ITSELF)
         cell.schedule()
 
 

@@ -12,7 +12,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
-from .mechanisms import Attach, Compose, Detach, DetachLayer, OnProtection, Transition, Update
+from .mechanisms import Attach, Compose, Detach, DetachLayer, Isolate, OnProtection, Transition, Update
 from .operation import Operation, Step
 from .reparenting import Move
 from .running import StartAgain, StopChild
@@ -75,7 +75,7 @@ class Change:
 
     def isolation(self, target: Target, isolation: Isolation) -> None:
         """Have an actor live in a process of its own, or as a task."""
-        self.step(living.Isolate(target, isolation))
+        self.step(Isolate(target, isolation))
 
     # -- what connects actors -----------------------------------------------------------------------------------------
 

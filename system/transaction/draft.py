@@ -24,6 +24,8 @@ from .operation import wrong
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
+    from .relocation import Relocation
+    from .rework import Rework
 
 Target = ActorRef[Any] | str
 """What an operation is about: a ref, or the address at that point of the transaction."""
@@ -38,13 +40,18 @@ class Place:
         "children",
         "flags",
         "is_leaving",
+        "is_moved",
         "is_planned",
+        "is_stopped",
         "is_suspended",
         "kind",
         "name",
         "names",
         "parent",
+        "relocation",
+        "rework",
         "spec",
+        "was",
     )
 
     def __init__(self, name: str, parent: Place | None, cell: Cell | None, spec: ChildSpec | None) -> None:
@@ -53,10 +60,15 @@ class Place:
         self.flags: Flags | None = None
         self.kind: type[Actor] | None = spec.start.kind if spec is not None else None
         self.is_leaving = False  # removed by an earlier step; it goes when all is done
+        self.is_moved = False  # to another supervisor, perhaps back again
         self.is_planned = False  # added by an earlier step
+        self.is_stopped = cell is None or cell.is_dead  # a child whose spec stays, and which does not run
         self.is_suspended = cell is not None and cell.more is not None and cell.more.suspended
         self.bindings: dict[str, Place] = {}
         self.names: list[str] = []
+        self.was = (parent, name)  # where it is before the transaction
+        self.rework: Rework | None = None  # what is changed in the actor itself
+        self.relocation: Relocation | None = None  # and where it lives
 
     @property
     def path(self) -> str:
@@ -83,6 +95,17 @@ class Place:
         """The supervisor itself, if it lives in this process now."""
         actor = self.cell.actor if self.cell is not None else None
         return actor if isinstance(actor, Supervisor) and "_children" in actor.__dict__ else None
+
+    @property
+    def is_protected(self) -> bool:
+        """Whether it lives as a group of replicas now."""
+        spec = self.cell.spec if self.cell is not None else None
+        return isinstance(spec, ChildSpec) and spec.mechanism is not None
+
+    def rework_of(self) -> Rework:
+        """What is changed in the actor itself; a step has asked for it."""
+        assert self.rework is not None
+        return self.rework
 
     def walk(self) -> Iterator[Place]:
         """This place, and all below it."""
@@ -147,9 +170,12 @@ class Draft:
                 lives = node.successor(target) if target.state is GONE else target
                 if lives is not None and lives in self.by_cell:
                     place.bindings[port] = self.by_cell[lives]
+        self.named: dict[str, Place] = {}
+        """Who has which name before the transaction."""
         for name, cell in node.names.items():
             if cell in self.by_cell:
                 self.by_cell[cell].names.append(name)
+                self.named[name] = self.by_cell[cell]
 
     def _survey(self, cell: Cell | None, name: str, parent: Place | None, spec: ChildSpec | None) -> Place:
         place = Place(name, parent, cell, spec)

@@ -54,6 +54,14 @@ def with_child(spec: ChildSpec) -> Edit:
     return lambda flags, specs: (flags, (*(other for other in specs if other.id != spec.id), spec))
 
 
+def changed(name: str, **fields: Any) -> Edit:
+    """The child of this id with other fields in its spec."""
+    return lambda flags, specs: (
+        flags,
+        tuple(dataclasses.replace(spec, **fields) if spec.id == name else spec for spec in specs),
+    )
+
+
 def in_order(ids: list[str]) -> Edit:
     """The children in another order; those that are not mentioned behind the others."""
     rank = {name: number for number, name in enumerate(ids)}

@@ -1,132 +1,108 @@
-"""Operations on fault-tolerance mechanisms: attach, detach, compose, exchange one for another, update a brick."""
+"""Operations on where an actor lives, and on its mechanisms: attach, detach, compose, exchange, update a brick."""
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.kernel.cell import Cell
-from ...supervision.arbiter import Grant, Hand, arbiter_of
+from ...actors.errors import SpecError
+from ...supervision.arbiter import Hand, arbiter_of
 from ...supervision.respec import recipe_spec
-from ..live_moves import to_its_end
+from ...supervision.spec import Isolation
 from .draft import Draft, Place, Target, is_elsewhere, rules
 from .living import OnLiving
 from .operation import wrong
+from .relocation import Relocation, described
 
 if TYPE_CHECKING:
     from ...ftm.group.probation import Probation
     from ..system import ActorSystem
 
-PROTECT_TIMEOUT = 60.0
-"""Seconds that a life may take to move into a group or out of it; the transaction's own time limit is shorter."""
 
-
-class OnProtection(OnLiving):
-    """Base: the way in and the way out, each of which undoes the other."""
+class OnPlace(OnLiving):
+    """Base of operations on where an actor lives, and behind which mechanisms; the first one does it for the others."""
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)
-        self._under_way: asyncio.Task[None] | None = None
-        self._before: Any = None  # the mechanism there was
-        self._after: Any = None  # and that there is to be
-        self._has_begun = False
-        self._grant: Grant | None = None
-        self.probation: Probation | None = None
-        """Whether it stays is known when this is over; None: at once."""
+        self._relocation: Relocation | None = None  # that of the first such step, which carries it out
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        await super().check(system, draft)
+        place = self._place
+        assert place is not None
+        above = place.parent
+        if place.spec is None and above is not None and above.cell is not None and is_elsewhere(above.cell):
+            place.spec = recipe_spec(place.cell) if place.cell is not None else None
+            if place.spec is None:
+                why = (
+                    "its supervisor lives in another process, and no recipe here has its spec: add it by a transaction"
+                )
+                raise wrong(self.target, why)
+        if place.spec is None:
+            raise wrong(self.target, self.unsupervised)
+        if place.relocation is None:
+            place.relocation = self._relocation = Relocation(place, self.text)
+
+    unsupervised: ClassVar[str] = "nobody supervises it, so nobody would start it again"
+
+    async def prepare(self, system: ActorSystem) -> None:
+        if self._relocation is not None:
+            await self._relocation.prepare(system)
+
+    def ready(self, system: ActorSystem) -> str:
+        return "" if self._relocation is None else self._relocation.ready(system)
+
+    def commit(self, system: ActorSystem) -> None:
+        if self._relocation is not None:
+            self._relocation.commit(system)
+
+    async def finish(self, system: ActorSystem) -> None:
+        if self._relocation is not None:
+            await self._relocation.finish(system)
+
+    async def release(self, system: ActorSystem) -> None:
+        if self._relocation is not None:
+            await self._relocation.release(system)
+
+
+class Isolate(OnPlace):
+    """Have an actor live in a process of its own, or as a task of this one."""
+
+    verb: ClassVar[str] = "isolate"
+    unsupervised: ClassVar[str] = "nobody supervises it: it has no isolation to change"
+
+    def __init__(self, target: Target, isolation: Isolation) -> None:
+        super().__init__(target)
+        self._to: Isolation = isolation
+
+    @property
+    def text(self) -> str:
+        return f"have {self.target} live in a {self._to}"
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        await super().check(system, draft)
+        place = self._place
+        assert place is not None
+        assert place.spec is not None
+        if self._to not in ("task", "process"):
+            raise SpecError(self.target, f"isolation must be one of task, process, not {self._to!r}")
+        if place.spec.mechanism is not None:
+            raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
+        place.spec = dataclasses.replace(place.spec, isolation=self._to)
+
+
+class OnProtection(OnPlace):
+    """Base of operations on the mechanisms of an actor."""
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         if (busy := arbiter_of(system.node).in_the_way(self.target, Hand.ADAPTATION)) is not None:
             raise busy
-        place = self._place
-        assert place is not None
-        above = place.parent
-        if above is not None and above.cell is not None and is_elsewhere(above.cell):
-            self._check_below(place)
-        if place.spec is None:
-            raise wrong(self.target, "nobody supervises it, so nobody would start it again")
 
-    def _check_below(self, place: Place) -> None:
-        """Whether it can be done below a supervisor that lives in another process. Raises SpecError."""
-        cell = place.cell
-        if place.spec is None and cell is not None:
-            place.spec = recipe_spec(cell)
-        if place.spec is None:
-            why = "its supervisor lives in another process, and no recipe here has its spec: add it by a transaction"
-            raise wrong(self.target, why)
-
-    async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
-        """Change it; whoever is cancelled gives up waiting, the change comes to its end."""
-        moves = system._moves
-        change = (
-            moves.unprotect(cell, PROTECT_TIMEOUT)
-            if mechanism is None
-            else moves.protect(cell, system.homes, mechanism, PROTECT_TIMEOUT)
-        )
-        self._under_way = system.node.loop.create_task(change, name=f"mechanism of {cell.path}")
-        await to_its_end(self.target, self._under_way)
-        self.probation = getattr(cell.host, "probation", None)  # None: there is no mechanism.
-
-    async def undo(self, system: ActorSystem) -> None:
-        if not self._has_begun:
-            return
-        try:
-            if self._under_way is not None:
-                self._give_up(system)
-                await asyncio.wait((self._under_way,))
-                if not self._under_way.cancelled():
-                    self._under_way.exception()
-            cell = self.cell(system)
-            if described(mechanism_of(cell)) != described(self._before):  # Else it stayed as it was.
-                await self._run(system, cell, self._before)
-            system.mechanism_notes.over(self.target)
-        finally:
-            self._give_back(system)
-
-    def _give_up(self, system: ActorSystem) -> None:
-        """Have what is under way end soon, if it can."""
-        system._moves.give_up(self.cell(system), "it is not wanted any more")
-
-    def _give_back(self, system: ActorSystem) -> None:
-        grant, self._grant = self._grant, None
-        if grant is not None:
-            arbiter_of(system.node).release(grant)
-
-    async def do(self, system: ActorSystem) -> None:
-        cell = self.cell(system)
-        self._grant = arbiter_of(system.node).claim(self.target, Hand.ADAPTATION, self.text)
-        self._before, self._has_begun = mechanism_of(cell), True
-        system.mechanism_notes.begun(self.target, self.text)
-        await self._run(system, cell, self._after)
-
-    def verify(self, system: ActorSystem) -> None:
-        place = self._place  # With what all steps have made of it.
-        assert place is not None
-        assert place.spec is not None
-        if described(mechanism_of(self.cell(system))) != described(place.spec.mechanism):
-            raise wrong(self.target, "its mechanism is another one again")
-
-    def seal(self, system: ActorSystem) -> None:
-        notes, target, before, after = system.mechanism_notes, self.target, self._before, self._after
-        probation = self.probation
-        is_open = probation is not None and not probation.is_over
-        notes.put(target, before, after, is_trusted=not is_open)
-        notes.over(target)
-
-        def over(is_kept: bool) -> None:
-            if is_kept:
-                notes.settled(target, after)
-            else:
-                notes.put(target, after, before, is_trusted=False)
-            notes.flush()
-
-        if probation is not None:
-            probation.when_over(over)
-        self._give_back(system)
-
-    async def finish(self, system: ActorSystem) -> None:
-        system.mechanism_notes.flush()
+    @property
+    def probation(self) -> Probation | None:
+        """Whether it stays is known when this is over; None: at once."""
+        return self._relocation.probation if self._relocation is not None else None
 
 
 class Attach(OnProtection):
@@ -137,6 +113,7 @@ class Attach(OnProtection):
     def __init__(self, target: Target, mechanism: Any) -> None:
         super().__init__(target)
         self._mechanism = mechanism
+        self._after: Any = None
 
     def _layers(self) -> Any:
         """As the spec has it: one alone stands there as it is."""
@@ -186,7 +163,8 @@ class Adapt(OnProtection):
 
     def __init__(self, target: Target) -> None:
         super().__init__(target)
-        self._was: Any = None
+        self._was: Any = None  # the mechanism there was
+        self._after: Any = None  # and that there is to be
 
     def _wanted(self, before: Any) -> tuple[Any, ...]:
         """The whole new stack.
@@ -210,19 +188,6 @@ class Adapt(OnProtection):
         if described(self._after) == described(self._was):
             raise wrong(self.target, f"it has just that already: {mechanism_text(self._was)}")
         place.spec = dataclasses.replace(place.spec, mechanism=self._after)
-
-    async def _run(self, system: ActorSystem, cell: Cell, mechanism: Any) -> None:
-        change = system._moves.adapt(cell, mechanism, PROTECT_TIMEOUT)
-        self._under_way = system.node.loop.create_task(change, name=f"adaptation of {cell.path}")
-        await to_its_end(self.target, self._under_way)
-        self.probation = getattr(cell.host, "probation", None)  # None: it has been detached since.
-
-    def _give_up(self, system: ActorSystem) -> None:
-        if self._under_way is not None and not self._under_way.done():
-            group = getattr(self.cell(system).host, "group", None)
-            change = None if group is None else group.change
-            if change is not None:
-                change.give_up("it is not wanted any more")
 
     @property
     def _from_to(self) -> str:
@@ -304,16 +269,6 @@ class Update(Adapt):
     def _wanted(self, before: Any) -> tuple[Any, ...]:
         layers: tuple[Any, ...] = rules().updated(before, self._brick, self._new, mechanism=self._of, role=self._role)
         return layers
-
-
-def mechanism_of(cell: Cell) -> Any:
-    """The mechanism that a live child has; None if it has none."""
-    return getattr(cell.spec, "mechanism", None)  # One that lives elsewhere has no spec here.
-
-
-def described(mechanism: Any) -> Any:
-    """A mechanism, or several, as it can be compared."""
-    return None if mechanism is None else rules().describe(mechanism)
 
 
 def check_layers(place: Place, mechanism: Any) -> None:

@@ -29,9 +29,14 @@ class Step:
 class Operation:
     """Base of all operations. A transaction calls, in this order:
 
-    `check` of all, each against the tree as it will be at that point, before anything is done; `do` of all; `verify`
-    of all; then there is no way back: `seal` of all, `finish` of all. If a `do` or `verify` fails, is cancelled or
-    takes too long, `undo` of all that have begun, last one first, instead.
+    1. `check` of all, each against the draft: the tree as it will be at that point.
+    2. `prepare` of all: what the commit needs is made beside what runs. Nothing that exists changes.
+    3. `ready` of all, until nobody names anything that is in the way.
+    4. `commit` of all, in the same step of the event loop as the last look: from here on the change is in force.
+    5. `finish` of all: what runs follows what is in force.
+
+    If something fails, is cancelled or takes too long before the commit: `release` of all whose `prepare` was begun,
+    last one first, instead of the rest.
     """
 
     verb: ClassVar[str] = ""
@@ -39,7 +44,7 @@ class Operation:
     def __init__(self, target: str) -> None:
         self.target = target
         self.waiting = ""
-        """What `do` waits for, told when the time is up."""
+        """What the transaction waits for because of this step, told when the time is up."""
         self.between_turns_of: tuple[Place, ...] = ()
         """Whose turns have to be over for this; known after the check."""
 
@@ -49,33 +54,38 @@ class Operation:
         return f"{self.verb} {self.target}"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        """See whether it can be done at this point, and change the draft as `do` will change the tree.
+        """See whether it can be done at this point, and change the draft as the commit will change the tree.
 
         Raises:
             HoldfastError: why not.
         """
         raise NotImplementedError
 
-    async def do(self, system: ActorSystem) -> None:
-        """Do it, noting what was done as it goes: it may be cancelled at any wait.
+    async def prepare(self, system: ActorSystem) -> None:
+        """Make what the commit needs beside what runs; called again when what was made is not good any more.
+
+        It may be cancelled at any wait, and notes what it has made as it goes, so that `release` finds it.
 
         Raises:
             HoldfastError: it cannot be done.
         """
-        raise NotImplementedError
 
-    async def undo(self, system: ActorSystem) -> None:
-        """Put back what `do` has changed so far; nothing if that is nothing."""
-        raise NotImplementedError
+    def ready(self, system: ActorSystem) -> str:
+        """What is in the way of a commit at this very instant, in words; "" if nothing is.
 
-    def verify(self, system: ActorSystem) -> None:
-        """All has been done: see whether it still holds. Raises HoldfastError if not."""
+        Raises:
+            HoldfastError: it cannot be done any more.
+        """
+        return ""
 
-    def seal(self, system: ActorSystem) -> None:
-        """The transaction is accepted: make the change one that outlives restarts."""
+    def commit(self, system: ActorSystem) -> None:
+        """Put it in force, at once. Called in the same step of the loop as `ready`, so it has no reason to fail."""
 
     async def finish(self, system: ActorSystem) -> None:
-        """What cannot be undone, and so comes last; what fails here is told, and changes nothing for the others."""
+        """Have what runs follow what is in force. What fails here is told, and changes nothing for the others."""
+
+    async def release(self, system: ActorSystem) -> None:
+        """Let go of what was prepared; nothing if that is nothing."""
 
 
 def wrong(where: str, problem: str) -> SpecError:

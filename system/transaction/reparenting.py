@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.kernel.cell import DOWN, GONE, Cell
@@ -12,20 +11,15 @@ from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.admin import NotSupported
 from ...supervision.children import STOPPED, UP, Child
-from ...supervision.spec import ChildSpec
 from ...supervision.supervisor import Supervisor
 from .addresses import Moved
 from .draft import Draft, Place, Target, is_elsewhere
 from .lasting import keep, with_child, without
 from .operation import Operation, wrong
-from .structure import check_child, text_of
-from .turns import arrange, between_turns
+from .structure import busy, check_child, child_of, text_of
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-
-LOOK_AGAIN = 0.02
-"""Seconds between two looks at a child that is being restarted, or a supervisor in the middle of something."""
 
 
 class Move(Operation):
@@ -37,14 +31,14 @@ class Move(Operation):
         super().__init__(text_of(target))
         self._at, self._to = target, supervisor
         self._place: Place | None = None
-        self._above: tuple[Place, Place] | None = None  # the supervisors: the old one and the new one
-        self._before: tuple[list[str], list[str]] | None = None  # the order there: of children, of addresses
-        self._spec: ChildSpec | None = None
+        self._draft: Draft | None = None
+        self._above: Place | None = None  # the new supervisor, at this point
+        self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
+        self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
 
     @property
     def text(self) -> str:
-        to = self._above[1].path if self._above is not None else text_of(self._to)
-        return f"move {self.target} to {to}"
+        return f"move {self.target} to {self._above.path if self._above is not None else text_of(self._to)}"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = draft.find(self._at)
@@ -64,76 +58,61 @@ class Move(Operation):
         check_child(new, place.spec)
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
-        self._place, self._above = place, (old, new)
-        self.between_turns_of = self._above
+        self._place, self._draft, self._above = place, draft, new
+        self._leads = not (place.is_moved or place.is_planned)  # Who is added is started where it is to be.
+        place.is_moved = True
+        self.between_turns_of = (old, new)
 
-    async def do(self, system: ActorSystem) -> None:
-        assert self._above is not None
-        old, new = (above.living(system.node) for above in self._above)
-        await self._moved(system, old, new)
+    def _ends(self, system: ActorSystem) -> tuple[Cell, Cell] | None:
+        """The supervisors that it leaves and comes to; None if it is to stay, or another step moves it."""
+        place = self._place
+        assert place is not None
+        old, new = place.was[0], place.parent
+        assert old is not None
+        assert new is not None
+        return (old.living(system.node), new.living(system.node)) if self._leads and old is not new else None
 
-    async def _moved(self, system: ActorSystem, old: Cell, new: Cell) -> None:
-        """Move it as soon as nothing is in the way, however often that has to be looked at."""
-        assert self._place is not None
-        name, homes, moved = self._place.name, system.homes, system.moved_addresses
-        asked: dict[Switch, int] = {}
-        while True:
-            settle_senders(homes, asked)
-            self.waiting = await between_turns(
-                old, lambda supervisor: self._attempt(supervisor, new, name, homes, moved)
-            )
-            if not self.waiting:
-                return
-            await asyncio.sleep(LOOK_AGAIN)
-
-    def _attempt(self, old: Supervisor, new: Cell, name: str, homes: Homes, moved: Moved) -> str:
-        """Move it, or say what is in the way. Nothing else happens between its first line and its last."""
-        one, to = old._children.get(name), new.actor
+    def ready(self, system: ActorSystem) -> str:
+        ends = self._ends(system)
+        if ends is None:
+            return ""
+        place = self._place
+        assert place is not None
+        for holder in ends:
+            if why := busy(holder):
+                return why
+        old, new = ends
+        one = child_of(old, place.name)
         if one is None:
-            raise wrong(old.ctx.path, f"it has no child {name!r} any more")
-        if not isinstance(to, Supervisor) or "_children" not in to.__dict__ or (new.more and new.more.turn):
-            return f"{new.path} is in the middle of something"
+            raise wrong(old.path, f"it has no child {place.name!r} any more")
         if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
-            return "it is being restarted"
-        if name in to._children or name in (new.children or ()):
+            return f"{self.target} is being restarted"
+        self._check_free(new, place.name)
+        settle_senders(system.homes, self._asked)
+        return WAITING if unsettled(system.homes) else ""
+
+    def _check_free(self, new: Cell, name: str) -> None:
+        """Raises SpecError: somebody came to live at the new address meanwhile, and stays there."""
+        assert self._draft is not None
+        known = child_of(new, name)
+        cell = (new.children or {}).get(name) or (known.cell if known is not None else None)
+        place = self._draft.by_cell.get(cell) if cell is not None else None
+        if (known is not None or cell is not None) and (place is None or not place.is_moved):
             raise wrong(new.path, f"it has a child {name!r} already")
-        if unsettled(homes):
-            return WAITING
-        self._before = self._before or (list(old._children), list(old.ctx.cell.children or ()))
-        self._spec = one.spec
-        move_child(old, to, one, moved)
-        return ""
 
-    async def undo(self, system: ActorSystem) -> None:
-        if self._before is None or self._above is None or self._place is None:
+    def commit(self, system: ActorSystem) -> None:
+        ends = self._ends(system)
+        if ends is None:
             return
-        old, new = (above.living(system.node) for above in self._above)
-        if not isinstance(new.actor, Supervisor) or self._place.name not in new.actor._children:
-            return  # It was not moved, or has ended for good since.
-        before, cells = self._before
-        await self._moved(system, new, old)
-
-        def back(supervisor: Supervisor) -> None:
-            known = supervisor._children
-            first = {name: known[name] for name in before if name in known}
-            supervisor._children = {**first, **{name: one for name, one in known.items() if name not in first}}
-            arrange(supervisor.ctx.cell, cells)
-
-        await between_turns(old, back)
-        system.moved_addresses.forget(f"{new.path}/{self._place.name}")
-
-    def seal(self, system: ActorSystem) -> None:
-        assert self._above is not None
-        assert self._spec is not None
-        old, new = self._above
-        keep(old.living(system.node), without(self._spec.id))
-        if self._spec.restart != "temporary":
-            keep(new.living(system.node), with_child(self._spec))
-
-    def verify(self, system: ActorSystem) -> None:
-        assert self._above is not None
-        for above in self._above:
-            above.living(system.node)
+        assert self._place is not None
+        old, new = (cell.actor for cell in ends)
+        assert isinstance(old, Supervisor)
+        assert isinstance(new, Supervisor)
+        one = old._children[self._place.name]
+        keep(ends[0], without(one.spec.id))
+        if one.spec.restart != "temporary":
+            keep(ends[1], with_child(one.spec))
+        move_child(old, new, one, system.moved_addresses)
 
 
 def check_movable(place: Place) -> None:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
-from ...actors.errors import ActorStopped, AskTimeout, HoldfastError
+from ...actors.errors import ActorStopped, AskTimeout, HoldfastError, StartFailed
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
@@ -22,16 +21,18 @@ from ...supervision.admin import (
     TerminateChild,
 )
 from ...supervision.change import check_subtree
+from ...supervision.children import Child
 from ...supervision.dynamic import check_dynamic
 from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, child
 from ...supervision.supervisor import Supervisor
 from .draft import Draft, Place, Target, check_awake, is_elsewhere
-from .lasting import Specs, in_order, keep, recipe_specs, with_child, without
+from .lasting import Specs, in_order, keep, recipe_flags, recipe_specs, with_child, without
 from .operation import Operation, wrong
-from .turns import arrange, between_turns
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
+
+T = TypeVar("T")
 
 START_TIMEOUT = 3600.0
 """Seconds a child may take to start; the transaction's own time limit is shorter."""
@@ -43,7 +44,7 @@ def text_of(target: Target) -> str:
 
 
 class Add(Operation):
-    """Start one more child of a supervisor."""
+    """Start one more child of a supervisor. It runs before the commit, and is nobody's child for good until then."""
 
     verb: ClassVar[str] = "add"
 
@@ -51,56 +52,130 @@ class Add(Operation):
         super().__init__(f"{text_of(supervisor)}/{spec.id}")
         self._at, self.spec = supervisor, spec
         self._place: Place | None = None
-        self._above: Place | None = None
-        self._asked = False  # the supervisor has been asked, and it is not known that it refused
+        self._asked: Cell | None = None  # the supervisor that was asked, and is not known to have refused
+        self._life = 0  # of that supervisor
+        self._is_over = False  # it has been up, and has ended by itself as it may
+        self._comes_last = False  # its address is free only when the transaction is in force
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         above, spec = await draft.supervisor(self._at), self.spec
         check_child(above, spec)
+        self._comes_last = any(one.was == (above, spec.id) for one in draft.by_cell.values())
         check_awake(above)
         if above.cell is not None and is_elsewhere(above.cell):
             check_subtree(above.path, (spec,))
             Boxed(spec).packed()
-        self._above, self.between_turns_of = above, (above,)
+        self.between_turns_of = (above,)
         self._place = _planned(draft, above, spec)
         self.target = self._place.path
 
-    async def do(self, system: ActorSystem) -> None:
-        above, place = self._above, self._place
-        assert above is not None
+    @property
+    def _own(self) -> tuple[Place, Place] | None:
+        """The supervisor and the child; None if it comes with a supervisor that is added too."""
+        place = self._place
         assert place is not None
-        supervisor: ActorRef[Supervisor] = ActorRef(above.living(system.node))
-        self._asked = True
+        above = place.parent
+        assert above is not None
+        return None if above.is_planned else (above, place)
+
+    async def prepare(self, system: ActorSystem) -> None:
+        if self._own is None or self._is_over or self._comes_last:
+            return
+        above, place = self._own
+        await self._start(system, above, place)
+
+    async def _start(self, system: ActorSystem, above: Place, place: Place) -> None:
+        cell = above.living(system.node)
+        if self._asked is cell and self._life == cell.life and place.name in (cell.children or {}):
+            return  # It is being restarted.
+        supervisor: ActorRef[Supervisor] = ActorRef(cell)
+        self._asked, self._life = cell, cell.life
         try:
-            ref = await supervisor.ask(StartChild(self.spec), START_TIMEOUT)
+            ref = await supervisor.ask(StartChild(planned_spec(place, in_force=False)), START_TIMEOUT)
         except AskTimeout:
             raise
         except HoldfastError:
-            self._asked = False  # It has refused, or the start has failed: nothing is left of it.
+            self._asked = None  # It has refused, or the start has failed: nothing is left of it.
             raise
-        if ref is not None:
-            _fill(place, ref._cell)
-            if is_elsewhere(supervisor._cell):
-                _grant(place)
-
-    async def undo(self, system: ActorSystem) -> None:
-        above = self._above
-        if not self._asked or above is None:
+        if ref is None:
+            self._is_over = True  # It did not want to be started.
             return
+        _fill(place, ref._cell)
+        if is_elsewhere(cell):
+            _grant(place)
+
+    def ready(self, system: ActorSystem) -> str:
+        if self._own is None or self._is_over or self._comes_last:
+            return ""
+        above, place = self._own
         supervisor = above.living(system.node)
+        if supervisor is not self._asked or supervisor.life != self._life:
+            return f"{above.path} has been restarted"
+        cell = (supervisor.children or {}).get(place.name)
+        if cell is None and place.cell is not None:
+            reason = place.cell.extra().reason
+            if place.cell.is_dead and reason.is_clean and self.spec.restart != "permanent":
+                self._is_over = True
+                return ""
+            raise StartFailed(place.path, f"it has ended: {reason}")
+        if cell is None or not cell.host.is_up(cell):
+            return f"{place.path} is being started"
+        _fill(place, cell)
+        return ""
+
+    def commit(self, system: ActorSystem) -> None:
+        if self._own is None:
+            return
+        above, place = self._own
+        supervisor, spec = above.living(system.node), planned_spec(place, in_force=True)
+        child = child_of(supervisor, place.name)
+        if child is not None and not self._comes_last:
+            child.spec = spec
+            if child.cell is not None:
+                child.cell.spec, child.cell.extra().start = spec, spec.start
+        if spec.restart != "temporary" and not above.is_dynamic:
+            keep(supervisor, with_child(spec))
+
+    async def finish(self, system: ActorSystem) -> None:
+        if self._own is not None and self._comes_last:
+            await self._start(system, *self._own)
+
+    async def release(self, system: ActorSystem) -> None:
+        supervisor = self._asked
+        if supervisor is None or supervisor.is_dead or supervisor.life != self._life:
+            return  # What was started has ended with it.
         cell = (supervisor.children or {}).get(self.spec.id)
         if cell is not None and not cell.host.is_up(cell):
             cell.kill()  # Its start would hold up its supervisor, and us, for as long as it likes.
         await forget(supervisor, self.spec.id)
 
-    def verify(self, system: ActorSystem) -> None:
-        if self._above is not None:
-            self._above.living(system.node)
 
-    def seal(self, system: ActorSystem) -> None:
-        assert self._above is not None
-        if self.spec.restart != "temporary" and not self._above.is_dynamic:
-            keep(self._above.living(system.node), with_child(self.spec))
+def child_of(supervisor: Cell, name: str) -> Child | None:
+    """A child as its supervisor has it, if that lives in this process."""
+    actor = supervisor.actor
+    return actor._listed().get(name) if isinstance(actor, Supervisor) else None
+
+
+def planned_spec(place: Place, *, in_force: bool) -> ChildSpec:
+    """The spec of a child that is added, with all that the transaction says of it and of those below it.
+
+    Its bindings are those that its start finds, or those that are in force with the transaction.
+    """
+    spec = place.spec
+    assert spec is not None
+    bound = {port: to for port, to in place.bindings.items() if port in spec.bindings}
+    paths = {port: to.path if in_force or to.cell is None else to.cell.path for port, to in bound.items()}
+    changes: dict[str, Any] = {"bindings": {**spec.bindings, **paths}}
+    if place.flags is not None and len(spec.start.args) == 2 and not place.is_dynamic:
+        below = tuple(
+            planned_spec(one, in_force=in_force)
+            for one in place.children.values()
+            if one.is_planned and one.spec is not None and not one.is_leaving
+        )
+        changes["start"] = Start(spec.start.kind, (place.flags, below), spec.start.kwargs)
+    elif place.flags is not None and len(spec.start.args) == 2:
+        changes["start"] = Start(spec.start.kind, (place.flags, spec.start.args[1]), spec.start.kwargs)
+    return dataclasses.replace(spec, **changes)
 
 
 def check_child(above: Place, spec: ChildSpec) -> None:
@@ -125,7 +200,7 @@ def check_child(above: Place, spec: ChildSpec) -> None:
 def _planned(draft: Draft, above: Place, spec: ChildSpec) -> Place:
     """The place of a child to be, and of those that come with it."""
     place = above.children[spec.id] = Place(spec.id, above, None, spec)
-    place.is_planned = True
+    place.is_planned, place.is_stopped = True, False
     for port, path in spec.bindings.items():
         place.bindings[port] = draft.find(path)
     flags, children = (*spec.start.args, None, None)[:2] if spec.is_supervisor else (None, None)
@@ -163,17 +238,17 @@ async def forget(supervisor: Cell, name: str) -> None:
 
 
 class Remove(Operation):
-    """Stop an actor for good. That cannot be undone, so it is done when everything else has been."""
+    """Stop an actor for good, when all else is in force."""
 
     verb: ClassVar[str] = "remove"
 
     def __init__(self, target: Target) -> None:
         super().__init__(text_of(target))
         self._at = target
-        self.place: Place | None = None
+        self._place: Place | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self.place = draft.find(self._at)
+        place = self._place = draft.find(self._at)
         above = place.parent
         if above is None:
             raise wrong(place.path, "the root is not removed: leave the system")
@@ -184,47 +259,102 @@ class Remove(Operation):
         self.target = place.path
         place.is_leaving = True
 
-    async def do(self, system: ActorSystem) -> None:
-        """Nothing: it goes when there is no way back."""
+    def ready(self, system: ActorSystem) -> str:
+        place = self._place
+        assert place is not None
+        above = place.parent
+        if above is not None and above.cell is not None and above.is_supervisor:
+            above.living(system.node)
+        return ""
 
-    async def undo(self, system: ActorSystem) -> None:
-        """Nothing was done."""
-
-    def seal(self, system: ActorSystem) -> None:
-        above = self.place.parent if self.place is not None else None
-        if above is not None and self.place is not None and above.cell is not None and above.is_supervisor:
-            keep(above.living(system.node), without(self.place.name))
+    def commit(self, system: ActorSystem) -> None:
+        place = self._place
+        assert place is not None
+        above = place.parent
+        if above is not None and above.cell is not None and above.is_supervisor:
+            keep(above.living(system.node), without(place.name))
 
     async def finish(self, system: ActorSystem) -> None:
-        place = self.place
+        place = self._place
         assert place is not None
         cell, above = place.cell, place.parent
         if cell is not None and not cell.is_dead:
             await system.stop(cell.ref)
-        elif above is not None and above.is_supervisor:
-            await forget(above.living(system.node), place.name)
+        elif above is not None and above.is_supervisor and above.cell is not None and not above.cell.is_dead:
+            await forget(above.cell, place.name)
 
 
-class Reorder(Operation):
+class OnSupervisor(Operation):
+    """Base of operations on what a supervisor is made of. One in another process is told when it is in force."""
+
+    verb: ClassVar[str] = "set"
+
+    def __init__(self, supervisor: Target) -> None:
+        super().__init__(text_of(supervisor))
+        self._at = supervisor
+        self._place: Place | None = None
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        place = self._place = await draft.supervisor(self._at)
+        self.target, self.between_turns_of = place.path, (place,)
+
+    def _cell(self, system: ActorSystem) -> Cell:
+        assert self._place is not None
+        return self._place.living(system.node)
+
+    @property
+    def _is_elsewhere(self) -> bool:
+        return self._place is not None and self._place.cell is not None and is_elsewhere(self._place.cell)
+
+    def ready(self, system: ActorSystem) -> str:
+        assert self._place is not None
+        if self._place.is_planned:
+            return ""
+        return "" if self._is_elsewhere else busy(self._cell(system))
+
+    def commit(self, system: ActorSystem) -> None:
+        assert self._place is not None
+        if self._place.is_planned and not self._place.is_dynamic:
+            return  # Its spec says so already.
+        cell = self._cell(system)
+        keep(cell, self._edit)
+        if isinstance(cell.actor, Supervisor):
+            self._arrange(cell.actor)
+
+    def _edit(self, flags: Flags, specs: Specs) -> tuple[Flags, Specs]:
+        """Flags and children of the recipe as they are from now on."""
+        raise NotImplementedError
+
+    def _arrange(self, supervisor: Supervisor) -> None:
+        """The same of one that lives in this process."""
+        raise NotImplementedError
+
+    async def finish(self, system: ActorSystem) -> None:
+        if not self._is_elsewhere:
+            return
+        cell = self._cell(system)
+        flags, specs = recipe_flags(cell), recipe_specs(cell)
+        ref: ActorRef[Supervisor] = ActorRef(cell)
+        await ref.ask(ChangeSupervisor(flags=flags, children=list(specs or ())), START_TIMEOUT)
+
+
+class Reorder(OnSupervisor):
     """Give a supervisor's children another start order; nobody is restarted."""
 
     verb: ClassVar[str] = "reorder"
 
     def __init__(self, supervisor: Target, ids: list[str]) -> None:
-        super().__init__(text_of(supervisor))
-        self._at, self._ids = supervisor, ids
-        self._place: Place | None = None
-        self._before: list[str] | None = None
-        self._cells_before: list[str] = []
-        self._specs: Specs | None = None  # of a supervisor in another process
+        super().__init__(supervisor)
+        self._ids = ids
 
     @property
     def text(self) -> str:
         return f"reorder the children of {self.target}: {', '.join(self._ids)}"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = await draft.supervisor(self._at)
-        self.target, self.between_turns_of = place.path, (place,)
+        await super().check(system, draft)
+        place = self._place
+        assert place is not None
         if place.is_dynamic or place.is_partitioned:
             raise NotSupported("its children have no order of their own")
         missing = [name for name in self._ids if name not in place.children]
@@ -233,116 +363,62 @@ class Reorder(Operation):
         if len(set(self._ids)) != len(self._ids):
             raise wrong(place.path, f"an id comes twice in {self._ids!r}")
         if place.cell is not None and is_elsewhere(place.cell):
-            self._specs = recipe_specs(place.cell)
-            if self._specs is None or set(self._ids) - {spec.id for spec in self._specs}:
+            specs = recipe_specs(place.cell)
+            if specs is None or set(self._ids) - {spec.id for spec in specs}:
                 raise NotSupported("it lives in another process, and its specs are known there only")
-        rest = [name for name in place.children if name not in self._ids]
-        place.children = {name: place.children[name] for name in (*self._ids, *rest)}
+        place.children = sorted_first(place.children, self._ids)
 
-    async def do(self, system: ActorSystem) -> None:
-        assert self._place is not None
-        cell = self._place.living(system.node)
-        if self._specs is not None:
-            self._before = [spec.id for spec in self._specs]
-            await self._tell(cell, self._ids)
-        else:
-            await between_turns(cell, self._arrange)
+    def _edit(self, flags: Flags, specs: Specs) -> tuple[Flags, Specs]:
+        return in_order(self._ids)(flags, specs)
 
     def _arrange(self, supervisor: Supervisor) -> None:
-        self._before = list(supervisor._children)
-        self._cells_before = list(supervisor.ctx.cell.children or ())
-        put_in_order(supervisor, self._ids)
-        arrange(supervisor.ctx.cell, list(supervisor._children))
-
-    async def undo(self, system: ActorSystem) -> None:
-        before = self._before
-        if before is None or self._place is None:
-            return
-        cell = self._place.living(system.node)
-        if self._specs is not None:
-            await self._tell(cell, before)
-            return
-
-        def back(supervisor: Supervisor) -> None:
-            put_in_order(supervisor, before)
-            arrange(supervisor.ctx.cell, self._cells_before)
-
-        await between_turns(cell, back)
-
-    async def _tell(self, cell: Cell, ids: list[str]) -> None:
-        """A supervisor in another process takes its specs in the new order; none of them changes."""
-        specs = {spec.id: spec for spec in self._specs or ()}
-        ref: ActorRef[Supervisor] = ActorRef(cell)
-        await ref.ask(ChangeSupervisor(children=[specs[name] for name in ids if name in specs]), START_TIMEOUT)
-
-    def seal(self, system: ActorSystem) -> None:
-        assert self._place is not None
-        keep(self._place.living(system.node), in_order(self._ids))
+        supervisor._children = sorted_first(supervisor._children, self._ids)
+        cell = supervisor.ctx.cell
+        cell.children = sorted_first(cell.children or {}, list(supervisor._children))
 
 
-def put_in_order(supervisor: Supervisor, ids: list[str]) -> None:
-    """Sort a supervisor's children; those that are not named come behind."""
-    known = supervisor._children
-    first = {name: known[name] for name in ids if name in known}
-    supervisor._children = {**first, **{name: one for name, one in known.items() if name not in first}}
-
-
-class SetFlags(Operation):
+class SetFlags(OnSupervisor):
     """Change some of a supervisor's flags: strategy, intensity, period."""
 
-    verb: ClassVar[str] = "set"
-
     def __init__(self, supervisor: Target, **wanted: Any) -> None:
-        super().__init__(text_of(supervisor))
-        self._at, self._wanted = supervisor, wanted
-        self._place: Place | None = None
-        self._before: dict[str, Any] | None = None
-        self._flags: Flags | None = None  # of a supervisor in another process, as they were
+        super().__init__(supervisor)
+        self._wanted = wanted
 
     @property
     def text(self) -> str:
         return f"set {', '.join(f'{name}={value!r}' for name, value in self._wanted.items())} of {self.target}"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = await draft.supervisor(self._at)
-        self.target, self.between_turns_of = place.path, (place,)
+        await super().check(system, draft)
+        place = self._place
+        assert place is not None
         if place.flags is None:
             raise NotSupported(
                 "it lives in another process and its class has an init of its own: only it knows its flags"
             )
-        if place.cell is not None and is_elsewhere(place.cell):
-            self._flags = place.flags
         place.flags = dataclasses.replace(place.flags, **self._wanted)
         if place.is_dynamic:
             check_dynamic(place.path, Plan.of(place.flags, ()))
 
-    async def do(self, system: ActorSystem) -> None:
-        assert self._place is not None
-        await self._set(self._place.living(system.node), self._take)
-
-    def _take(self, flags: Flags) -> Flags:
-        self._before = {name: getattr(flags, name) for name in self._wanted}
-        return dataclasses.replace(flags, **self._wanted)
-
-    async def undo(self, system: ActorSystem) -> None:
-        before = self._before
-        if before is not None and self._place is not None:
-            await self._set(self._place.living(system.node), lambda flags: dataclasses.replace(flags, **before))
-
-    async def _set(self, cell: Cell, edit: Callable[[Flags], Flags]) -> None:
-        if self._flags is None:
-            await between_turns(cell, lambda supervisor: setattr(supervisor, "_flags", edit(supervisor._flags)))
-            return
-        self._flags = edit(self._flags)
-        ref: ActorRef[Supervisor] = ActorRef(cell)
-        await ref.ask(ChangeSupervisor(flags=self._flags), START_TIMEOUT)
-
-    def seal(self, system: ActorSystem) -> None:
-        assert self._place is not None
-        keep(self._place.living(system.node), self._edit)
-
     def _edit(self, flags: Flags, specs: Specs) -> tuple[Flags, Specs]:
         return dataclasses.replace(flags, **self._wanted), specs
+
+    def _arrange(self, supervisor: Supervisor) -> None:
+        supervisor._flags = dataclasses.replace(supervisor._flags, **self._wanted)
+
+
+def busy(supervisor: Cell) -> str:
+    """Why a supervisor of this process is not between two turns; "" if it is."""
+    actor, more = supervisor.actor, supervisor.more
+    if not isinstance(actor, Supervisor) or "_children" not in actor.__dict__ or (more is not None and more.turn):
+        return f"{supervisor.path} is in the middle of something"
+    return ""
+
+
+def sorted_first(known: dict[str, T], ids: list[str]) -> dict[str, T]:
+    """With these first, in this order; the others behind them."""
+    first = {name: known[name] for name in ids if name in known}
+    return {**first, **{name: one for name, one in known.items() if name not in first}}
 
 
 def named_spec(supervisor: Target, spec: ChildSpec | Start[Any], taken: set[str], system: ActorSystem) -> ChildSpec:

@@ -1,4 +1,4 @@
-"""Transactions: checked, carried out and, if a step fails, undone. One at a time in a system."""
+"""Transactions: all is prepared beside what runs, put in force in one step, and followed. One at a time in a system."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from .operation import Operation
 if TYPE_CHECKING:
     from ..system import ActorSystem
 
-UNDO_TIMEOUT = 30.0
-"""Seconds that undoing one step may take before it is given up, and told as such."""
+RELEASE_TIMEOUT = 30.0
+"""Seconds that letting go of what one step has prepared may take before it is given up, and told as such."""
+LOOK_AGAIN = 0.02
+"""Seconds between two looks at whether nothing is in the way of a commit any more."""
 
 
 class Transactions:
@@ -43,6 +45,7 @@ class Transaction:
         self._change = Change(system)
         self._draft: Draft | None = None
         self._task: asyncio.Task[Any] | None = None
+        self._problems: list[str] = []  # of what is in force, and could not be followed
 
     async def __aenter__(self) -> Change:
         self._task = asyncio.current_task()
@@ -108,52 +111,68 @@ class Transaction:
             raise TransactionRefused("the tree as it would be", said(error)) from error
         change._difference = difference(before, draft.lines())
 
-    # -- the steps ----------------------------------------------------------------------------------------------------
+    # -- prepare, commit -----------------------------------------------------------------------------------------------
 
     async def _do(self, deadline: float) -> None:
-        system, change = self._system, self._change
-        texts = tuple(step.text for step in change.steps)
-        self._emit(TransactionBegan(self._address, texts))
+        """Prepare all, and commit."""
+        system, operations = self._system, self._change.operations
+        self._emit(TransactionBegan(self._address, self._texts))
         begun: list[Operation] = []
-        failed = "commit"
+        failed = "begin"
+        waiting = ""
         try:
             async with asyncio.timeout_at(deadline):
-                for operation in change.operations:
+                for operation in operations:
                     failed = operation.text
-                    begun.append(operation)  # Before it is done: it may be cancelled in the middle.
-                    await operation.do(system)
-            for operation in change.operations:
-                failed = operation.text
-                operation.verify(system)
-            for operation in change.operations:
-                operation.seal(system)
+                    begun.append(operation)  # Before it is prepared: it may be cancelled in the middle.
+                    await operation.prepare(system)
+                while True:
+                    late = None
+                    for operation in operations:
+                        failed = operation.text
+                        waiting = operation.ready(system)
+                        if waiting:
+                            late = operation
+                            break
+                    if late is None:
+                        break
+                    await asyncio.sleep(LOOK_AGAIN)
+                    await late.prepare(system)
+            self._commit()  # In the same step of the loop in which all were ready.
         except BaseException as error:
             if isinstance(error, TimeoutError):
-                waiting = begun[-1].waiting if begun else ""
                 cause = f"not within {self._timeout:g} s{f': {waiting}' if waiting else ''}"
             else:
                 cause = said(error)
-            undone, kept = await self._undo(begun)
-            self._emit(TransactionRolledBack(self._address, texts, failed, cause, kept))
+            undone, kept = await self._release(begun)
+            self._emit(TransactionRolledBack(self._address, self._texts, failed, cause, kept))
             if isinstance(error, (HoldfastError, TimeoutError)):
                 raise TransactionFailed(failed, cause, undone, kept) from error
             raise
 
-    async def _undo(self, begun: list[Operation]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-        """Undo what has begun, last one first; a cancellation waits until that is over."""
+    def _commit(self) -> None:
+        """Put all of it in force, with no wait in between: there is no way back from here."""
+        for operation in self._change.operations:
+            try:
+                operation.commit(self._system)
+            except Exception as error:  # It had said that it is ready: the others are in force all the same.
+                self._problems.append(f"{operation.text}: {said(error)}")
+
+    async def _release(self, begun: list[Operation]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Let go of what was prepared, last one first; a cancellation waits until that is over."""
         undone: list[str] = []
         kept: list[str] = []
 
-        async def undo_all() -> None:
+        async def release_all() -> None:
             for operation in reversed(begun):
                 try:
-                    async with asyncio.timeout(UNDO_TIMEOUT):
-                        await operation.undo(self._system)
+                    async with asyncio.timeout(RELEASE_TIMEOUT):
+                        await operation.release(self._system)
                     undone.append(operation.text)
-                except Exception as error:  # The others are undone all the same, and this is told.
+                except Exception as error:  # The others are let go of all the same, and this is told.
                     kept.append(f"{operation.text}: {said(error)}")
 
-        work = self._system.node.loop.create_task(undo_all(), name="undoing a transaction")
+        work = self._system.node.loop.create_task(release_all(), name="release of a transaction")
         cancelled: asyncio.CancelledError | None = None
         while not work.done():
             try:
@@ -179,7 +198,7 @@ class Transaction:
             await asyncio.shield(work)
 
     async def _finish_all(self) -> None:
-        problems: list[str] = []
+        problems = self._problems
         try:
             for operation in self._change.operations:
                 try:
@@ -188,8 +207,7 @@ class Transaction:
                     problems.append(f"{operation.text}: {said(error)}")
         finally:
             self._shared.lock.release()
-            texts = tuple(step.text for step in self._change.steps)
-            self._emit(TransactionCommitted(self._address, texts, tuple(problems)))
+            self._emit(TransactionCommitted(self._address, self._texts, tuple(problems)))
 
     def _removes_caller(self) -> bool:
         """Whether the turn that called us belongs to an actor that goes: its end waits for that turn."""
@@ -200,6 +218,10 @@ class Transaction:
                 return True
             place = place.parent
         return False
+
+    @property
+    def _texts(self) -> tuple[str, ...]:
+        return tuple(step.text for step in self._change.steps)
 
     @property
     def _address(self) -> str:

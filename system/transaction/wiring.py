@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
-from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.cell import RUNNING
 from ...actors.kernel.lifecycle import LocalHost
 from .draft import Draft, Place, Target
 from .operation import Operation, wrong
@@ -25,9 +25,6 @@ class Bind(Operation):
         self._at, self._port, self._to = owner, port, target
         self._owner: Place | None = None
         self._bound: Place | None = None
-        self._done = False
-        self._before: Cell | None = None
-        self._was_claimed = False  # of that only another process had said so
 
     @property
     def text(self) -> str:
@@ -46,38 +43,17 @@ class Bind(Operation):
             raise wrong(owner.path, f"{type_name(kind)} has no binding {self._port!r} (it has: {known})")
         owner.bindings[self._port] = self._bound
 
-    async def do(self, system: ActorSystem) -> None:
+    def ready(self, system: ActorSystem) -> str:
         assert self._owner is not None
         assert self._bound is not None
-        owner, target = self._owner.living(system.node), self._bound.living(system.node)
-        self._before, self._was_claimed = bound_to(owner, self._port), self._port in owner.extra().claimed
-        system.node.bind(owner, self._port, target)
-        self._done = True
-
-    async def undo(self, system: ActorSystem) -> None:
-        if not self._done or self._owner is None:
-            return
-        owner = self._owner.living(system.node)
-        if self._before is not None:
-            system.node.bind(owner, self._port, self._before, is_claimed=self._was_claimed)
-            return
-        more = owner.extra()  # It was bound to nobody; another process keeps the last one it was told of.
-        more.bindings.pop(self._port, None)
-        if more.turn is not None and more.turn.rebinds is not None:
-            more.turn.rebinds.pop(self._port, None)
-
-    def verify(self, system: ActorSystem) -> None:
-        assert self._bound is not None
+        self._owner.living(system.node)
         self._bound.living(system.node)
+        return ""
 
-
-def bound_to(owner: Cell, port: str) -> Cell | None:
-    """Where a binding points, as far as is known here."""
-    more = owner.more
-    if more is None:
-        return None
-    soon = more.turn.rebinds if more.turn is not None else None
-    return (soon or {}).get(port) or more.bindings.get(port)
+    def commit(self, system: ActorSystem) -> None:
+        assert self._owner is not None
+        assert self._bound is not None
+        system.node.bind(self._owner.living(system.node), self._port, self._bound.living(system.node))
 
 
 class Unbind(Operation):
@@ -89,7 +65,6 @@ class Unbind(Operation):
         super().__init__(text_of(owner))
         self._at, self._port = owner, port
         self._owner: Place | None = None
-        self._before: Cell | None = None
 
     @property
     def text(self) -> str:
@@ -107,18 +82,17 @@ class Unbind(Operation):
             raise wrong(owner.path, "it lives in another process, which keeps a binding: bind it to somebody else")
         del owner.bindings[self._port]
 
-    async def do(self, system: ActorSystem) -> None:
+    def ready(self, system: ActorSystem) -> str:
         assert self._owner is not None
-        owner = self._owner.living(system.node)
-        self._before = bound_to(owner, self._port)
-        more = owner.extra()
+        self._owner.living(system.node)
+        return ""
+
+    def commit(self, system: ActorSystem) -> None:
+        assert self._owner is not None
+        more = self._owner.living(system.node).extra()
         more.bindings.pop(self._port, None)
         if more.turn is not None and more.turn.rebinds is not None:
             more.turn.rebinds.pop(self._port, None)
-
-    async def undo(self, system: ActorSystem) -> None:
-        if self._before is not None and self._owner is not None:
-            system.node.bind(self._owner.living(system.node), self._port, self._before)
 
 
 class Register(Operation):
@@ -130,7 +104,7 @@ class Register(Operation):
         super().__init__(text_of(target))
         self._name, self._at = name, target
         self._place: Place | None = None
-        self._done = False
+        self._before: Place | None = None  # who has the name before the transaction, and gives it away
 
     @property
     def text(self) -> str:
@@ -145,19 +119,23 @@ class Register(Operation):
             raise NameTaken(self._name)
         if place.cell is not None and place.cell.state is not RUNNING:
             raise ActorStopped(place.path)
+        self._before = draft.named.get(self._name)
         if holder is None:
             place.names.append(self._name)
 
-    async def do(self, system: ActorSystem) -> None:
+    def ready(self, system: ActorSystem) -> str:
+        assert self._place is not None
+        holder, cell = system.node.names.get(self._name), self._place.living(system.node)
+        before = self._before.cell if self._before is not None else None
+        if holder is not None and holder is not cell and holder is not before:
+            raise NameTaken(self._name)
+        return "" if cell.state is RUNNING else f"{cell.path} is being restarted"
+
+    def commit(self, system: ActorSystem) -> None:
         assert self._place is not None
         cell = self._place.living(system.node)
         if system.node.names.get(self._name) is not cell:
             system.node.register(self._name, cell)
-            self._done = True
-
-    async def undo(self, system: ActorSystem) -> None:
-        if self._done:
-            system.node.unregister(self._name)
 
 
 class Unregister(Operation):
@@ -168,31 +146,23 @@ class Unregister(Operation):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self._name = name
-        self._holder: Cell | None = None
-        self._life = 0
-        self._order: list[str] = []
+        self._holder: Place | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        holder = holder_of(self._name, draft)
+        holder = self._holder = holder_of(self._name, draft)
         if holder is None:
             raise NoSuchActor(self._name)
         holder.names.remove(self._name)
 
-    async def do(self, system: ActorSystem) -> None:
-        holder = system.node.names.get(self._name)
-        if holder is not None:
-            self._holder, self._life, self._order = holder, holder.life, list(system.node.names)
-            system.node.unregister(self._name)
+    def ready(self, system: ActorSystem) -> str:
+        holder, before = system.node.names.get(self._name), self._holder
+        if holder is not None and before is not None and before.cell is not None and holder is not before.cell:
+            raise NameTaken(self._name)  # Its holder has ended meanwhile, and another one has it: that one keeps it.
+        return ""
 
-    async def undo(self, system: ActorSystem) -> None:
-        holder, names = self._holder, system.node.names
-        if holder is None or holder.life != self._life or holder.state is not RUNNING:
-            return  # Names end with the life.
-        system.node.register(self._name, holder)
-        rank = {name: number for number, name in enumerate(self._order)}
-        kept = sorted(names.items(), key=lambda pair: rank.get(pair[0], len(rank)))
-        names.clear()
-        names.update(kept)
+    def commit(self, system: ActorSystem) -> None:
+        if self._name in system.node.names:
+            system.node.unregister(self._name)
 
 
 def holder_of(name: str, draft: Draft) -> Place | None:

@@ -86,14 +86,14 @@ class Stumble(hf.Operation):
     async def check(self, system: hf.ActorSystem, draft: Any) -> None:
         self.calls.append("check")
 
-    async def do(self, system: hf.ActorSystem) -> None:
-        self.calls.append("do")
+    async def prepare(self, system: hf.ActorSystem) -> None:
+        self.calls.append("prepare")
         if self._do is None:
             raise hf.HoldfastError("there was a stone")
         await self._do(system)
 
-    async def undo(self, system: hf.ActorSystem) -> None:
-        self.calls.append("undo")
+    async def release(self, system: hf.ActorSystem) -> None:
+        self.calls.append("release")
 
 
 def counter(name: str, start: int = 0, **options: Any) -> hf.ChildSpec:

@@ -1,0 +1,210 @@
+"""Where a transaction has a live actor go on: as a task, in a process of its own, as replicas behind mechanisms.
+
+The new place is made ready and the actor comes to rest beside what runs; it waits at a gate that the commit opens. What
+its spec says from then on is in force, and what runs follows it: if the life ends on the way, the next one is moved.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+from collections.abc import Coroutine
+from typing import TYPE_CHECKING, Any
+
+from ...actors.kernel.cell import Cell
+from ...actors.migration.move import Gate
+from ...supervision.arbiter import Grant, Hand, arbiter_of
+from ...supervision.respec import recipe_spec, replace_mechanism, replace_place
+from ...supervision.spec import ChildSpec
+from ..live_moves import to_its_end
+from .draft import rules
+
+if TYPE_CHECKING:
+    from ...ftm.group.probation import Probation
+    from ..system import ActorSystem
+    from .draft import Place
+
+MOVED_WITHIN = 60.0
+"""Seconds that a life may take to move; the transaction's own time limit is shorter."""
+
+
+class Relocation:
+    """One actor that is to live elsewhere, or behind other mechanisms: the way from its spec to that of the draft."""
+
+    def __init__(self, place: Place, text: str) -> None:
+        self._place, self._text = place, text
+        assert place.spec is not None
+        self._before: ChildSpec = place.spec
+        self._task: asyncio.Task[None] | None = None
+        self._gate: Gate | None = None
+        self._grant: Grant | None = None
+        self.probation: Probation | None = None
+        """Whether its mechanisms stay is known when this is over; None: at once."""
+
+    @property
+    def _after(self) -> ChildSpec:
+        spec = self._place.spec
+        assert spec is not None
+        return spec
+
+    @property
+    def _adapts(self) -> bool:
+        """Whether its mechanisms are other ones."""
+        return bool(described(self._before.mechanism) != described(self._after.mechanism))
+
+    @property
+    def _moves(self) -> bool:
+        """Whether it lives elsewhere, mechanisms aside."""
+        return self._before.isolation != self._after.isolation
+
+    @property
+    def _comes_last(self) -> bool:
+        """Its state or code is changed too: it is where it is until that is done."""
+        return self._place.rework is not None
+
+    # -- before the commit --------------------------------------------------------------------------------------------
+
+    async def prepare(self, system: ActorSystem) -> None:
+        """Make the new place ready and wait until the life is at rest."""
+        if self._place.is_planned or not (self._adapts or self._moves):
+            return
+        if self._adapts and self._grant is None:
+            path = self._place.path
+            self._grant = arbiter_of(system.node).claim(path, Hand.ADAPTATION, self._text)
+            system.mechanism_notes.begun(path, self._text)
+        if not self._comes_last:
+            await self._ready_at_gate(system)
+
+    async def _ready_at_gate(self, system: ActorSystem) -> None:
+        if self._task is None:
+            self._gate = Gate(system.node.loop)
+            self._task = self._begin(system, self._gate)
+        gate, task = self._gate, self._task
+        assert gate is not None
+        while not gate.is_waiting and not task.done():
+            await asyncio.wait((gate.reached, task), return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            task.result()
+
+    def _begin(self, system: ActorSystem, gate: Gate | None) -> asyncio.Task[None]:
+        cell, moves = self._place.living(system.node), system._moves
+        wanted, before = self._after.mechanism, self._before.mechanism
+        work: Coroutine[Any, Any, None]
+        if not self._adapts:
+            work = moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN, gate)
+        elif wanted is None:
+            work = moves.unprotect(cell, MOVED_WITHIN, gate)
+        elif before is None:
+            work = moves.protect(cell, system.homes, wanted, MOVED_WITHIN, gate)
+        else:
+            work = moves.adapt(cell, wanted, MOVED_WITHIN, gate)
+        task = system.node.loop.create_task(
+            to_its_end(cell.path, asyncio.ensure_future(work)),
+            name=f"{self._text}",
+            context=system.node.base_context.copy(),
+        )
+        task.add_done_callback(_seen)
+        return task
+
+    def ready(self, system: ActorSystem) -> str:
+        """Whether it is at rest, and everything is ready for it."""
+        cell = self._place.living(system.node) if not self._place.is_planned else None
+        if cell is None or self._task is None or self._gate is None:
+            return ""
+        if self._task.done():
+            self._task.result()
+            return ""  # There was nothing to be done.
+        return "" if self._gate.is_waiting else f"{cell.path} is not at rest any more"
+
+    # -- from the commit on -------------------------------------------------------------------------------------------
+
+    def commit(self, system: ActorSystem) -> None:
+        """From here on its spec says so."""
+        if self._place.is_planned or not (self._adapts or self._moves):
+            return
+        cell = self._place.living(system.node)
+        now = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
+        if now is not None and self._task is not None:
+            if self._adapts:
+                replace_mechanism(cell, dataclasses.replace(now, mechanism=self._after.mechanism))
+            else:
+                replace_place(cell, dataclasses.replace(now, isolation=self._after.isolation))
+        if self._gate is not None:
+            self._gate.open()
+
+    async def finish(self, system: ActorSystem) -> None:
+        """Have its life follow."""
+        if self._place.is_planned or not (self._adapts or self._moves):
+            return
+        try:
+            if self._task is None:
+                self._task = self._begin(system, None)
+            await asyncio.shield(self._task)
+            if self._adapts and self._moves and self._after.mechanism is None:
+                cell = self._place.living(system.node)
+                await system._moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN)
+        finally:
+            self._settle(system)
+
+    def _settle(self, system: ActorSystem) -> None:
+        """Note what its mechanisms are now, for the next root, and whether they are trusted."""
+        if not self._adapts:
+            return
+        cell = self._place.living(system.node)
+        notes, path = system.mechanism_notes, self._place.path
+        before, after = self._before.mechanism, mechanism_of(cell)
+        probation = self.probation = getattr(cell.host, "probation", None)  # None: there is no mechanism.
+        notes.put(path, before, after, is_trusted=probation is None or probation.is_over)
+        notes.over(path)
+
+        def over(is_kept: bool) -> None:
+            if is_kept:
+                notes.settled(path, after)
+            else:
+                notes.put(path, after, before, is_trusted=False)
+            notes.flush()
+
+        if probation is not None:
+            probation.when_over(over)
+        self._give_back(system)
+        notes.flush()
+
+    # -- given up -----------------------------------------------------------------------------------------------------
+
+    async def release(self, system: ActorSystem) -> None:
+        """It goes on where it is."""
+        try:
+            task = self._task
+            if task is not None and not task.done():
+                cell = self._place.cell
+                while cell is not None and not task.done():  # What has only begun may not hear it yet.
+                    system._moves.give_up(cell, "it is not wanted any more")
+                    await asyncio.wait((task,), timeout=AGAIN_AFTER)
+            if self._grant is not None:
+                system.mechanism_notes.over(self._place.path)
+        finally:
+            self._give_back(system)
+
+    def _give_back(self, system: ActorSystem) -> None:
+        grant, self._grant = self._grant, None
+        if grant is not None:
+            arbiter_of(system.node).release(grant)
+
+
+AGAIN_AFTER = 0.05
+"""Seconds after which a change that is not wanted is told so again."""
+
+
+def _seen(done: asyncio.Future[Any]) -> None:
+    if not done.cancelled():
+        done.exception()
+
+
+def mechanism_of(cell: Cell) -> Any:
+    """The mechanism that a live child has; None if it has none."""
+    return getattr(cell.spec, "mechanism", None)  # One that lives elsewhere has no spec here.
+
+
+def described(mechanism: Any) -> Any:
+    """A mechanism, or several, as it can be compared."""
+    return None if mechanism is None else rules().describe(mechanism)

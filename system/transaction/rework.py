@@ -1,0 +1,174 @@
+"""What a transaction changes in one live actor: its state, its code, whether it is suspended.
+
+The actor is held between two of its turns and tries what is wanted of it. At the commit it goes on with what it has
+tried, or, if the transaction is given up, as before: it has handled nothing in between.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING, Any
+
+from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend
+from ...actors.control.orders_lane import order
+from ...actors.errors import ControlFailed
+from ...actors.kernel import mailbox
+from ...actors.kernel.actor import Start
+from ...actors.kernel.cell import Cell
+from ...actors.migration.quiesce import ATTEMPTS
+from ...actors.process.wire.start_codec import unpack_recipe
+from ...checkpoint.home.outputs import switch_of
+from ...supervision.respec import respec
+from .operation import wrong
+from .structure import busy
+
+if TYPE_CHECKING:
+    from ..system import ActorSystem
+    from .draft import Place
+
+PREPARED_WITHIN = 3600.0
+"""Seconds that an actor may take to come to it; the transaction's own time limit is shorter."""
+CONCLUDED_WITHIN = 60.0
+"""Seconds that an actor in another process may take to hear that the transaction is over."""
+
+
+class Rework:
+    """One actor that is held, all that is wanted of it, and what it has prepared."""
+
+    def __init__(self, place: Place) -> None:
+        self._place = place
+        self._wanted: list[ReplaceState | ReplaceCode] = []
+        self.suspended: bool | None = None
+        """Whether it is to be suspended; None: as it is."""
+        self._attempt = next(ATTEMPTS)
+        self._held: tuple[Cell, int] | None = None  # where, and which life there
+        self._recipe: bytes | None = None  # of the next lives, from another process
+        self._concluded: asyncio.Future[Any] | None = None  # there
+        self._lock: asyncio.Lock | None = None  # nobody moves it meanwhile
+
+    def add(self, wanted: ReplaceState | ReplaceCode) -> None:
+        """One more thing.
+
+        Raises:
+            SpecError: that cannot be done to this actor, or not where it lives.
+        """
+        place = self._place
+        if place.is_supervisor:
+            raise wrong(place.path, "a supervisor is changed by its own operations: add, remove, strategy ...")
+        if place.is_protected:
+            raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
+        if place.cell is not None and not lives_here(place.cell) and not place.cell.is_dead:
+            wanted.pack(place.path)
+        self._wanted.append(wanted)
+
+    @property
+    def _is_ordered(self) -> bool:
+        """Whether it is only told, and not held: a supervisor has to answer meanwhile, and replicas are of the root."""
+        return self._place.is_supervisor or self._place.is_protected
+
+    async def prepare(self, system: ActorSystem) -> None:
+        """Hold it, and have it try."""
+        if self._is_ordered:
+            return
+        cell = self._place.living(system.node)
+        if self._lock is None:
+            lock = system._moves.lock(cell)
+            await lock.acquire()
+            self._lock = lock
+        self._held = None
+        self._recipe = await order(cell, Prepare(self._attempt, tuple(self._wanted)), PREPARED_WITHIN)
+        self._held = (cell, cell.life)
+
+    def ready(self, system: ActorSystem) -> str:
+        """Whether the life that was prepared is the one."""
+        place = self._place
+        cell = place.living(system.node)
+        if self._is_ordered:
+            return busy(cell) if lives_here(cell) else ""
+        if lives_here(cell):
+            hold = mailbox.held(cell)
+            is_held = hold is not None and hold.attempt == self._attempt
+        else:
+            is_held = self._held == (cell, cell.life) and cell.host.is_up(cell)
+        return "" if is_held else f"{cell.path} has begun a new life"
+
+    def commit(self, system: ActorSystem) -> None:
+        """It goes on with what it has prepared: here at once; elsewhere as soon as it hears so, before all else."""
+        cell = self._place.living(system.node)
+        if self._is_ordered:
+            if self.suspended is not None:
+                self._tell(cell, Suspend() if self.suspended else Resume())
+            return
+        self._put_recipe(cell)
+        self._tell(cell, Conclude(self._attempt, True, self.suspended))
+
+    def _put_recipe(self, cell: Cell) -> None:
+        """The next lives begin as the new class, wherever the actor is."""
+        switch = switch_of(cell)
+        if lives_here(cell):
+            hold = mailbox.held(cell)
+            start = hold.prepared.start if hold is not None and hold.prepared is not None else None
+        else:
+            start = None if self._recipe is None else unpack_recipe(self._recipe, imports=False)
+        if start is None:
+            return
+        if switch is not None:
+            switch.becomes = start  # Its snapshot is of the new class.
+        if not lives_here(cell):
+            self._known_as(cell, start)
+
+    @staticmethod
+    def _known_as(cell: Cell, start: Start[Any]) -> None:
+        cell.table = start.kind._table
+        if cell.more is not None and cell.more.tap is not None:
+            cell.more.tap.attach()
+        respec(cell, start)
+
+    def _tell(self, cell: Cell, wanted: Order) -> None:
+        if not lives_here(cell):
+            self._concluded = order(cell, wanted, CONCLUDED_WITHIN)
+            self._concluded.add_done_callback(lambda done: self._over(cell))
+            return
+        actor = cell.actor
+        assert actor is not None
+        try:
+            wanted.run(cell, actor)
+        finally:
+            self._over(cell)
+
+    def _over(self, cell: Cell) -> None:
+        switch = switch_of(cell)
+        if switch is not None:
+            switch.becomes = None
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            lock.release()
+
+    async def finish(self, system: ActorSystem) -> None:
+        """Wait until an actor in another process has heard it."""
+        if self._concluded is None:
+            return
+        cell = self._place.living(system.node)
+        switch = switch_of(cell)
+        before = 0 if switch is None else len(switch.unsaved)
+        await asyncio.shield(self._concluded)
+        if switch is not None and len(switch.unsaved) > before:
+            problem = f"the new state could not be saved ({switch.unsaved[-1]})"
+            raise ControlFailed(cell.path, "replace_state", problem)
+
+    async def release(self, system: ActorSystem) -> None:
+        """It goes on as before."""
+        if self._is_ordered:
+            return
+        cell = self._place.cell
+        try:
+            if cell is not None and not cell.is_dead and self._lock is not None:
+                await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
+        finally:
+            if cell is not None:
+                self._over(cell)
+
+
+def lives_here(cell: Cell) -> bool:
+    """Whether an actor's life, if it has one, is lived in this process."""
+    return cell.actor is not None
