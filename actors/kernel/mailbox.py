@@ -291,6 +291,7 @@ def resume(cell: Cell, who: int = BY_USER) -> None:
     for index, item in enumerate(queue):  # Not removed: the run loop has counted it.
         if type(item) is Hold:
             queue[index] = NOTHING
+            cell.schedule()
             return
 
 

@@ -54,6 +54,7 @@ class Worker(Peer):
         self.gate = Gate(self)
         self.inner = Inner(self.node, self)
         self.cell: Cell | None = None
+        self.home = ""  # the address that it was given; an actor that has left may have another one by now
         self._workers = workers
         self._died: Callable[[Cell, ExitReason], None] | None = None
         self._launches: dict[int, asyncio.Future[None]] = {}
@@ -158,7 +159,7 @@ class Worker(Peer):
 
     def reserve(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
         """The actor at `cell` may be moved into this process, which counts as its own only when it is adopted."""
-        self.cell, self._died = cell, died
+        self.cell, self._died, self.home = cell, died, cell.path
         if limits is not None:
             self._watch = Watch(self, limits)
 

@@ -203,7 +203,6 @@ class Router(Actor):
         self._rooms.clear()
         cell = self.ctx.cell
         mailbox.resume(cell, mailbox.BY_ITSELF)
-        cell.schedule()
 
 
 class AnyMessage(Table):

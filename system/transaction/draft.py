@@ -123,9 +123,11 @@ class Place:
         return cell
 
     def check_lived_in(self, node: Node) -> None:
-        """Whether somebody lives here, or will at this point. Raises NoSuchActor."""
-        if not self.is_planned:
-            self.living(node)
+        """Whether somebody lives here at this point. Raises NoSuchActor, or SpecError: a step before stops it."""
+        if not self.is_stopped:
+            return
+        self.living(node)
+        raise wrong(self.path, "it is stopped by this very transaction")
 
     def line(self) -> str:
         """The place in one line of text."""

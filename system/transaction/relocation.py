@@ -59,8 +59,11 @@ class Relocation:
 
     @property
     def _comes_last(self) -> bool:
-        """Its state or code is changed too: it is where it is until that is done."""
-        return self._place.rework is not None
+        """Its state, its code or its address is changed too: it is where it is until that is done."""
+        at: Place | None = self._place
+        while at is not None and not at.is_moved:
+            at = at.parent
+        return self._place.rework is not None or at is not None
 
     # -- before the commit --------------------------------------------------------------------------------------------
 
@@ -124,11 +127,10 @@ class Relocation:
             return
         cell = self._place.living(system.node)
         now = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
-        if now is not None and self._task is not None:
-            if self._adapts:
-                replace_mechanism(cell, dataclasses.replace(now, mechanism=self._after.mechanism))
-            else:
-                replace_place(cell, dataclasses.replace(now, isolation=self._after.isolation))
+        if now is not None and not self._adapts:
+            replace_place(cell, dataclasses.replace(now, isolation=self._after.isolation))
+        elif now is not None and self._task is not None:
+            replace_mechanism(cell, dataclasses.replace(now, mechanism=self._after.mechanism))
         if self._gate is not None:
             self._gate.open()
 

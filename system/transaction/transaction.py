@@ -214,7 +214,7 @@ class Transaction:
         caller = current.get(None)
         place = self._draft.by_cell.get(caller.cell) if caller is not None and self._draft is not None else None
         while place is not None:
-            if place.is_leaving:
+            if place.is_leaving or place.is_stopped:
                 return True
             place = place.parent
         return False

@@ -74,10 +74,9 @@ class Gate:
     @property
     def home(self) -> str:
         """The address that the process was given."""
-        cell = self._worker.cell
-        if cell is None:
+        if self._worker.cell is None:
             raise BadFrame("a process without an actor says something")
-        return cell.path
+        return self._worker.home
 
     def owns(self, path: str) -> bool:
         """Whether an address is its own."""
