@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend
 from ...actors.control.orders_lane import order
-from ...actors.errors import ControlFailed
+from ...actors.errors import ActorStopped, AskFailed, ControlFailed
 from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 PREPARED_WITHIN = 3600.0
 """Seconds that an actor may take to come to it; the transaction's own time limit is shorter."""
+AGAIN_AFTER = 0.02
+"""Seconds after which the next life of an actor is looked for."""
 CONCLUDED_WITHIN = 60.0
 """Seconds that an actor in another process may take to hear that the transaction is over."""
 
@@ -70,14 +72,32 @@ class Rework:
         """Hold it, and have it try."""
         if self._is_ordered:
             return
-        cell = self._place.living(system.node)
-        if self._lock is None:
-            lock = system._moves.lock(cell)
+        while True:
+            cell = self._place.living(system.node)
+            await self._claim(system, cell)
+            life, self._held = cell.life, None
+            try:
+                self._recipe = await order(cell, Prepare(self._attempt, tuple(self._wanted)), PREPARED_WITHIN)
+            except (AskFailed, ActorStopped):
+                if cell.life == life and cell.host.is_up(cell):
+                    raise
+                await asyncio.sleep(AGAIN_AFTER)  # Its life has ended: the next one is prepared, if there is one.
+                continue
+            self._held = (cell, cell.life)
+            return
+
+    async def _claim(self, system: ActorSystem, cell: Cell) -> None:
+        """Have nobody else move it."""
+        lock = system._moves.lock(cell)
+        if self._lock is not lock:
+            self._let_go()
             await lock.acquire()
             self._lock = lock
-        self._held = None
-        self._recipe = await order(cell, Prepare(self._attempt, tuple(self._wanted)), PREPARED_WITHIN)
-        self._held = (cell, cell.life)
+
+    def _let_go(self) -> None:
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            lock.release()
 
     def ready(self, system: ActorSystem) -> str:
         """Whether the life that was prepared is the one."""
@@ -140,9 +160,7 @@ class Rework:
         switch = switch_of(cell)
         if switch is not None:
             switch.becomes = None
-        lock, self._lock = self._lock, None
-        if lock is not None:
-            lock.release()
+        self._let_go()
 
     async def finish(self, system: ActorSystem) -> None:
         """Wait until an actor in another process has heard it."""
@@ -164,6 +182,8 @@ class Rework:
         try:
             if cell is not None and not cell.is_dead and self._lock is not None:
                 await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
+        except (AskFailed, ActorStopped):
+            pass  # The life that was held has ended.
         finally:
             if cell is not None:
                 self._over(cell)
