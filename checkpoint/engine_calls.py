@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+import contextlib
+from collections.abc import Callable, Collection, Generator, Sequence
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, ParamSpec, TypeVar
 
 from ..actors.errors import HoldfastError
@@ -80,6 +82,23 @@ class Called:
         """See `Journal`."""
         self._refuse_failed()
         self._call(self._engine.cut, address, snapshot, drop, turn=turn, keep=keep)
+
+    @contextlib.contextmanager
+    def together(self) -> Generator[None, None, None]:
+        """See `Journal`. An engine that does not have it writes each on its own."""
+        joint: Callable[[], AbstractContextManager[None]] | None = getattr(self._engine, "together", None)
+        if joint is None:
+            yield
+            return
+        self._refuse_failed()
+        try:
+            with joint():
+                yield
+        except HoldfastError:
+            raise
+        except Exception as error:
+            self._failure = self._failed(error)
+            raise self._failure from error
 
     def load(self, address: str, *, older: int = False) -> Saved:
         """See `Journal`."""

@@ -10,11 +10,13 @@ What is submitted lives here, not in the message handler that has it written: th
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import contextvars
 import functools
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Protocol
 
 from ..actors.errors import HoldfastError
@@ -389,6 +391,27 @@ class Commits:
     def notes(self, prefix: str) -> dict[str, bytes]:
         """All facts whose keys begin so."""
         return self.engine.notes(prefix)
+
+    @contextlib.contextmanager
+    def together(self) -> Generator[None, None, None]:
+        """Have all that is kept meanwhile be in the store completely, or not at all, if the engine can do that.
+
+        Call `barrier` before. If the store fails at the end, nothing more is written: what is in memory is not in it,
+        and a root that is started again has what was there before.
+
+        Raises:
+            HoldfastError: it has failed.
+        """
+        joint: Callable[[], AbstractContextManager[None]] | None = getattr(self.engine, "together", None)
+        if joint is None:
+            yield
+            return
+        try:
+            with joint():
+                yield
+        except HoldfastError as error:
+            self._stop(error)
+            raise
 
     def sync(self) -> None:
         """Have everything that was submitted outlive the machine; it waits for the disk."""

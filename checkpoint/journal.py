@@ -112,6 +112,10 @@ class Journal(Protocol):
     Entries come back exactly as given, in order, or not at all and loudly. Calls that write either happen completely
     or raise and leave the store as it was. `append` may be called on the event loop; `cut`, `load` and `erase` may run
     in worker threads meanwhile, but only one of them per address at a time.
+
+    An engine may have `together()`, which returns a context manager: what is written inside, by the thread that is in
+    it, stands in the store completely or not at all. Without it, a root that is killed while a transaction comes into
+    force may come back with the new state of one actor and the old state of another.
     """
 
     durable: bool

@@ -121,6 +121,8 @@ class ChildSpec(Generic[A_co]):
             _number(self.start_timeout) and 0 < self.start_timeout < float("inf")
         ):
             raise SpecError(where, f"start_timeout must be seconds > 0 or 'infinity', not {self.start_timeout!r}")
+        if not isinstance(self.autostart, bool):
+            raise SpecError(where, f"autostart must be True or False, not {self.autostart!r}")
         if not isinstance(self.significant, bool):
             raise SpecError(where, f"significant must be True or False, not {self.significant!r}")
         if self.significant and self.restart == "permanent":
@@ -224,6 +226,7 @@ def child(
     rules: Iterable[Rule] = (),
     mechanism: Any = None,
     start_timeout: StartTimeout | None = None,
+    autostart: bool = True,
 ) -> ChildSpec[A]:
     """A child spec.
 
@@ -247,6 +250,8 @@ def child(
             "infinity"; if left out 60, and "infinity" for a supervisor, whose children have limits of their own. A
             start that takes longer is killed, and has failed. A child that is brought back may take longer altogether,
             but not longer without having handled one more input again; pauses that a paced replay repeats do not count.
+        autostart: whether its supervisor starts it with the others. If not, it is known and stopped, at each start of
+            its supervisor, until it is started by order (`RestartChild`, or `start` in a transaction).
 
     Raises:
         MechanismRefused: the class does not have what the mechanism needs.
@@ -271,6 +276,7 @@ def child(
         tuple(rules),
         mechanism,
         start_timeout=start_timeout,
+        autostart=autostart,
     )
 
 

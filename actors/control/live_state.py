@@ -106,8 +106,10 @@ def change_state(actor: Actor, change: Callable[[Any], Any]) -> None:
         actor.ctx.replaced()
 
 
-def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> Any:
+def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str) -> tuple[Any, list[bytes]]:
     """The state that the actor would have with these changes, one after the other; it has what it had.
+
+    Also what its home would be told of it, as bytes.
 
     Raises:
         ControlFailed: one of them raised, or what it returned is no state, or cannot be kept.
@@ -115,8 +117,8 @@ def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str
     with _changing(actor, verb, is_trial=True):
         for change in changes:
             put_state(actor, change(state_to_change(actor)))
-        actor.ctx.check_saving()
-        return state_to_change(actor)
+        saved = actor.ctx.saved()
+        return state_to_change(actor), saved
 
 
 @contextlib.contextmanager

@@ -199,27 +199,31 @@ class Prepared:
 class Prepare(Order):
     """Handle no message from now on, for a transaction, and try what it wants: nothing is changed by it.
 
-    Returns the recipe of the next lives, packed, if there is another one, and if it is carried out in another process.
+    Returns, from another process: the recipe of the next lives, packed, if there is another one, and the new state as
+    the home of a recorded actor is to keep it.
     """
 
     verb: ClassVar[str] = "prepare"
     attempt: int
     wanted: tuple[ReplaceState | ReplaceCode, ...]
 
-    def run(self, cell: Cell, actor: Actor) -> bytes | None:
+    def run(self, cell: Cell, actor: Actor) -> tuple[bytes | None, list[bytes]]:
         mailbox.suspend(cell, mailbox.BY_TRANSACTION)
         hold = mailbox.held(cell)
         assert hold is not None
         hold.attempt, hold.prepared = self.attempt, None
         if not self.wanted:
-            return None
+            return None, []
         start: Start[Any] | None = None
         for one in self.wanted:
             if isinstance(one, ReplaceCode):
                 start = next_start(cell, one.start, keeps_arguments=one.keeps_arguments)
         changes = [one.change if isinstance(one, ReplaceState) else one.becoming(actor) for one in self.wanted]
-        hold.prepared = Prepared(tried_state(actor, changes, self.wanted[0].verb), start)
-        return None if start is None or cell.node.uplink is None else pack_recipe(start, cell.path)
+        state, saved = tried_state(actor, changes, self.wanted[0].verb)
+        hold.prepared = Prepared(state, start)
+        if cell.node.uplink is None:
+            return None, []
+        return None if start is None else pack_recipe(start, cell.path), saved
 
     def pack(self, where: str) -> dict[str, Any]:
         return {"attempt": self.attempt, "wanted": [[one.verb, one.pack(where)] for one in self.wanted]}

@@ -420,8 +420,12 @@ class ActorContext:
         Raises whatever keeps it from being saved.
         """
 
-    def check_saving(self) -> None:
-        """Raises whatever would keep the present state from being saved, if it has to be."""
+    def saved(self) -> list[bytes]:
+        """The present state as the actor's home would be told of it, if it has one; nobody is told.
+
+        Raises whatever keeps it from being saved.
+        """
+        return []
 
     def close(self) -> None:
         """The life is over."""

@@ -8,6 +8,8 @@ import random
 from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import msgspec
+
 from ...actors.errors import ControlFailed, HoldfastError, remote_crash
 from ...actors.exit_reasons import NORMAL, ExitReason
 from ...actors.kernel import mailbox
@@ -19,7 +21,6 @@ from ...actors.kernel.links import Monitor
 from ...actors.kernel.message import Message, message_name, require_message
 from ...actors.kernel.ref import ActorRef, current
 from ..protocol import Feed, PipeDone
-from ..snapshot.key_variables import save_state
 from .recorded_inbox import INIT, STARTED, Fed
 
 if TYPE_CHECKING:
@@ -308,10 +309,8 @@ class RecordedContext(ActorContext):
     def replaced(self) -> None:
         self.recorded.replaced()
 
-    def check_saving(self) -> None:
-        actor = self.cell.actor
-        assert actor is not None
-        save_state(actor)
+    def saved(self) -> list[bytes]:
+        return [msgspec.msgpack.encode(piece) for piece in self.recorded.replaced_snapshot()]
 
     def stop(self, reason: ExitReason = NORMAL) -> None:
         if self.recorded.is_live:

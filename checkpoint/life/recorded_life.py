@@ -446,26 +446,41 @@ class Life:
         Raises:
             UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
         """
-        actor = self.cell.actor
-        assert actor is not None
-        begin = time.perf_counter()
-        self._send_snapshot(save_state(actor), begin, is_replaced=True)
+        told = self.replaced_snapshot()
+        self._begin_snapshot(sum(len(piece.data) for piece in told))
+        for piece in told:
+            self.port.to_home(piece)
         if self._snapshot_turn != self.turn:  # A home in another process says so later, and ends this life.
             raise ControlFailed(self.cell.path, "replace_state", "the new state could not be saved")
 
-    def _send_snapshot(self, data: bytes, begin: float, *, is_replaced: bool = False) -> None:
+    def replaced_snapshot(self) -> list[Snapshot]:
+        """The present state as the home would be told of it, piece by piece."""
+        actor, begin = self.cell.actor, time.perf_counter()
+        assert actor is not None
+        return self._snapshot(save_state(actor), begin, is_replaced=True)
+
+    def _send_snapshot(self, data: bytes, begin: float) -> None:
+        self._begin_snapshot(len(data))
+        for piece in self._snapshot(data, begin, is_replaced=False):
+            self.port.to_home(piece)
+
+    def _begin_snapshot(self, size: int) -> None:
         self.images.stop()
         self.images.restart()
-        self.images.last_bytes = len(data)
+        self.images.last_bytes = size
+        self._snapshot_turn = self.turn  # Before it is sent: a home in this process says at once if it cannot keep it.
+        self._snapshot_wanted = False
+
+    def _snapshot(self, data: bytes, begin: float, *, is_replaced: bool) -> list[Snapshot]:
         stash = [fed.feed.id for fed in self.stash]
         pause = time.perf_counter() - begin
         parts = pieces(data)
-        self._snapshot_turn = self.turn  # Before it is sent: a home in this process says at once if it cannot keep it.
-        self._snapshot_wanted = False
-        for index, part in enumerate(parts, 1):
-            is_last = index == len(parts)
-            said = self.traps, *self.made_by()
-            self.port.to_home(Snapshot(self.turn, part, is_last, stash, pause, is_replaced, None, *said))
+        said = self.traps, *self.made_by()
+        last = len(parts) - 1
+        return [
+            Snapshot(self.turn, part, index == last, stash, pause, is_replaced, None, *said)
+            for index, part in enumerate(parts)
+        ]
 
     def made_by(self) -> tuple[str, list[str]]:
         """The class whose state is saved, and the variables that it had when `__init__` had run."""

@@ -8,6 +8,7 @@ import zlib
 from array import array
 from bisect import bisect_left, bisect_right
 from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager
 from typing import Final, Literal
 
 from ..journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
@@ -346,6 +347,11 @@ class SqliteJournal:
         with self._store.lock:
             self._store.refresh()
             return sorted(self._store.chains)
+
+    def together(self) -> AbstractContextManager[None]:
+        """Have all that is written meanwhile be kept completely, or not at all; see `Journal`."""
+        self._store.refuse_failed()
+        return self._store.together()
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small named fact; see `Journal`."""

@@ -50,6 +50,8 @@ class Store:
         self.files = SnapshotFiles(path)
         self.parts = Parts(path, (self.files.folder, f"{path}-log", f"{path}-packs"))
         self.lock = threading.RLock()
+        self._joint: sqlite3.Connection | None = None  # of the transaction that others join
+        self._doomed: list[str] = []  # files to be removed behind it
         self.read_lock = threading.Lock()
         self.chains: dict[str, Chain] = {}
         self.notes: dict[str, bytes] = {}
@@ -241,6 +243,9 @@ class Store:
         shows if it is lost, and the store row is brought up to date.
         """
         with self.lock:
+            if self._joint is not None:  # Of the thread that has the lock.
+                yield self._joint
+                return
             self.refresh()
             db, log = self.db, self.log
             try:
@@ -273,6 +278,20 @@ class Store:
             self._unsaved_bytes += size + 8192
             if self._unsaved_bytes > _CHECKPOINT_BYTES:
                 self._start_checkpoint()
+
+    @contextlib.contextmanager
+    def together(self) -> Generator[None, None, None]:
+        """Have all that this thread writes meanwhile be one transaction."""
+        doomed: list[str] = []
+        with self.lock:
+            with self.transaction(note=True) as db:
+                self._joint, self._doomed = db, doomed
+                try:
+                    yield
+                finally:
+                    self._joint = None
+            with contextlib.suppress(StoreFailed):  # What was to be kept is kept; the next opening removes the others.
+                self.remove_files(doomed)
 
     def takes(self, entries: Sequence[tuple[str, Entry]], size: int) -> bool:
         """Whether the log takes these entries, encoded in so many bytes; else they need a transaction."""
@@ -346,6 +365,9 @@ class Store:
             StoreFailed: they could not be removed, which is done at the next opening; or as `sync_rows`.
         """
         if not names:
+            return
+        if self._joint is not None:  # Until that is committed, rows name them.
+            self._doomed += names
             return
         self.sync_rows()
         try:

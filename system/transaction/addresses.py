@@ -17,7 +17,7 @@ class Moved:
 
     def leave(self, path: str, cell: Cell) -> None:
         """The actor at `path` has another address now."""
-        # Who was restarted since it came here, with its supervisor, has another cell now, and goes on from here with it.
+        # Who was restarted since it came here has another cell now, and goes on with it.
         known = {old: cell if other.path == path else other for old, other in self._cells.items()}
         self._cells = {old: other for old, other in known.items() if old != cell.path}
         self._cells[path] = cell

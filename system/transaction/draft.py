@@ -134,6 +134,8 @@ class Place:
         said = [self.kind.__name__ if self.kind is not None else "actor"]
         if self.spec is not None:
             said += [self.spec.restart, self.spec.isolation]
+            if not self.spec.autostart:
+                said.append("stopped")
             if self.spec.recovery is not None:
                 said.append(type(self.spec.recovery).__name__.lower())
             if self.spec.mechanism is not None:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend
 from ...actors.control.orders_lane import order
 from ...actors.errors import ActorStopped, AskFailed, ControlFailed
@@ -18,6 +20,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.migration.quiesce import ATTEMPTS
 from ...actors.process.wire.start_codec import unpack_recipe
 from ...checkpoint.home.outputs import switch_of
+from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
 from .operation import wrong
 from .structure import busy
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from ..system import ActorSystem
     from .draft import Place
 
+SNAPSHOT: msgspec.msgpack.Decoder[Snapshot] = msgspec.msgpack.Decoder(Snapshot)
 PREPARED_WITHIN = 3600.0
 """Seconds that an actor may take to come to it; the transaction's own time limit is shorter."""
 AGAIN_AFTER = 0.02
@@ -45,6 +49,7 @@ class Rework:
         self._attempt = next(ATTEMPTS)
         self._held: tuple[Cell, int] | None = None  # where, and which life there
         self._recipe: bytes | None = None  # of the next lives, from another process
+        self._saved: list[bytes] = []  # and the new state, as its home is to keep it
         self._concluded: asyncio.Future[Any] | None = None  # there
         self._lock: asyncio.Lock | None = None  # nobody moves it meanwhile
 
@@ -77,7 +82,8 @@ class Rework:
             await self._claim(system, cell)
             life, self._held = cell.life, None
             try:
-                self._recipe = await order(cell, Prepare(self._attempt, tuple(self._wanted)), PREPARED_WITHIN)
+                prepared = await order(cell, Prepare(self._attempt, tuple(self._wanted)), PREPARED_WITHIN)
+                self._recipe, self._saved = prepared
             except (AskFailed, ActorStopped):
                 if cell.life == life and cell.host.is_up(cell):
                     raise
@@ -120,6 +126,10 @@ class Rework:
                 self._tell(cell, Suspend() if self.suspended else Resume())
             return
         self._put_recipe(cell)
+        switch = switch_of(cell)
+        if switch is not None and not lives_here(cell):  # Its process keeps it again when it hears of it, and may die.
+            for piece in self._saved:
+                switch.from_life(SNAPSHOT.decode(piece))
         self._tell(cell, Conclude(self._attempt, True, self.suspended))
 
     def _put_recipe(self, cell: Cell) -> None:

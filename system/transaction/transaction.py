@@ -138,6 +138,7 @@ class Transaction:
                         break
                     await asyncio.sleep(LOOK_AGAIN)
                     await late.prepare(system)
+            system.homes.journal.barrier()
             self._commit()  # In the same step of the loop in which all were ready.
         except BaseException as error:
             if isinstance(error, TimeoutError):
@@ -152,11 +153,15 @@ class Transaction:
 
     def _commit(self) -> None:
         """Put all of it in force, with no wait in between: there is no way back from here."""
-        for operation in self._change.operations:
-            try:
-                operation.commit(self._system)
-            except Exception as error:  # It had said that it is ready: the others are in force all the same.
-                self._problems.append(f"{operation.text}: {said(error)}")
+        try:
+            with self._system.homes.journal.together():
+                for operation in self._change.operations:
+                    try:
+                        operation.commit(self._system)
+                    except Exception as error:  # It had said that it is ready: the others are in force all the same.
+                        self._problems.append(f"{operation.text}: {said(error)}")
+        except HoldfastError as error:
+            self._problems.append(f"it is not in the store, which has failed: {said(error)}")
 
     async def _release(self, begun: list[Operation]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Let go of what was prepared, last one first; a cancellation waits until that is over."""

@@ -1,0 +1,473 @@
+"""What is prepared changes nothing, what is committed is in force at once, and nothing in between is ever seen."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from tests.system.trees import Add, Boom, Counter, Double, Life, Stumble, counter, picture, ref
+
+# A transaction that fails ends with its block, which collects several steps.
+# ruff: noqa: PT012
+
+Meanwhile = Callable[[hf.ActorSystem], Awaitable[None]]
+IN_TIME = 20.0
+
+
+class Slot(Stumble):
+    """A step in the middle, which does what a test wants there when all before it is prepared."""
+
+    def __init__(self, do: Meanwhile, *, fails: bool) -> None:
+        super().__init__(do)
+        self._fails = fails
+
+    async def prepare(self, system: hf.ActorSystem) -> None:
+        await super().prepare(system)
+        if self._fails:
+            raise hf.HoldfastError("there was a stone")
+
+
+def plus(n: int, state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "count": state["count"] + n}
+
+
+def hundred(state: dict[str, Any]) -> dict[str, Any]:
+    return plus(100, state)
+
+
+async def crashed(system: hf.ActorSystem, path: str) -> None:
+    """An actor is killed, and its next life is up."""
+    before = ref(system, path)._cell
+    life = before.life
+    before.kill()
+    async with asyncio.timeout(IN_TIME):
+        while True:
+            cell = system.node.find(path)
+            if cell is not None and (cell is not before or cell.life != life) and cell.host.is_up(cell):
+                return
+            await asyncio.sleep(0)
+
+
+@pytest.fixture(params=["plain", "recorded", "in a process", "recorded in a process"])
+async def one(system: hf.ActorSystem, request: pytest.FixtureRequest) -> hf.ActorRef[Any]:
+    recovery = hf.hybrid(interval=60.0) if "recorded" in request.param else None
+    isolation: Any = "process" if "process" in request.param else "task"
+    spec = hf.child("one", hf.start(Counter, 5), recovery=recovery, isolation=isolation)
+    await system.start(hf.supervisor("top", intensity=99, children=[spec, counter("other")]))
+    return ref(system, "/app/top/one")
+
+
+# -- until the commit nothing has changed -----------------------------------------------------------------------------
+
+
+async def test_work_that_is_acknowledged_in_the_middle_is_kept(system: hf.ActorSystem, one: hf.ActorRef[Any]) -> None:
+    """The life that was held ends; what its next life handles is not overwritten when the transaction is given up."""
+    acknowledged: list[int] = []
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        await crashed(running, one.path)
+        acknowledged.extend([await one.ask(Add()) for _ in range(3)])
+
+    with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.replace_state(one, hundred)
+            change.step(Slot(meanwhile, fails=True))
+    assert failed.value.kept == ()
+    assert await one.ask(Add(0)) == acknowledged[-1]
+
+
+async def test_a_life_that_ends_in_the_middle_is_prepared_again(system: hf.ActorSystem, one: hf.ActorRef[Any]) -> None:
+    """What its next life has acknowledged before it is held is in the state that is changed."""
+    acknowledged: list[int] = []
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        await crashed(running, one.path)
+        acknowledged.append(await one.ask(Add(7)))
+
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.replace_state(one, hundred)
+        change.step(Slot(meanwhile, fails=False))
+    assert await one.ask(Add(0)) == acknowledged[0] + 100
+
+
+@pytest.mark.parametrize("fails", [True, False])
+async def test_what_is_held_handles_nothing_before_the_end(
+    system: hf.ActorSystem, one: hf.ActorRef[Any], fails: bool
+) -> None:
+    asked: list[asyncio.Future[int]] = []
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        asked.append(one.ask(Add(1)))
+        await system.resume(one)  # That of a user: the transaction holds it all the same.
+        await running.get_status(one)
+        assert not asked[0].done()
+
+    try:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.replace_state(one, hundred)
+            change.resume(one)
+            change.step(Slot(meanwhile, fails=fails))
+    except hf.TransactionFailed:
+        assert fails
+    assert await asked[0] == (6 if fails else 106)
+
+
+async def test_a_user_who_has_suspended_it_is_heard_after_it(system: hf.ActorSystem, one: hf.ActorRef[Any]) -> None:
+    """Holding is not suspending: neither ends the other."""
+    await system.suspend(one)
+    with pytest.raises(hf.TransactionFailed):
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.replace_state(one, hundred)
+            change.step(Stumble())
+    assert (await system.get_status(one)).state == "suspended"
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.replace_state(one, hundred)
+    assert (await system.get_status(one)).state == "suspended"
+    await system.resume(one)
+    assert await one.ask(Add(0)) == 105
+
+
+async def test_what_it_wants_last_is_what_it_is(system: hf.ActorSystem, one: hf.ActorRef[Any]) -> None:
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.resume(one)
+        change.replace_state(one, hundred)
+        change.suspend(one)
+    assert (await system.get_status(one)).state == "suspended"
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.suspend(one)
+        change.resume(one)
+    assert await one.ask(Add(0)) == 105
+
+
+async def test_several_changes_of_one_actor_are_one(system: hf.ActorSystem, one: hf.ActorRef[Any]) -> None:
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.replace_state(one, hundred)
+        change.replace_code(one, Double)
+        change.replace_state(one, hundred)
+    assert await one.ask(Add(1)) == 207
+    await crashed(system, one.path)
+    assert await one.ask(Add(1)) in (209, 7), "it is of the new class, from what was recorded or from its arguments"
+
+
+async def test_a_change_that_raises_leaves_it_as_it_was(system: hf.ActorSystem, one: hf.ActorRef[Any]) -> None:
+    with pytest.raises(hf.TransactionFailed, match="KeyError"):
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.replace_state(one, hundred)
+            change.replace_state(one, missing)
+    assert await one.ask(Add(1)) == 6
+
+
+def missing(state: dict[str, Any]) -> dict[str, Any]:
+    return {"count": state["nothing"]}
+
+
+# -- what restarts meanwhile ------------------------------------------------------------------------------------------
+
+RESTARTED = ["/app/left", "/app/right"]
+SHAPES: dict[str, Callable[[hf.Change], object]] = {
+    "add": lambda change: change.add("/app/left", counter("g")),
+    "add subtree": lambda change: change.add("/app/left", hf.supervisor("g", children=[counter("h")])),
+    "remove": lambda change: change.remove("/app/left/b"),
+    "stop": lambda change: change.stop("/app/left/b"),
+    "start": lambda change: change.start("/app/right", "e"),
+    "move": lambda change: change.move("/app/left/b", "/app/right"),
+    "move back": lambda change: (change.move("/app/left/b", "/app/right"), change.move("/app/right/b", "/app/left")),
+    "reorder": lambda change: change.reorder("/app/left", ["c", "a"]),
+    "strategy": lambda change: change.strategy("/app/left", "rest_for_one"),
+    "intensity": lambda change: change.intensity("/app/left", 77, 7.0),
+}
+shapes = pytest.mark.parametrize("name", SHAPES)
+restarted = pytest.mark.parametrize("path", RESTARTED)
+
+
+def shape(system: hf.ActorSystem) -> dict[str, Any]:
+    """What there is: children in order with their states, and flags."""
+    found: dict[str, Any] = {}
+    for path in RESTARTED:
+        actor: Any = ref(system, path)._cell.actor
+        found[path] = [actor._flags, [(name, one.state) for name, one in actor._children.items()]]
+    return {"tree": sorted(path for path in system.tree() if path.startswith(tuple(RESTARTED))), **found}
+
+
+async def stopped_for_good(system: hf.ActorSystem) -> None:
+    """What the tree has stopped by a message comes back with its supervisor; what a transaction stops does not."""
+    async with system.transaction() as change:
+        change.start("/app/right", "e")
+    async with system.transaction() as change:
+        change.stop("/app/right/e")
+
+
+async def in_force(system: hf.ActorSystem) -> dict[str, Any]:
+    """What there is when both supervisors have been restarted: what is in force, and nothing else."""
+    for path in RESTARTED:
+        await crashed(system, path)
+    async with asyncio.timeout(IN_TIME):
+        while any(
+            one.state not in ("running", "stopped")
+            for path in RESTARTED
+            for one in getattr(ref(system, path)._cell.actor, "_children", {"": None}).values()
+        ):
+            await asyncio.sleep(0)
+    return shape(system)
+
+
+@shapes
+@restarted
+async def test_a_supervisor_that_is_restarted_in_the_middle_has_what_was_in_force(
+    system: hf.ActorSystem, name: str, path: str
+) -> None:
+    await stopped_for_good(system)
+    before = shape(system)
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        await crashed(running, path)
+
+    with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+        async with system.transaction(timeout=IN_TIME) as change:
+            SHAPES[name](change)
+            change.step(Slot(meanwhile, fails=True))
+    assert failed.value.kept == ()
+    assert shape(system) == before
+    assert await in_force(system) == before
+
+
+@shapes
+@restarted
+async def test_what_is_committed_is_in_force_though_a_supervisor_was_restarted_in_the_middle(
+    system: hf.ActorSystem, name: str, path: str
+) -> None:
+    await stopped_for_good(system)
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        await crashed(running, path)
+
+    async with system.transaction(timeout=IN_TIME) as change:
+        SHAPES[name](change)
+        change.step(Slot(meanwhile, fails=False))
+    now = shape(system)
+    after = await in_force(system)
+    assert after == now
+    match name:
+        case "add" | "add subtree":
+            assert "/app/left/g" in after["tree"]
+        case "remove" | "stop":
+            assert "/app/left/b" not in after["tree"]
+        case "start":
+            assert "/app/right/e" in after["tree"]
+        case "move":
+            assert "/app/right/b" in after["tree"]
+            assert "/app/left/b" not in after["tree"]
+        case "reorder":
+            assert [child for child, _ in after["/app/left"][1]] == ["c", "a", "b"]
+        case "strategy":
+            assert after["/app/left"][0].strategy == "rest_for_one"
+        case "intensity":
+            assert after["/app/left"][0].intensity == 77
+        case _:
+            assert "/app/left/b" in after["tree"]
+
+
+async def test_several_steps_about_one_child_are_all_in_force(system: hf.ActorSystem) -> None:
+    """No step writes over what another says of the same spec."""
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.add("/app/left", counter("x"))
+        change.isolation("/app/left/x", "process")
+        change.replace_code("/app/left/b", Double)
+        change.move("/app/left/b", "/app/right")
+        change.add("/app/left", hf.supervisor("sub"))
+        change.strategy("/app/left/sub", "one_for_all")
+        change.add("/app/left/sub", counter("y"))
+        change.move("/app/left/sub", "/app/right")
+    for path in RESTARTED:
+        await crashed(system, path)
+    assert system.pid_of(ref(system, "/app/left/x")) != os.getpid()
+    assert await ref(system, "/app/right/b").ask(Add(1)) == 2
+    assert await ref(system, "/app/right/sub/y").ask(Add(1)) == 1
+    flags = ref(system, "/app/right/sub")._cell.actor._flags  # type: ignore[union-attr]
+    assert flags.strategy == "one_for_all"
+
+
+# -- stopping ---------------------------------------------------------------------------------------------------------
+
+
+class Work(hf.Message[int]): ...
+
+
+class Worker(hf.Actor):
+    """Busy until a test lets it go on."""
+
+    def __init__(self) -> None:
+        self.began, self.may_end = asyncio.Event(), asyncio.Event()
+
+    @hf.on(Work)
+    async def work(self, message: Work) -> int:
+        self.began.set()
+        await self.may_end.wait()
+        return 1
+
+
+@pytest.mark.parametrize("is_cancelled", [False, True])
+async def test_a_busy_actor_is_stopped_however_long_it_takes(system: hf.ActorSystem, is_cancelled: bool) -> None:
+    """There is no time at which it is told as running and stops later."""
+    busy = await ref(system, "/app/left").ask(hf.StartChild(hf.child("busy", hf.start(Worker))))
+    asked = busy.ask(Work())
+    worker: Any = busy._cell.actor
+    await worker.began.wait()
+    task = asyncio.ensure_future(stopped(system, busy.path))
+    if is_cancelled:
+        with system.events() as stream:
+            async with asyncio.timeout(IN_TIME):
+                async for event in stream:
+                    if isinstance(event, hf.TransactionBegan):
+                        break
+        task.cancel()
+    worker.may_end.set()
+    try:
+        await task
+    except asyncio.CancelledError:
+        assert is_cancelled
+    assert await asked == 1
+    async with system.transaction():  # Behind it.
+        pass
+    is_there = busy.path in system.tree()
+    spec = ref(system, "/app/left")._cell.actor._children["busy"].spec  # type: ignore[union-attr]
+    assert is_there == spec.autostart
+
+
+async def stopped(system: hf.ActorSystem, path: str) -> None:
+    async with system.transaction(timeout=0.2) as change:
+        change.stop(path)
+
+
+async def test_who_is_stopped_stays_so_until_it_is_started(system: hf.ActorSystem) -> None:
+    async with system.transaction() as change:
+        change.stop("/app/left/b")
+        change.strategy("/app/left", "one_for_all")
+    await crashed(system, "/app/left")
+    assert "/app/left/b" not in system.tree()
+    a = ref(system, "/app/left/a")
+    before = await a.ask(Life())
+    a.tell(Boom())
+    assert await a.ask(Life()) == before + 1
+    assert "/app/left/b" not in system.tree()
+    async with system.transaction(dry_run=True) as change:
+        change.start("/app/left", "b")
+    assert change.difference == (
+        "- /app/left/b: Counter, permanent, task, stopped",
+        "+ /app/left/b: Counter, permanent, task",
+    )
+    async with system.transaction() as change:
+        b = change.start("/app/left", "b")
+        change.register("again", b)
+    assert await system.whereis("again").ask(Add(3)) == 3
+    await crashed(system, "/app/left")
+    assert "/app/left/b" in system.tree()
+
+
+# -- names and bindings -----------------------------------------------------------------------------------------------
+
+
+async def test_a_name_that_somebody_else_took_meanwhile_is_left_to_it(system: hf.ActorSystem) -> None:
+    a, c = ref(system, "/app/left/a"), ref(system, "/app/left/c")
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        running.register("till", c)
+
+    with pytest.raises(hf.TransactionFailed, match="till"):
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.register("till", a)
+            change.step(Slot(meanwhile, fails=False))
+    assert system.whereis("till") == c
+
+
+async def test_a_binding_in_a_process_is_changed_by_the_commit_alone(
+    system: hf.ActorSystem, one: hf.ActorRef[Any]
+) -> None:
+    await system.node.settled()
+    before = picture(system)
+    with pytest.raises(hf.TransactionFailed):
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.bind("/app/right/client", "peer", one)
+            change.unregister("first")
+            change.register("first", one)
+            change.step(Stumble())
+    assert picture(system) == before
+
+
+# -- the root ends ----------------------------------------------------------------------------------------------------
+
+
+class Die(hf.Operation):
+    """A step at which the program is killed, before the commit or in the middle of it."""
+
+    verb = "die"
+
+    def __init__(self, when: str) -> None:
+        super().__init__("now")
+        self._when = when
+
+    async def check(self, system: hf.ActorSystem, draft: Any) -> None: ...
+
+    async def prepare(self, system: hf.ActorSystem) -> None:
+        self._die("prepare")
+
+    def commit(self, system: hf.ActorSystem) -> None:
+        self._die("commit")
+
+    async def finish(self, system: hf.ActorSystem) -> None:
+        self._die("finish")
+
+    def _die(self, when: str) -> None:
+        if when == self._when:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+
+async def accounts(store: str, when: str, isolation: Any) -> tuple[int, int]:
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", durability="os", log=False) as system:
+        recovery = hf.hybrid(interval=900.0)
+        specs = [hf.child(name, hf.start(Counter), recovery=recovery, isolation=isolation) for name in "ab"]
+        a, b = [await system.start(spec) for spec in specs]
+        if when:
+            for account in (a, b):
+                await account.ask(Add(1000))
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.replace_state(a, taken)
+                change.step(Die(when))
+                change.replace_state(b, hundred)
+        return await a.ask(Add(0)), await b.ask(Add(0))
+
+
+def taken(state: dict[str, Any]) -> dict[str, Any]:
+    return plus(-100, state)
+
+
+PROGRAM = """
+import asyncio, sys
+from tests.system.test_transaction_commit import accounts
+
+if __name__ == "__main__":
+    asyncio.run(accounts(*sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+@pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
+async def test_a_root_that_is_killed_comes_back_with_all_states_or_none(
+    tmp_path: Path, when: str, isolation: str
+) -> None:
+    store, program = str(tmp_path / "store"), tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    args = (sys.executable, str(program), store, when, isolation)
+    dying = await asyncio.create_subprocess_exec(*args, env=environment)
+    assert await asyncio.wait_for(dying.wait(), 60) == -signal.SIGKILL
+    both = {"prepare": [(1000, 1000)], "commit": [(1000, 1000)], "finish": [(900, 1100)]}
+    assert await accounts(store, "", isolation) in both[when]
