@@ -280,8 +280,8 @@ class Remove(Operation):
         cell, above = place.cell, place.parent
         if cell is not None and not cell.is_dead:
             await system.stop(cell.ref)
-        elif above is not None and above.is_supervisor and above.cell is not None and not above.cell.is_dead:
-            await forget(above.cell, place.name)
+        elif above is not None and above.is_supervisor:
+            await forget(above.living(system.node), place.name)  # It was restarted before it was removed.
 
 
 class OnSupervisor(Operation):

@@ -138,6 +138,7 @@ class Transaction:
                         break
                     await asyncio.sleep(LOOK_AGAIN)
                     await late.prepare(system)
+            failed, waiting = "commit", ""
             system.homes.journal.barrier()
             self._commit()  # In the same step of the loop in which all were ready.
         except BaseException as error:

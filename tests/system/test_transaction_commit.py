@@ -179,11 +179,18 @@ SHAPES: dict[str, Callable[[hf.Change], object]] = {
     "stop": lambda change: change.stop("/app/left/b"),
     "start": lambda change: change.start("/app/right", "e"),
     "move": lambda change: change.move("/app/left/b", "/app/right"),
-    "move back": lambda change: (change.move("/app/left/b", "/app/right"), change.move("/app/right/b", "/app/left")),
+    "move back": lambda change: there_and_back(change),
     "reorder": lambda change: change.reorder("/app/left", ["c", "a"]),
     "strategy": lambda change: change.strategy("/app/left", "rest_for_one"),
     "intensity": lambda change: change.intensity("/app/left", 77, 7.0),
 }
+
+
+def there_and_back(change: hf.Change) -> None:
+    change.move("/app/left/b", "/app/right")
+    change.move("/app/right/b", "/app/left")
+
+
 shapes = pytest.mark.parametrize("name", SHAPES)
 restarted = pytest.mark.parametrize("path", RESTARTED)
 
@@ -439,6 +446,8 @@ async def accounts(store: str, when: str, isolation: Any) -> tuple[int, int]:
             for account in (a, b):
                 await account.ask(Add(1000))
             async with system.transaction(timeout=IN_TIME) as change:
+                if when == "finish":  # Before any process has heard that it is in force.
+                    change.step(Die(when))
                 change.replace_state(a, taken)
                 change.step(Die(when))
                 change.replace_state(b, hundred)
@@ -465,7 +474,8 @@ async def test_a_root_that_is_killed_comes_back_with_all_states_or_none(
 ) -> None:
     store, program = str(tmp_path / "store"), tmp_path / "program.py"
     program.write_text(PROGRAM)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])}
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path}
     args = (sys.executable, str(program), store, when, isolation)
     dying = await asyncio.create_subprocess_exec(*args, env=environment)
     assert await asyncio.wait_for(dying.wait(), 60) == -signal.SIGKILL

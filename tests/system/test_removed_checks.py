@@ -1,0 +1,79 @@
+"""Each safety check of transactions is there for a reason: take it out, and a test fails.
+
+`HOLDFAST_REMOVED=1 python -m pytest tests/system/test_removed_checks.py` does so, in a copy; otherwise it is only
+looked whether the checks and the tests are where this table says.
+"""
+
+from __future__ import annotations
+
+from tests.removing import Check, as_tests
+
+COMMIT = "tests/system/test_transaction_commit.py"
+
+CHECKS = {
+    "the states are in the store together": Check(
+        "system/transaction/transaction.py",
+        "            with self._system.homes.journal.together():\n",
+        "            if True:\n",
+        COMMIT,
+        "test_a_root_that_is_killed and commit and task",
+    ),
+    "the home keeps the new state though its process has not heard of it": Check(
+        "system/transaction/rework.py",
+        "            for piece in self._saved:\n                switch.from_life(SNAPSHOT.decode(piece))\n",
+        "            pass\n",
+        COMMIT,
+        "test_a_root_that_is_killed and finish and process",
+    ),
+    "a life that was not prepared is prepared": Check(
+        "system/transaction/rework.py",
+        "            is_held = hold is not None and hold.attempt == self._attempt\n",
+        "            is_held = True\n",
+        COMMIT,
+        "test_a_life_that_ends_in_the_middle and plain",
+    ),
+    "a user does not release what a transaction holds": Check(
+        "actors/kernel/mailbox.py",
+        "    more.suspended &= ~who\n    if more.suspended:\n        return\n",
+        "    more.suspended = 0\n",
+        COMMIT,
+        "test_what_is_held_handles_nothing",
+    ),
+    "what was held goes on without another message": Check(
+        "actors/kernel/mailbox.py",
+        "            queue[index] = NOTHING\n            cell.schedule()\n",
+        "            queue[index] = NOTHING\n",
+        COMMIT,
+        "test_what_is_held_handles_nothing and plain",
+    ),
+    "a child that was added belongs to a life of its supervisor": Check(
+        "system/transaction/structure.py",
+        '            return f"{above.path} has been restarted"\n',
+        '            return ""\n',
+        COMMIT,
+        "test_what_is_committed_is_in_force and add",
+    ),
+    "what was stopped is not started with the others": Check(
+        "supervision/supervisor.py",
+        "(one for one in self._children.values() if one.spec.autostart)",
+        "self._children.values()",
+        COMMIT,
+        "test_who_is_stopped_stays_so",
+    ),
+    "what was stopped is not restarted with the others": Check(
+        "supervision/supervisor.py",
+        "(other.state != STARTING and (other.spec.autostart or other.is_running))",
+        "other.state != STARTING",
+        COMMIT,
+        "test_who_is_stopped_stays_so",
+    ),
+    "a name is not taken from its new holder": Check(
+        "system/transaction/wiring.py",
+        "        if holder is not None and holder is not cell and holder is not before:\n            raise",
+        "        if False:\n            raise",
+        COMMIT,
+        "test_a_name_that_somebody_else_took",
+    ),
+}
+
+test_the_table_is_true, test_without_the_check_a_test_fails = as_tests(CHECKS)
