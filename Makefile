@@ -33,7 +33,8 @@ campaign: $(VENV)/.dev
 	HOLDFAST_SIGNALS=100 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 tests/system/test_signals.py
 	HOLDFAST_SYSCALLS=500 HOLDFAST_FUZZ=5000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
 	    tests/faults tests/actors/process/hostile/test_fuzz.py
-	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/actors/process/hostile/test_removed_claims.py
+	HOLDFAST_REMOVED=1 $(BIN)/python -m pytest -q -n 2 -s tests/system/test_removed_checks.py \
+	    tests/actors/process/hostile/test_removed_claims.py
 	HOLDFAST_MUTANTS=100 $(BIN)/python -m pytest -q -s -o faulthandler_timeout=0 tests/test_mutants.py
 
 # Memory, descriptors, processes, threads and the store stay as they are under kills, for so many hours. See docs/testing.md.
