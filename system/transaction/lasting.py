@@ -68,6 +68,53 @@ def in_order(ids: list[str]) -> Edit:
     return lambda flags, specs: (flags, tuple(sorted(specs, key=lambda spec: rank.get(spec.id, len(rank)))))
 
 
+class Renamed:
+    """Specs and recipes in which the address of an actor that has moved, and those below it, are the new ones."""
+
+    def __init__(self, was: str, now: str) -> None:
+        self._was, self._now = was, now
+        self._made: dict[int, tuple[Any, Any]] = {}  # by the identity of the old: what was one stays one
+
+    def keep(self, root: Cell) -> None:
+        """Have all that look after others, at and below this cell, know it by its new address."""
+        waiting = [root]
+        while waiting:
+            cell = waiting.pop()
+            waiting.extend((cell.children or {}).values())
+            if isinstance(cell.spec, ChildSpec):
+                cell.spec = self._spec(cell.spec)
+            if cell.more is not None and cell.more.start is not None:
+                cell.more.start = self._start(cell.more.start)
+            if isinstance(cell.actor, Supervisor):
+                for one in cell.actor._listed().values():
+                    one.spec = self._spec(one.spec)
+
+    def _path(self, path: str) -> str:
+        is_meant = path == self._was or path.startswith(f"{self._was}/")
+        return self._now + path[len(self._was) :] if is_meant else path
+
+    def _spec(self, spec: ChildSpec) -> ChildSpec:
+        if id(spec) not in self._made:
+            bindings = {port: self._path(path) for port, path in spec.bindings.items()}
+            start, new = self._start(spec.start), spec
+            if bindings != spec.bindings or start is not spec.start:
+                new = dataclasses.replace(spec, bindings=bindings, start=start)
+            self._made[id(spec)] = (spec, new)
+        new_spec: ChildSpec = self._made[id(spec)][1]
+        return new_spec
+
+    def _start(self, start: Start[Any]) -> Start[Any]:
+        specs = _parts(start)[1]
+        if id(start) not in self._made:
+            below = tuple(map(self._spec, specs or ()))
+            new = start
+            if any(one is not other for one, other in zip(below, specs or (), strict=True)):
+                new = Start(start.kind, (start.args[0], below), start.kwargs)
+            self._made[id(start)] = (start, new)
+        new_start: Start[Any] = self._made[id(start)][1]
+        return new_start
+
+
 def _recipe(cell: Cell) -> tuple[Cell, Start[Any] | None]:
     """The recipe of a supervisor, and the cell in whose recipe it stands: its own, or one above it."""
     names: list[str] = []

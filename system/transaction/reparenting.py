@@ -14,7 +14,7 @@ from ...supervision.children import STOPPED, UP, Child
 from ...supervision.supervisor import Supervisor
 from .addresses import Moved
 from .draft import Draft, Place, Target, is_elsewhere
-from .lasting import keep, with_child, without
+from .lasting import Renamed, keep, with_child, without
 from .operation import Operation, wrong
 from .structure import busy, check_child, child_of, text_of
 
@@ -112,7 +112,11 @@ class Move(Operation):
         keep(ends[0], without(one.spec.id))
         if one.spec.restart != "temporary":
             keep(ends[1], with_child(one.spec))
+        was = f"{ends[0].path}/{one.spec.id}"
         move_child(old, new, one, system.moved_addresses)
+        root = system.node.root
+        assert root is not None
+        Renamed(was, f"{ends[1].path}/{one.spec.id}").keep(root)
 
 
 def check_movable(place: Place) -> None:

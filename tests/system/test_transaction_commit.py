@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from tests.system.trees import Add, Boom, Counter, Double, Life, Stumble, counter, picture, ref
+from tests.system.trees import Add, Boom, Client, Counter, Double, Life, Stumble, Where, counter, picture, ref
 
 # A transaction that fails ends with its block, which collects several steps.
 # ruff: noqa: PT012
@@ -407,6 +407,23 @@ async def test_a_binding_in_a_process_is_changed_by_the_commit_alone(
             change.register("first", one)
             change.step(Stumble())
     assert picture(system) == before
+
+
+async def test_a_binding_of_a_spec_follows_an_actor_and_not_its_old_address(system: hf.ActorSystem) -> None:
+    for name in ("user", "deep"):
+        users = [hf.child("client", hf.start(Client), bindings={"peer": "/app/left/a"})]
+        above = [hf.supervisor("inner", children=users)] if name == "deep" else users
+        await system.start(hf.supervisor(name, children=above))
+    async with system.transaction() as change:
+        change.move("/app/left", "/app/right")
+        change.move("/app/right/left/a", "/app/pool")
+    async with system.transaction() as change:
+        change.add("/app", hf.supervisor("left", children=[counter("a")]))
+        change.add("/app/right/left", counter("a"))
+    for path in ("/app/user", "/app/deep", "/app/deep/inner"):
+        await crashed(system, path)
+    for path in ("/app/user/client", "/app/deep/inner/client"):
+        assert await ref(system, path).ask(Where()) == "/app/pool/a"
 
 
 # -- the root ends ----------------------------------------------------------------------------------------------------
