@@ -22,8 +22,7 @@ from ...actors.process.resource_limits import Limits
 from ...actors.process.wire import frames
 from ...actors.process.wire.connection import BadFrame
 from ...actors.process.worker_pool import Worker, Workers
-from ..life.recorded_inbox import StopRecorded
-from ..life.recorded_life import Life
+from ..life.recorded_life import Life, LifeHost
 from ..method import Method
 from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
 from .homes import ENDED, HomeHost, Homes, seen
@@ -36,7 +35,7 @@ SENT = frozenset(("tell", "send", "ask", "forward", "publish"))
 """Outputs that are messages to somebody."""
 
 
-class TaskHost(HomeHost, lifecycle.LocalHost):
+class TaskHost(HomeHost, LifeHost):
     """The host of a recorded actor in this process."""
 
     takes_parcels = True
@@ -106,10 +105,6 @@ class TaskHost(HomeHost, lifecycle.LocalHost):
                 raise
             raise StartFailed(cell.path, error.reason if error.reason != ENDED else str(cell.extra().reason)) from error
         self.clock = None
-
-    def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self.life is not None:
-            cell.urge(StopRecorded(self.life, reason))
 
     def push(self, cell: Cell, item: Item) -> None:
         if isinstance(item, (links.Exit, links.Down)):

@@ -22,6 +22,7 @@ from ..protocol import Closed, Protected, Wanted
 
 if TYPE_CHECKING:
     from ...actors.process.worker_node import Guest
+    from .recorded_life import Life
     from .worker_lives import Port
 
 
@@ -64,6 +65,7 @@ class ChildStub:
         self._homeward: Homeward | None = None
         self._number = 0  # of the life that is wanted
         self._up: asyncio.Future[None] | None = None
+        self.life: Life | None = None  # that is lived here
 
     def joined(self, cell: Cell) -> Port:
         """The way home, on which we hear of lives from now on."""

@@ -51,7 +51,7 @@ from ..snapshot.key_variables import check_keys, restore_state, save_state, vari
 from .determinism_guard import Guard
 from .readonly_guard import check_readonly
 from .recorded_context import RecordedContext
-from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, TakeSnapshot
+from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
 
 
@@ -484,3 +484,20 @@ class Life:
             self.cell.urge(call)
         self.port.closed()
         self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.
+
+
+class LifeHost(lifecycle.LocalHost):
+    """The host of a recorded actor whose turns run in this process."""
+
+    def __init__(self, life: Life | None = None) -> None:
+        self.life = life
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        if cell.state is RUNNING and self.life is not None:
+            cell.urge(StopRecorded(self.life, reason))
+
+    def recovers(self, reason: ExitReason) -> bool:
+        return not reason.is_clean
+
+    def retired(self, cell: Cell) -> None:
+        cell.node.here.retired(cell)

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
-from ...actors.exit_reasons import ExitReason
-from ...actors.kernel import lifecycle, links
-from ...actors.kernel.cell import DOWN, RUNNING, Cell, Host
+from ...actors.kernel import links
+from ...actors.kernel.cell import DOWN, Cell, Host
 from ...actors.kernel.envelope import Item
 from ...actors.persistence import child_key
 from ...actors.process.wire import frames
@@ -28,8 +27,7 @@ from ..protocol import (
     ToLife,
 )
 from .child_stub import ChildStub
-from .recorded_inbox import StopRecorded
-from .recorded_life import Life
+from .recorded_life import Life, LifeHost
 
 if TYPE_CHECKING:
     from ...actors.process.worker_node import Guest
@@ -73,7 +71,7 @@ class RecordedGuest:
         """
         port = self.port_of(cell.path)
         life = Life(cell, port, Method.of(options["method"]), self._guest.page, may_fork=True)
-        cell.host = OwnHost(self._guest, life)
+        cell.host = LifeHost(life)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
         life.begins_suspended = bool(options.get("suspended"))
@@ -200,37 +198,8 @@ class Port:
             self.on_closed()
 
 
-class LifeHost(lifecycle.LocalHost):
-    """The host of a recorded life in this process."""
-
-    _life: Life | None
-
-    def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self._life is not None:
-            cell.urge(StopRecorded(self._life, reason))
-
-    def recovers(self, reason: ExitReason) -> bool:
-        return not reason.is_clean
-
-
-class OwnHost(LifeHost):
-    """The host of the process's own actor."""
-
-    def __init__(self, guest: Guest, life: Life) -> None:
-        self._guest, self._life = guest, life
-
-    def retired(self, cell: Cell) -> None:
-        if cell.queue:
-            cell.queue.clear()
-        self._guest.report_end(cell, cell.extra().reason)
-
-
 class InnerLifeHost(ChildStub, LifeHost):
     """The host of a recorded child of a supervisor in this process, whose lives are lived here."""
-
-    def __init__(self, guest: Guest, method: Method, port_of: Callable[[str], Port]) -> None:
-        super().__init__(guest, method, port_of)
-        self._life = None
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the home to bring the actor back."""
@@ -244,19 +213,19 @@ class InnerLifeHost(ChildStub, LifeHost):
         return port
 
     def progress(self, cell: Cell) -> object:
-        life = self._life
+        life = self.life
         if life is None or (life.feed is None and not cell.queue):
             return object()  # It waits for its home.
         return life.turn
 
     def take_up(self, cell: Cell, life: Life, number: int) -> None:
         """A life that has come back here is that of the address, as if it had been wanted as `number`."""
-        self._life, self._number, self._port = life, number, self.joined(cell)
+        self.life, self._number, self._port = life, number, self.joined(cell)
         cell.host, cell.admit = self, self.way_home
 
     def let_go(self) -> Life:
         """The life that is lived here, which is at rest, is not the address's any more; its home hears no more."""
-        life, self._life = self._life, None
+        life, self.life = self.life, None
         assert life is not None
         assert self._port is not None
         self._port.life = self._port.on_closed = None
@@ -277,13 +246,13 @@ class InnerLifeHost(ChildStub, LifeHost):
         assert port is not None
         cell.life = record.life - 1
         page = self._guest.page[record.slot : record.slot + 1]
-        self._life = life = Life(cell, port, self._method, page, may_fork=True)
+        self.life = life = Life(cell, port, self._method, page, may_fork=True)
         port.on_closed = None  # A start that fails is told of here, with its reason.
         try:
             port.begin(life, record.turn, record.stash)
             port.on_closed = lambda: self._closed(cell)
         except StartFailed as error:
-            port.life = self._life = None
+            port.life = self.life = None
             self.fail(error)
             self.say_closed(cell, cell.extra().reason)
 
@@ -303,7 +272,7 @@ class InnerLifeHost(ChildStub, LifeHost):
             self._up.set_result(None)
 
     def _closed(self, cell: Cell) -> None:
-        life, self._life = self._life, None
+        life, self.life = self.life, None
         self.say_closed(cell, cell.extra().reason)
         if life is not None and life.ignored_why is not None:
             self.fail(StartIgnored(cell.path, life.ignored_why))

@@ -48,6 +48,13 @@ class Peer:
 
     # -- out --------------------------------------------------------------------------------------------------------
 
+    def require_granted(self, path: str, order: str) -> None:
+        """See whether an actor of this process may give an order to one that is outside of it; the root's may.
+
+        Raises:
+            NotGranted: it may not.
+        """
+
     def send_item(self, cell: Cell, path: str, item: Any, number: int) -> None:
         """Send what `cell.admit` was given to the actor at `path` on the other side.
 
@@ -368,9 +375,11 @@ class OutsideHost:
         raise HoldfastError(f"{cell.path} is in another process")
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.peer.require_granted(cell.path, "stop")
         self.told(cell, "stop", {"reason": pack_exit(reason)})
 
     def kill(self, cell: Cell) -> None:
+        self.peer.require_granted(cell.path, "kill")
         self.told(cell, "kill", {})
 
     def retired(self, cell: Cell) -> None:
