@@ -10,7 +10,7 @@ import asyncio
 import contextvars
 import signal
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 from .. import exit_reasons
@@ -101,6 +101,16 @@ class LocalHost:
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         pass
+
+
+def outside_turn(
+    cell: Cell, work: Coroutine[Any, Any, None], what: str = "start", context: contextvars.Context | None = None
+) -> asyncio.Task[None]:
+    """Run a start or an end of a life that takes long; whoever has asked for it need not wait for its outcome."""
+    task = cell.node.loop.create_task(work, name=f"{what} of {cell.path}", context=context)
+    # If the system stops meanwhile, perhaps nobody looks, and asyncio need not complain of that.
+    task.add_done_callback(lambda done: None if done.cancelled() else done.exception())
+    return task
 
 
 def is_up(cell: Cell) -> bool:

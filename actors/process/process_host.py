@@ -260,8 +260,7 @@ class ProcessHost(Elsewhere):
     def begin(self, cell: Cell, start: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
         """Run the start of a life outside the supervisor's turn."""
         self._stop_wanted = self.stop_sent = None
-        self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
-        self._starting.add_done_callback(_seen)
+        self._starting = lifecycle.outside_turn(cell, start)
         return self._starting
 
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
@@ -424,12 +423,6 @@ class ProcessHost(Elsewhere):
         worker = self._workers.of(cell)
         if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
             worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
-
-
-def _seen(start: asyncio.Task[None]) -> None:
-    """If nobody waits for a start any more, asyncio need not complain of its failure."""
-    if not start.cancelled():
-        start.exception()
 
 
 def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:

@@ -25,7 +25,7 @@ from ...actors.process.worker_pool import Worker, Workers
 from ..life.recorded_life import Life, LifeHost
 from ..method import Method
 from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
-from .homes import ENDED, HomeHost, Homes, seen
+from .homes import ENDED, HomeHost, Homes
 from .switch import Switch
 
 FROM_LIFE: msgspec.msgpack.Decoder[ToHome] = msgspec.msgpack.Decoder(ToHome)
@@ -43,7 +43,6 @@ class TaskHost(HomeHost, LifeHost):
     def __init__(self, homes: Homes, method: Method) -> None:
         super().__init__(homes, method)
         self.life: Life | None = None
-        self._starting: asyncio.Task[None] | None = None
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
@@ -57,9 +56,8 @@ class TaskHost(HomeHost, LifeHost):
             self._begin(cell, switch)
             self._replay(cell, switch)
             begun = self._follow(cell, live, recovering)
-        task = self._starting = cell.node.loop.create_task(begun, name=f"start of {cell.path}")
-        task.add_done_callback(seen)
-        return task
+        self._starting = lifecycle.outside_turn(cell, begun)
+        return self._starting
 
     def _begin(self, cell: Cell, switch: Switch) -> None:
         """S3, the new life with its state."""
@@ -75,10 +73,8 @@ class TaskHost(HomeHost, LifeHost):
 
     def _replay(self, cell: Cell, switch: Switch) -> None:
         """S3, what it has handled since."""
-        start = cell.extra().start
-        assert start is not None
         assert self.life is not None
-        self.subscribe(cell, start.kind._topics)
+        self.subscribe(cell)
         switch.attach(LocalLife(self.life))
 
     async def _step_by_step(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
@@ -109,9 +105,9 @@ class TaskHost(HomeHost, LifeHost):
     def push(self, cell: Cell, item: Item) -> None:
         if isinstance(item, (links.Exit, links.Down)):
             assert self.switch is not None
-            self.switch.push(item)
-        else:
             super().push(cell, item)
+        else:
+            LifeHost.push(self, cell, item)
 
     def kill(self, cell: Cell) -> None:
         if cell.state is DOWN and self._starting is not None:
@@ -122,12 +118,6 @@ class TaskHost(HomeHost, LifeHost):
     def running(self, cell: Cell) -> int:
         feed = self.life.feed if self.life is not None else None
         return -1 if feed is None else feed.id
-
-    def retired(self, cell: Cell) -> None:
-        if self._starting is not None and not self._starting.done():
-            self._starting.cancel()
-        start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=lifecycle.parent_ended(cell))
 
 
 class LocalHome:
@@ -182,14 +172,12 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         return self.begin(cell, self._recover(cell, *self.enter(cell)))
 
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        start = cell.extra().start
-        assert start is not None
         clock = self.clock
         assert clock is not None
         await self.gate("restart")
         worker, recipe = await self.take(cell)
         worker.record_taker = functools.partial(own_records, worker, switch)
-        self.subscribe(cell, start.kind._topics)
+        self.subscribe(cell)
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
@@ -229,18 +217,13 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         self.over(cell, running, str(reason), ordered=reason == KILLED, noticed=noticed, reason=reason)
         lifecycle.ended(cell, reason)
 
-    def push(self, cell: Cell, item: Item) -> None:
-        if self.switch is not None:
-            self.switch.push(item)
-
     def running(self, cell: Cell) -> int:
         worker = self._workers.of(cell)
         return -1 if worker is None else int(worker.page[0]) - 1
 
     def retired(self, cell: Cell) -> None:
         ProcessHost.retired(self, cell)
-        start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=lifecycle.parent_ended(cell))
+        self.give_up(cell)
 
 
 def own_records(worker: Worker, switch: Switch, path: str) -> frames.TakeRecord:
