@@ -17,7 +17,7 @@ from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Journal, Saved
 from ..method import Durability, Method, hybrid
-from ..protocol import START
+from ..protocol import START, LifePort
 from ..recovery.recoveries import Recoveries, Recovery
 from ..recovery_file import RecoveryFile
 from ..snapshot.rollback import older_snapshot, roll_back
@@ -505,6 +505,20 @@ class HomeHost:
         let_go(self.switch)
         why = "its supervisor has ended" if restarting else "it is not started again"
         self.homes.recoveries.given_up(cell.path, why)
+
+    async def replay(self, cell: Cell, port: LifePort, live: asyncio.Future[float], recovering: bool) -> None:
+        """The rest of S3, what a life that has begun has handled since; then S4.
+
+        Raises:
+            StartFailed: it did not come so far.
+        """
+        assert self.clock is not None
+        assert self.switch is not None
+        self.clock.mark("restart")
+        await self.gate("replay")
+        if not live.done():  # Else it has ended meanwhile.
+            self.switch.attach(port)
+        await self.until_live(cell, live, recovering)
 
     async def until_live(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
         """Wait until a life has caught up, and tell of it.

@@ -66,7 +66,7 @@ class TaskHost(HomeHost, LifeHost):
         self.page = self.homes.page(switch)
         life = self.life = Life(cell, LocalHome(self, cell), self.method, self.page)
         for record in switch.restore_records():
-            life.from_home(record)
+            life.to_life(record)
         life.begin(start, switch.state_turn, switch.stash)
         assert self.clock is not None
         self.clock.mark("restart")
@@ -75,7 +75,7 @@ class TaskHost(HomeHost, LifeHost):
         """S3, what it has handled since."""
         assert self.life is not None
         self.subscribe(cell)
-        switch.attach(LocalLife(self.life))
+        switch.attach(self.life)
 
     async def _step_by_step(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
         """A recovery on whose way others have something to do."""
@@ -145,18 +145,6 @@ class LocalHome:
         self._is_open = False
 
 
-class LocalLife:
-    """From a home to its life, in one process."""
-
-    begins = True
-
-    def __init__(self, life: Life) -> None:
-        self._life = life
-
-    def to_life(self, record: ToLife) -> None:
-        self._life.from_home(record)
-
-
 class RecordedProcessHost(HomeHost, ProcessHost):
     """The host of a recorded actor with a process of its own."""
 
@@ -172,8 +160,6 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         return self.begin(cell, self._recover(cell, *self.enter(cell)))
 
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        clock = self.clock
-        assert clock is not None
         await self.gate("restart")
         worker, recipe = await self.take(cell)
         worker.record_taker = functools.partial(own_records, worker, switch)
@@ -184,11 +170,7 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         options = {"recorded": {"method": self.method.data(), "turn": switch.state_turn, "stash": switch.stash}}
         try:
             await worker.launch(cell, recipe, options)
-            clock.mark("restart")
-            await self.gate("replay")
-            if not live.done():  # Else it has ended meanwhile.
-                switch.attach(port)
-            await self.until_live(cell, live, recovering)
+            await self.replay(cell, port, live, recovering)
         except StartFailed:
             await worker.gone()  # The next life begins when this one is over.
             raise

@@ -20,7 +20,7 @@ from ...actors.migration.worker import FromOwnWorker, ToWorker
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
 from ..protocol import LifePort, Live, ToHome
-from .recorded_hosts import LocalHome, LocalLife, RecordedProcessHost, RemoteLife, TaskHost, records_of
+from .recorded_hosts import LocalHome, RecordedProcessHost, RemoteLife, TaskHost, records_of
 from .switch import Switch
 
 if TYPE_CHECKING:
@@ -283,10 +283,10 @@ class RecordedArrival(Arrival):
         life = self._life = Life(self.other, home, host.method, host.page)
         life.begins_suspended = suspended
         for record in switch.restore_records():
-            life.from_home(record)
+            life.to_life(record)
         self.other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
         life.begin(start, switch.state_turn, switch.stash)
-        switch.attach(LocalLife(life))
+        switch.attach(life)
         live.add_done_callback(lambda done: None if done.cancelled() else home.fail(done.exception()))
         return up
 

@@ -74,6 +74,8 @@ class HomePort(Protocol):
 class Life:
     """One recorded life: the turn in hand, its outputs, and when the next snapshot is due."""
 
+    begins = True  # what is handed to it, whenever it has come to that
+
     def __init__(
         self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False
     ) -> None:
@@ -166,7 +168,7 @@ class Life:
 
     # -- records from home ------------------------------------------------------------------------------------------
 
-    def from_home(self, record: ToLife) -> None:
+    def to_life(self, record: ToLife) -> None:
         """Take what the home says, in order."""
         match record:
             case Feed():

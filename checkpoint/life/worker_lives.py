@@ -169,7 +169,7 @@ class Port:
                     self.on_group(record)
             case _:
                 if self.life is not None:
-                    self.life.from_home(record)
+                    self.life.to_life(record)
 
     def begin(self, life: Life, turn: int, stash: list[int]) -> None:
         """Begin a life with the state that has come.
@@ -181,7 +181,7 @@ class Port:
         assert start is not None
         state, self._state = self._state, []
         for record in state:
-            life.from_home(record)
+            life.to_life(record)
         self.life = life
         life.begin(start, turn, stash)
 

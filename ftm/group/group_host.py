@@ -17,7 +17,7 @@ from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
-from ...checkpoint.home.homes import Homes
+from ...checkpoint.home.homes import HomeHost, Homes
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import Restore
 from ...supervision.backoff import Backoff
@@ -45,10 +45,11 @@ from .reconfiguration import (
     Reconfiguration,
     names_for,
 )
-from .steering import Steered
+from .steering import bind, bind_again, give_order
 from .transient_homes import UNKEPT, begin_afresh, begin_again, forget_later, is_unkept
 
 if TYPE_CHECKING:
+    from ...actors.control.orders_lane import Call
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import TurnEnd
     from ...checkpoint.snapshot.snapshot_record import Meta
@@ -69,7 +70,7 @@ BRICKS_INTENSITY = 100
 BRICKS_PERIOD = 5.0
 
 
-class GroupHost(Steered):
+class GroupHost(HomeHost):
     """Lives that are lived by replicas, each in a process of its own."""
 
     def __init__(self, homes: Homes, method: Method | None, mechanism: Any) -> None:
@@ -115,8 +116,6 @@ class GroupHost(Steered):
         return opened
 
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        clock = self.clock
-        assert clock is not None
         await self.gate("restart")
         if not self.is_gated:
             self.isolated()
@@ -128,11 +127,7 @@ class GroupHost(Steered):
             group = await self.build(cell, switch)
             self.subscribe(cell)
             await self.lead(group, switch)
-            clock.mark("restart")
-            await self.gate("replay")
-            if not live.done():  # Else it has ended meanwhile.
-                switch.attach(group)
-            await self.until_live(cell, live, recovering)
+            await self.replay(cell, group, live, recovering)
             await self.protected(group)
         except BaseException as error:
             if isinstance(error, asyncio.CancelledError):
@@ -195,7 +190,7 @@ class GroupHost(Steered):
         group.went_back = lambda back: self._went_back(cell, group, back)
         if self.probation is not None:
             self.probation.moved(group)
-        group.on_joining = lambda name: self._bind_all(cell, group, name)
+        group.on_joining = lambda name: bind_again(cell, group, name)
 
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
         parts = (
@@ -591,6 +586,15 @@ class GroupHost(Steered):
         self.give_up(cell)
 
     # -- what else a host does --------------------------------------------------------------------------------------
+
+    def control(self, cell: Cell, call: Call) -> None:
+        give_order(self.group if self.is_up(cell) else None, cell, call)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """Links and monitors are the home's; a binding is that of the actor in each replica."""
+        if verb == "bind" and self.group is not None:
+            for name in self.group.names:
+                bind(self.group, name, data)
 
     def is_up(self, cell: Cell) -> bool:
         return super().is_up(cell) and self.group is not None and not self.group.is_over
