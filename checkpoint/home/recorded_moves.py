@@ -14,9 +14,10 @@ from ...actors.errors import CannotMove, HoldfastError, StartFailed
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.cell import Cell
 from ...actors.migration.here import Arrival, FromHere
-from ...actors.migration.move import Entering, Move
+from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import Settle, Transit, now, part, settle_with_queue, sorted_out
-from ...actors.migration.worker import FromOwnWorker, ToWorker
+from ...actors.migration.worker import FromOwnWorker, FromWorker, ToWorker
+from ...actors.process.process_host import ProcessHost
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
 from ..protocol import LifePort, Live, ToHome
@@ -28,6 +29,27 @@ if TYPE_CHECKING:
     from ...actors.kernel.envelope import Item
     from ...actors.process.resource_limits import Limits
     from ...actors.process.worker_pool import Workers
+
+
+def leaving(cell: Cell, ignored: tuple[str, ...] = ()) -> Leaving:
+    """The side of a move that is where the actor lives now, in this process or in one of its own.
+
+    Args:
+        cell: its address.
+        ignored: children that are not the actor's own.
+
+    Raises:
+        CannotMove: its process has ended.
+    """
+    host = cell.host
+    if isinstance(host, TaskHost):
+        return FromRecordedHere(host, ignored)
+    if not isinstance(host, ProcessHost):
+        return FromHere(ignored)
+    worker = host.worker_of(cell)
+    if worker is None:
+        raise CannotMove(cell.path, "its process has ended")
+    return FromRecordedWorker(worker) if isinstance(host, RecordedProcessHost) else FromWorker(worker)
 
 
 class Detached:

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import CannotMove
 from ...actors.kernel.lifecycle import LOCAL
-from ...actors.migration.here import FromHere
 from ...actors.migration.move import Move
 from ...actors.process.wire.peer import OutsideHost
 from ...checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
-from ...checkpoint.home.recorded_moves import FromRecordedHere, FromRecordedWorker
+from ...checkpoint.home.recorded_moves import leaving
 from ...checkpoint.home.subtree_homes import SubtreeHome
 from ..group.group_host import GroupHost
 from ..group.transient_homes import UNKEPT, is_unkept
@@ -44,17 +43,11 @@ def into_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> Move
         CannotMove: it lives somewhere else.
     """
     old = cell.host
-    if isinstance(old, TaskHost):
-        group = GroupHost(homes, old.method, mechanism)
-        return Move(cell, FromRecordedHere(old, PART), ToGroup(group, old.switch), timeout)
-    if isinstance(old, RecordedProcessHost):
-        worker = old.worker_of(cell)
-        if worker is None:
-            raise CannotMove(cell.path, "its process has ended")
-        group = GroupHost(homes, old.method, mechanism)
-        return Move(cell, FromRecordedWorker(worker), ToGroup(group, old.switch), timeout)
     if old is LOCAL:
-        return Move(cell, FromHere(PART), ToGroup(GroupHost(homes, None, mechanism), None), timeout)
+        return Move(cell, leaving(cell, PART), ToGroup(GroupHost(homes, None, mechanism), None), timeout)
+    if isinstance(old, (TaskHost, RecordedProcessHost)):
+        group = GroupHost(homes, old.method, mechanism)
+        return Move(cell, leaving(cell, PART), ToGroup(group, old.switch), timeout)
     if isinstance(old, SubtreeHome):
         spec = spec_of(cell)
         below = group_for(old, spec, old.method, mechanism)
