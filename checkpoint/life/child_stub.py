@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from ...actors import exit_reasons
 from ...actors.errors import StartFailed
@@ -18,9 +18,10 @@ from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.mailbox import Bounded, Senders
 from ...actors.kernel.message import message_name
 from ..method import Method
-from ..protocol import Closed, Protected, Wanted
+from ..protocol import Begin, Closed, Over, Protected, Respec, Started, Wanted
 
 if TYPE_CHECKING:
+    from ...actors.kernel.cell import Host
     from ...actors.process.worker_node import Guest
     from .recorded_life import Life
     from .worker_lives import Port
@@ -67,9 +68,31 @@ class ChildStub:
         self._up: asyncio.Future[None] | None = None
         self.life: Life | None = None  # that is lived here
 
-    def joined(self, cell: Cell) -> Port:
+    def join(self, cell: Cell) -> Port:
         """The way home, on which we hear of lives from now on."""
+        self.cell = cell
+        port = self._port = self._port_of(cell.path)
+        port.stub = self
+        return port
+
+    def take_up(self, cell: Cell, number: int) -> None:
+        """A life that was begun elsewhere goes on as that of the address, as if it had been wanted as `number`."""
+        self._number = number
+        self.join(cell)
+        cell.host, cell.admit = cast("Host", self), self.way_home
+
+    def begin_here(self, record: Begin) -> None:
+        """Begin the life that is wanted, if it is to be lived here."""
+
+    def started(self, record: Started) -> None:
+        """The home tells how the start of a life went."""
         raise NotImplementedError
+
+    def closed_here(self) -> None:
+        """A life that was lived here is over, or its start has failed."""
+
+    def told_by_group(self, record: Over | Respec) -> None:
+        """Take what a group at the root says, if that lives it."""
 
     def ask_for_life(self, cell: Cell, method: Method, made: Protected | None = None) -> asyncio.Future[None]:
         """Ask the home for a life; the future ends when it is up. `made`: what a group at the root needs.
@@ -91,7 +114,7 @@ class ChildStub:
                 more.outlet = self._homeward = Homeward(node.loop, self.bound.capacity)
         self._number += 1
         self._up = node.loop.create_future()
-        port = self._port = self.joined(cell)
+        port = self.join(cell)
         kind, topics = message_name(start.kind), list(start.kind._topics)
         bindings = {name: target.path for name, target in more.bindings.items()}
         port.to_home(Wanted(self._number, kind, topics, method, self.bound, made, bindings))

@@ -198,7 +198,7 @@ class PlainChild:
         host = cell.host
         assert isinstance(host, InnerGroupHost)
         has_ended = arrival.other.state is not RUNNING  # by its background work
-        guest.recovery.port_of(self._path).on_group = None
+        guest.recovery.port_of(self._path).stub = None
         cell.host = guest.node.here
         bound = None if host.bound is None else Bound(host.bound.capacity, host.bound.overflow)
         queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])
