@@ -17,9 +17,7 @@ from .group_moves import FromGroup, FromRecordedGroup, ToGroup
 from .subtree_groups import SubtreeGroup
 from .subtree_moves import (
     FromRecordedSubtree,
-    FromRecordedSubtreeGroup,
     FromSubtree,
-    FromSubtreeGroup,
     ToRecordedSubtree,
     ToSubtree,
     group_for,
@@ -66,11 +64,10 @@ def out_of_group(cell: Cell, entering: Entering, timeout: float) -> Move:
         CannotMove: it is being recovered.
     """
     old = cell.host
-    if not isinstance(old, SubtreeGroup):
-        return Move(cell, FromGroup(cell) if is_plain(cell) else FromRecordedGroup(cell), entering, timeout)
-    if is_plain(cell):
-        return Move(cell, FromSubtreeGroup(cell), ToSubtree(cell, old), timeout)
-    return Move(cell, FromRecordedSubtreeGroup(cell), ToRecordedSubtree(cell, old), timeout)
+    from_group, to_subtree = (FromGroup, ToSubtree) if is_plain(cell) else (FromRecordedGroup, ToRecordedSubtree)
+    if isinstance(old, SubtreeGroup):
+        return Move(cell, from_group(cell, is_below=True), to_subtree(cell, old), timeout)
+    return Move(cell, from_group(cell, is_below=False), entering, timeout)
 
 
 def is_plain(cell: Cell) -> bool:
