@@ -10,7 +10,7 @@ import asyncio
 import contextvars
 import signal
 from collections import deque
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 from .. import exit_reasons
@@ -19,7 +19,7 @@ from ..events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
 from ..exit_reasons import KILLED, NORMAL, SHUTDOWN, Crash, ExitReason
 from . import links, mailbox
 from .actor import Actor
-from .cell import DOWN, ENDING, GONE, RUNNING, Cell
+from .cell import DOWN, ENDING, GONE, RUNNING, Cell, Host
 from .context import ActorContext
 from .envelope import LEAVE, Ask, Item
 from .message import Refusal
@@ -36,19 +36,10 @@ KILLED_WITHIN = 5.0
 """Seconds until a killed child is given up that has not ended; a process that was sent SIGKILL takes less."""
 
 
-class LocalHost:
+class LocalHost(Host):
     """Lives as turns in this very process."""
 
     takes_parcels = False
-
-    def progress(self, cell: Cell) -> object:
-        return None
-
-    def recovers(self, reason: ExitReason) -> bool:
-        return False
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        return True
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
@@ -78,10 +69,6 @@ class LocalHost:
     def push(self, cell: Cell, item: Item) -> None:
         mailbox.queue_of(cell).append(item)
         cell.schedule()
-
-    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
-        cell.admit(cell, item)
-        return None
 
     def control(self, cell: Cell, call: Call) -> None:
         if call.is_urgent:

@@ -11,7 +11,7 @@ from ...actors.errors import ControlFailed, HoldfastError, StartFailed, StartIgn
 from ...actors.events import ActorStarted, Recovered, RecoveryFailed
 from ...actors.exit_reasons import ExitReason
 from ...actors.kernel import lifecycle, links
-from ...actors.kernel.cell import DOWN, GONE, Cell
+from ...actors.kernel.cell import DOWN, GONE, Cell, Host
 from ...actors.persistence import child_key
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
@@ -331,7 +331,7 @@ class Clock:
         return spans
 
 
-class HomeHost:
+class HomeHost(Host):
     """What all hosts of recorded actors have in common: the home, and the clock of the recovery at hand."""
 
     takes_parcels = True

@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from ...actors import exit_reasons
 from ...actors.errors import StartFailed
 from ...actors.exit_reasons import ExitReason, pack_exit
-from ...actors.kernel.cell import DOWN, Cell
-from ...actors.kernel.envelope import Ask, Envelope, Item
+from ...actors.kernel.cell import DOWN, Cell, Host
+from ...actors.kernel.envelope import Envelope, Item
 from ...actors.kernel.mailbox import Bounded, Senders
 from ...actors.kernel.message import message_name
 from ..method import Method
 from ..protocol import Begin, Closed, Over, Protected, Respec, Started, Wanted
 
 if TYPE_CHECKING:
-    from ...actors.kernel.cell import Host
     from ...actors.process.worker_node import Guest
     from .recorded_life import Life
     from .worker_lives import Port
@@ -54,7 +53,7 @@ class Homeward:
         return None if self.has_room else self._senders.wait(self._loop)
 
 
-class ChildStub:
+class ChildStub(Host):
     """The host of such a child, as far as it is the same wherever its lives are lived."""
 
     takes_parcels = True
@@ -79,7 +78,7 @@ class ChildStub:
         """A life that was begun elsewhere goes on as that of the address, as if it had been wanted as `number`."""
         self._number = number
         self.join(cell)
-        cell.host, cell.admit = cast("Host", self), self.way_home
+        cell.host, cell.admit = self, self.way_home
 
     def begin_here(self, record: Begin) -> None:
         """Begin the life that is wanted, if it is to be lived here."""
@@ -156,10 +155,6 @@ class ChildStub:
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        """Whether the turn of an ask may have begun: only its home knows."""
-        return True
 
     def way_home(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: the home numbers and journals, and feeds whoever lives there."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ...errors import AskDeadlock, BadMessage, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
+from ...kernel.cell import Cell, Host
 from ...kernel.codec import Codec, Parcel, Raw
 from ...kernel.envelope import Ask, Envelope, Item
 from ...kernel.message import Message, message_name
@@ -21,7 +22,6 @@ from .pending_sends import Offered
 
 if TYPE_CHECKING:
     from ...control.orders_lane import Call
-    from ...kernel.cell import Cell
     from ...kernel.node import Node
 
 Coroutine_ = types.CoroutineType
@@ -363,7 +363,7 @@ class RelayedAsk(Ask, eq=False):
             self.page = [0, 0]  # The real one counts in the order of arrival: a late number would undo later ones.
 
 
-class OutsideHost:
+class OutsideHost(Host):
     """The host of stand-ins for actors in other processes: everything goes over the connection."""
 
     takes_parcels = True
@@ -384,15 +384,6 @@ class OutsideHost:
 
     def retired(self, cell: Cell) -> None:
         pass
-
-    def progress(self, cell: Cell) -> object:
-        return None
-
-    def recovers(self, reason: ExitReason) -> bool:
-        return False
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        return True
 
     def push(self, cell: Cell, item: Item) -> None:
         send_signal(self.peer, cell.path, item)
