@@ -16,14 +16,14 @@ from ..actors.kernel.cell import Cell, Host
 from ..actors.kernel.lifecycle import LOCAL
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
-from ..actors.migration.here import FromHere, ToHere
-from ..actors.migration.move import Entering, Gate, Leaving, Move
-from ..actors.migration.worker import FromWorker, ToWorker
+from ..actors.migration.here import ToHere
+from ..actors.migration.move import Entering, Gate, Move
+from ..actors.migration.worker import ToWorker
 from ..actors.process.process_host import ProcessHost
 from ..actors.process.resource_limits import Limits
 from ..actors.process.worker_pool import Workers
 from ..checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
-from ..checkpoint.home.recorded_moves import FromRecordedHere, FromRecordedWorker, ToRecordedHere, ToRecordedWorker
+from ..checkpoint.home.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
 from ..supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
@@ -266,23 +266,6 @@ class Moves:
         if isinstance(host, ProcessHost):
             return ToWorker(host, self._workers, limits)
         return ToRecordedHere(host) if isinstance(host, TaskHost) else ToHere(host)
-
-
-def leaving(cell: Cell) -> Leaving:
-    """The side of a move that is where the actor lives now, in this process or in one of its own.
-
-    Raises:
-        CannotMove: that has ended.
-    """
-    host = cell.host
-    if isinstance(host, TaskHost):
-        return FromRecordedHere(host)
-    if not isinstance(host, ProcessHost):
-        return FromHere()
-    worker = host.worker_of(cell)
-    if worker is None:
-        raise CannotMove(cell.path, "its process has ended")
-    return FromRecordedWorker(worker) if isinstance(host, RecordedProcessHost) else FromWorker(worker)
 
 
 def check_isolation(isolation: object, limits: object, timeout: object) -> None:

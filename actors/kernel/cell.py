@@ -37,12 +37,13 @@ ANY = AnyTable()
 
 
 class Host(Protocol):
-    """Where and how the lives at an address are lived: in this process, in another one, recorded or not."""
+    """Where and how the lives at an address are lived: in this process, in another one, recorded or not.
 
-    @property
-    def takes_parcels(self) -> bool:
-        """Whether messages that came encoded are passed on as they are."""
-        ...
+    What most hosts do stands here; a host that says so inherits it.
+    """
+
+    takes_parcels: bool
+    """Whether messages that came encoded are passed on as they are."""
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
@@ -67,15 +68,16 @@ class Host(Protocol):
     def progress(self, cell: Cell) -> object:
         """How far the start that is under way has come: it is another value when it has come further, and while it
         waits for somebody else. None: it has no steps."""
-        ...
+        return None
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether a life that ended for this reason is brought back with its state."""
-        ...
+        return False
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it is accepted. None: it is."""
-        ...
+        cell.admit(cell, item)
+        return None
 
     def control(self, cell: Cell, call: Call) -> None:
         """Have an order carried out between two turns of the actor, ahead of all messages."""
@@ -87,7 +89,7 @@ class Host(Protocol):
 
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
-        ...
+        return True
 
     def backlog(self, cell: Cell) -> int:
         """Messages that wait, as far as is known in this process."""

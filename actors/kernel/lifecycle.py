@@ -10,7 +10,7 @@ import asyncio
 import contextvars
 import signal
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 from .. import exit_reasons
@@ -19,7 +19,7 @@ from ..events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
 from ..exit_reasons import KILLED, NORMAL, SHUTDOWN, Crash, ExitReason
 from . import links, mailbox
 from .actor import Actor
-from .cell import DOWN, ENDING, GONE, RUNNING, Cell
+from .cell import DOWN, ENDING, GONE, RUNNING, Cell, Host
 from .context import ActorContext
 from .envelope import LEAVE, Ask, Item
 from .message import Refusal
@@ -36,19 +36,10 @@ KILLED_WITHIN = 5.0
 """Seconds until a killed child is given up that has not ended; a process that was sent SIGKILL takes less."""
 
 
-class LocalHost:
+class LocalHost(Host):
     """Lives as turns in this very process."""
 
     takes_parcels = False
-
-    def progress(self, cell: Cell) -> object:
-        return None
-
-    def recovers(self, reason: ExitReason) -> bool:
-        return False
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        return True
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
@@ -79,10 +70,6 @@ class LocalHost:
         mailbox.queue_of(cell).append(item)
         cell.schedule()
 
-    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
-        cell.admit(cell, item)
-        return None
-
     def control(self, cell: Cell, call: Call) -> None:
         if call.is_urgent:
             urge(cell, call)
@@ -101,6 +88,16 @@ class LocalHost:
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         pass
+
+
+def outside_turn(
+    cell: Cell, work: Coroutine[Any, Any, None], what: str = "start", context: contextvars.Context | None = None
+) -> asyncio.Task[None]:
+    """Run a start or an end of a life that takes long; whoever has asked for it need not wait for its outcome."""
+    task = cell.node.loop.create_task(work, name=f"{what} of {cell.path}", context=context)
+    # If the system stops meanwhile, perhaps nobody looks, and asyncio need not complain of that.
+    task.add_done_callback(lambda done: None if done.cancelled() else done.exception())
+    return task
 
 
 def is_up(cell: Cell) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ..control.orders_lane import Call
@@ -128,7 +128,7 @@ class Settle(Item):
         return LEAVE
 
 
-class Transit:
+class Transit(Host):
     """Stands for the host of an actor that is at rest: what is asked for is done when it is known where it lives."""
 
     def __init__(self, old: Host, give_up: Callable[[str], None]) -> None:
@@ -153,18 +153,8 @@ class Transit:
     def push(self, cell: Cell, item: Item) -> None:
         self.waiting.append(lambda host: host.push(cell, item))
 
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        return True
-
-    def progress(self, cell: Cell) -> object:
-        return None
-
     def recovers(self, reason: ExitReason) -> bool:
         return self.old.recovers(reason)
-
-    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
-        cell.admit(cell, item)
-        return None
 
     def control(self, cell: Cell, call: Call) -> None:
         self.waiting.append(lambda host: host.control(cell, call))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Awaitable, Coroutine
+from collections.abc import Coroutine
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
 from ..events import ActorStarted, StoreRefused
 from ..exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ..kernel import lifecycle, links, mailbox
-from ..kernel.cell import DOWN, GONE, RUNNING, Cell
+from ..kernel.cell import DOWN, GONE, RUNNING, Cell, Host
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item
 from ..overflow import DROPS
@@ -207,7 +207,7 @@ def _check_codable(cell: Cell, item: Any) -> None:
         cell.node.codec.encode(message, cell.path)
 
 
-class Elsewhere:
+class Elsewhere(Host):
     """What hosts have in common whose lives are lived in another process: what one does is known there."""
 
     def worker_of(self, cell: Cell) -> Worker | None:
@@ -219,12 +219,6 @@ class ProcessHost(Elsewhere):
     """The host of actors with a process of their own; one per such address."""
 
     takes_parcels = True
-
-    def progress(self, cell: Cell) -> object:
-        return None
-
-    def recovers(self, reason: Any) -> bool:
-        return False
 
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         """The process puts a turn's number on its page first, and only then looks whether its deadline is over."""
@@ -260,8 +254,7 @@ class ProcessHost(Elsewhere):
     def begin(self, cell: Cell, start: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
         """Run the start of a life outside the supervisor's turn."""
         self._stop_wanted = self.stop_sent = None
-        self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
-        self._starting.add_done_callback(_seen)
+        self._starting = lifecycle.outside_turn(cell, start)
         return self._starting
 
     async def take(self, cell: Cell) -> tuple[Worker, bytes]:
@@ -385,10 +378,6 @@ class ProcessHost(Elsewhere):
         else:
             send_signal(outlet.worker, cell.path, item)
 
-    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
-        cell.admit(cell, item)
-        return None
-
     def control(self, cell: Cell, call: Call) -> None:
         from ..control.orders_lane import send_call
 
@@ -424,12 +413,6 @@ class ProcessHost(Elsewhere):
         worker = self._workers.of(cell)
         if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
             worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
-
-
-def _seen(start: asyncio.Task[None]) -> None:
-    """If nobody waits for a start any more, asyncio need not complain of its failure."""
-    if not start.cancelled():
-        start.exception()
 
 
 def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:

@@ -65,26 +65,13 @@ async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prep
 
 
 class GuestHost(lifecycle.LocalHost):
-    """The host of the process's own actor: its address is kept at the root, so its end is only reported."""
+    """The host of the actors of the process: the root knows their addresses, so that they can be reached."""
 
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
 
     def retired(self, cell: Cell) -> None:
-        if cell.queue:
-            cell.queue.clear()  # Its home has these, and sends them to the next life.
-        more = cell.more
-        self._guest.report_end(cell, more.reason if more is not None else None)
-
-
-class InnerHost(lifecycle.LocalHost):
-    """The host of all other actors of the process: the root knows their addresses, so that they can be reached."""
-
-    def __init__(self, guest: Guest) -> None:
-        self._guest = guest
-
-    def retired(self, cell: Cell) -> None:
-        self._guest.tell_gone(cell)
+        self._guest.address_retired(cell)
 
 
 class GuestTopics(Topics):
@@ -114,20 +101,6 @@ class OutsideTable(AnyTable):
 
 
 OUTSIDE = OutsideTable()
-
-
-class GuestOutsideHost(OutsideHost):
-    """The host of stand-ins for actors outside of this process: orders go only to whom it may give some."""
-
-    peer: Guest
-
-    def stop(self, cell: Cell, reason: ExitReason) -> None:
-        self.peer.require_granted(cell.path, "stop")
-        super().stop(cell, reason)
-
-    def kill(self, cell: Cell) -> None:
-        self.peer.require_granted(cell.path, "kill")
-        super().kill(cell)
 
 
 class NudgingPage:
@@ -163,10 +136,10 @@ class Guest(Peer):
         self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}
-        self._host = GuestOutsideHost(self)
+        self._host = OutsideHost(self)
         self.node.outside = self.outside
         self.node.uplink = self
-        self.node.here = InnerHost(self)
+        self.node.here = GuestHost(self)
         self.node.topics = GuestTopics(self)
         self.node.overdue = Overdue(loop)
         self.node.events.add_sink(self._on_event)
@@ -223,6 +196,15 @@ class Guest(Peer):
     def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """Tell the root something about an address."""
         self.connection.send(frames.Command(self.connection.name_out(cell.path), verb, data))
+
+    def address_retired(self, cell: Cell) -> None:
+        """An address of this process is free. The process's own is kept at the root, and the process ends with it."""
+        if cell is not self.node.root:
+            self.tell_gone(cell)
+            return
+        if cell.queue:
+            cell.queue.clear()  # Its home has these, and sends them to the next life.
+        self.report_end(cell, cell.more.reason if cell.more is not None else None)
 
     def tell_gone(self, cell: Cell) -> None:
         """An address of this process is free."""
@@ -340,7 +322,7 @@ class Guest(Peer):
         if frame.options.get("bounded"):
             self.page = NudgingPage(self, self.page)
         node = self.node
-        cell = node.root = Cell(node, None, path, GuestHost(self))
+        cell = node.root = Cell(node, None, path, node.here)
         cell.life = frame.life - 1
         try:
             _apply(limits)

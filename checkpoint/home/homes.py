@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 from ...actors.errors import ControlFailed, HoldfastError, StartFailed, StartIgnored
 from ...actors.events import ActorStarted, Recovered, RecoveryFailed
 from ...actors.exit_reasons import ExitReason
-from ...actors.kernel.cell import DOWN, GONE, Cell
+from ...actors.kernel import lifecycle, links
+from ...actors.kernel.cell import DOWN, GONE, Cell, Host
 from ...actors.persistence import child_key
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Journal, Saved
 from ..method import Durability, Method, hybrid
-from ..protocol import START
+from ..protocol import START, LifePort
 from ..recovery.recoveries import Recoveries, Recovery
 from ..recovery_file import RecoveryFile
 from ..snapshot.rollback import older_snapshot, roll_back
@@ -31,7 +32,7 @@ from .quarantine import PLACE, Quarantine
 from .switch import Switch
 
 if TYPE_CHECKING:
-    from ...actors.kernel.envelope import Ask
+    from ...actors.kernel.envelope import Ask, Item
     from ...actors.kernel.node import Node
 
 ENDED = "it ended before it was live"
@@ -330,7 +331,7 @@ class Clock:
         return spans
 
 
-class HomeHost:
+class HomeHost(Host):
     """What all hosts of recorded actors have in common: the home, and the clock of the recovery at hand."""
 
     takes_parcels = True
@@ -341,6 +342,7 @@ class HomeHost:
         self.switch: Switch | None = None
         self.clock: Clock | None = None
         self.recovery: Recovery | None = None  # that of the life which is begun now
+        self._starting: asyncio.Task[None] | None = None
 
     def enter(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
         """As `open`, and it is a recovery if anything comes back, or if one is not over."""
@@ -385,10 +387,19 @@ class HomeHost:
         self.clock.mark("isolate")
         return switch, switch.prepare(), not switch.is_new
 
-    def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
+    def topics(self, cell: Cell) -> Iterable[str]:
+        """Those that the class subscribes to."""
+        start = cell.extra().start
+        return start.kind._topics if start is not None else ()
+
+    def is_restarting(self, cell: Cell) -> bool:
+        """Whether a retired address may have its supervisor, and so itself, started again."""
+        return lifecycle.parent_ended(cell)
+
+    def subscribe(self, cell: Cell) -> None:
         """Have the home admit what is published, also between two lives."""
         assert self.switch is not None
-        for topic in (*topics, *self.switch.topics):
+        for topic in (*self.topics(cell), *self.switch.topics):
             cell.node.topics.subscribe(topic, inlet(self.switch, topic))
 
     def over(
@@ -433,6 +444,13 @@ class HomeHost:
             switch.live.set_exception(StartFailed(cell.path, why))
             switch.live.exception()  # Nobody may be left to look.
 
+    def ended_below(self, cell: Cell, reason: ExitReason, *, recovers: bool) -> None:
+        """Tell of the end of a life whose supervisor is in another process: that one decides what follows."""
+        more = cell.extra()
+        cell.state, more.reason = DOWN, reason
+        links.announce(cell, reason, recovering=recovers)
+        lifecycle.tell_enders(more, reason)
+
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it counts."""
         commits = self.homes.journal
@@ -465,16 +483,42 @@ class HomeHost:
         """The input in hand, -1 if none is known."""
         return -1
 
-    def give_up(self, cell: Cell, topics: Iterable[str], *, restarting: bool) -> None:
-        """The address is free: it hears nothing more. `restarting`: it is its supervisor that has ended."""
+    def push(self, cell: Cell, item: Item) -> None:
+        """Have the home put an item of the runtime's own behind the messages."""
+        if self.switch is not None:
+            self.switch.push(item)
+
+    def retired(self, cell: Cell) -> None:
+        """The address is gone for good: a start that is under way is not wanted any more."""
+        if self._starting is not None and not self._starting.done():
+            self._starting.cancel()
+        self.give_up(cell)
+
+    def give_up(self, cell: Cell) -> None:
+        """The address is free: it hears nothing more."""
         if self.switch is None:
             return
-        for topic in (*topics, *self.switch.topics):
+        restarting = self.is_restarting(cell)
+        for topic in (*self.topics(cell), *self.switch.topics):
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
         self.switch.ends.drop_all("it has stopped", keep_tells=restarting)
         let_go(self.switch)
         why = "its supervisor has ended" if restarting else "it is not started again"
         self.homes.recoveries.given_up(cell.path, why)
+
+    async def replay(self, cell: Cell, port: LifePort, live: asyncio.Future[float], recovering: bool) -> None:
+        """The rest of S3, what a life that has begun has handled since; then S4.
+
+        Raises:
+            StartFailed: it did not come so far.
+        """
+        assert self.clock is not None
+        assert self.switch is not None
+        self.clock.mark("restart")
+        await self.gate("replay")
+        if not live.done():  # Else it has ended meanwhile.
+            self.switch.attach(port)
+        await self.until_live(cell, live, recovering)
 
     async def until_live(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
         """Wait until a life has caught up, and tell of it.
@@ -523,9 +567,3 @@ class HomeHost:
                 raise StartFailed(switch.path, ENDED)
             switch.waits_for_release = False
             switch.let_at()
-
-
-def seen(start: asyncio.Task[None]) -> None:
-    """Look at the outcome of a start: perhaps nobody else does, when the system stops meanwhile."""
-    if not start.cancelled():
-        start.exception()

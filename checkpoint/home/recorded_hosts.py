@@ -22,11 +22,10 @@ from ...actors.process.resource_limits import Limits
 from ...actors.process.wire import frames
 from ...actors.process.wire.connection import BadFrame
 from ...actors.process.worker_pool import Worker, Workers
-from ..life.recorded_inbox import StopRecorded
-from ..life.recorded_life import Life
+from ..life.recorded_life import Life, LifeHost
 from ..method import Method
 from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
-from .homes import ENDED, HomeHost, Homes, seen
+from .homes import ENDED, HomeHost, Homes
 from .switch import Switch
 
 FROM_LIFE: msgspec.msgpack.Decoder[ToHome] = msgspec.msgpack.Decoder(ToHome)
@@ -36,7 +35,7 @@ SENT = frozenset(("tell", "send", "ask", "forward", "publish"))
 """Outputs that are messages to somebody."""
 
 
-class TaskHost(HomeHost, lifecycle.LocalHost):
+class TaskHost(HomeHost, LifeHost):
     """The host of a recorded actor in this process."""
 
     takes_parcels = True
@@ -44,7 +43,6 @@ class TaskHost(HomeHost, lifecycle.LocalHost):
     def __init__(self, homes: Homes, method: Method) -> None:
         super().__init__(homes, method)
         self.life: Life | None = None
-        self._starting: asyncio.Task[None] | None = None
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
@@ -58,9 +56,8 @@ class TaskHost(HomeHost, lifecycle.LocalHost):
             self._begin(cell, switch)
             self._replay(cell, switch)
             begun = self._follow(cell, live, recovering)
-        task = self._starting = cell.node.loop.create_task(begun, name=f"start of {cell.path}")
-        task.add_done_callback(seen)
-        return task
+        self._starting = lifecycle.outside_turn(cell, begun)
+        return self._starting
 
     def _begin(self, cell: Cell, switch: Switch) -> None:
         """S3, the new life with its state."""
@@ -69,18 +66,16 @@ class TaskHost(HomeHost, lifecycle.LocalHost):
         self.page = self.homes.page(switch)
         life = self.life = Life(cell, LocalHome(self, cell), self.method, self.page)
         for record in switch.restore_records():
-            life.from_home(record)
+            life.to_life(record)
         life.begin(start, switch.state_turn, switch.stash)
         assert self.clock is not None
         self.clock.mark("restart")
 
     def _replay(self, cell: Cell, switch: Switch) -> None:
         """S3, what it has handled since."""
-        start = cell.extra().start
-        assert start is not None
         assert self.life is not None
-        self.subscribe(cell, start.kind._topics)
-        switch.attach(LocalLife(self.life))
+        self.subscribe(cell)
+        switch.attach(self.life)
 
     async def _step_by_step(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
         """A recovery on whose way others have something to do."""
@@ -107,16 +102,12 @@ class TaskHost(HomeHost, lifecycle.LocalHost):
             raise StartFailed(cell.path, error.reason if error.reason != ENDED else str(cell.extra().reason)) from error
         self.clock = None
 
-    def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self.life is not None:
-            cell.urge(StopRecorded(self.life, reason))
-
     def push(self, cell: Cell, item: Item) -> None:
         if isinstance(item, (links.Exit, links.Down)):
             assert self.switch is not None
-            self.switch.push(item)
-        else:
             super().push(cell, item)
+        else:
+            LifeHost.push(self, cell, item)
 
     def kill(self, cell: Cell) -> None:
         if cell.state is DOWN and self._starting is not None:
@@ -127,12 +118,6 @@ class TaskHost(HomeHost, lifecycle.LocalHost):
     def running(self, cell: Cell) -> int:
         feed = self.life.feed if self.life is not None else None
         return -1 if feed is None else feed.id
-
-    def retired(self, cell: Cell) -> None:
-        if self._starting is not None and not self._starting.done():
-            self._starting.cancel()
-        start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=lifecycle.parent_ended(cell))
 
 
 class LocalHome:
@@ -160,18 +145,6 @@ class LocalHome:
         self._is_open = False
 
 
-class LocalLife:
-    """From a home to its life, in one process."""
-
-    begins = True
-
-    def __init__(self, life: Life) -> None:
-        self._life = life
-
-    def to_life(self, record: ToLife) -> None:
-        self._life.from_home(record)
-
-
 class RecordedProcessHost(HomeHost, ProcessHost):
     """The host of a recorded actor with a process of its own."""
 
@@ -187,25 +160,17 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         return self.begin(cell, self._recover(cell, *self.enter(cell)))
 
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        start = cell.extra().start
-        assert start is not None
-        clock = self.clock
-        assert clock is not None
         await self.gate("restart")
         worker, recipe = await self.take(cell)
         worker.record_taker = functools.partial(own_records, worker, switch)
-        self.subscribe(cell, start.kind._topics)
+        self.subscribe(cell)
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
         options = {"recorded": {"method": self.method.data(), "turn": switch.state_turn, "stash": switch.stash}}
         try:
             await worker.launch(cell, recipe, options)
-            clock.mark("restart")
-            await self.gate("replay")
-            if not live.done():  # Else it has ended meanwhile.
-                switch.attach(port)
-            await self.until_live(cell, live, recovering)
+            await self.replay(cell, port, live, recovering)
         except StartFailed:
             await worker.gone()  # The next life begins when this one is over.
             raise
@@ -234,18 +199,13 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         self.over(cell, running, str(reason), ordered=reason == KILLED, noticed=noticed, reason=reason)
         lifecycle.ended(cell, reason)
 
-    def push(self, cell: Cell, item: Item) -> None:
-        if self.switch is not None:
-            self.switch.push(item)
-
     def running(self, cell: Cell) -> int:
         worker = self._workers.of(cell)
         return -1 if worker is None else int(worker.page[0]) - 1
 
     def retired(self, cell: Cell) -> None:
         ProcessHost.retired(self, cell)
-        start = cell.extra().start
-        self.give_up(cell, start.kind._topics if start is not None else (), restarting=lifecycle.parent_ended(cell))
+        self.give_up(cell)
 
 
 def own_records(worker: Worker, switch: Switch, path: str) -> frames.TakeRecord:

@@ -14,13 +14,14 @@ from ...actors.errors import CannotMove, StartFailed
 from ...actors.kernel import lifecycle, mailbox
 from ...actors.kernel.cell import Cell
 from ...actors.migration.here import Arrival, FromHere
-from ...actors.migration.move import Entering, Move
+from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import Settle, Transit, now, part, settle_with_queue, sorted_out
-from ...actors.migration.worker import FromOwnWorker, ToWorker
+from ...actors.migration.worker import FromOwnWorker, FromWorker, ToWorker
+from ...actors.process.process_host import ProcessHost
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
 from ..protocol import LifePort, Live, ToHome
-from .recorded_hosts import LocalHome, LocalLife, RecordedProcessHost, RemoteLife, TaskHost, records_of
+from .recorded_hosts import LocalHome, RecordedProcessHost, RemoteLife, TaskHost, records_of
 from .switch import Switch
 
 if TYPE_CHECKING:
@@ -28,6 +29,27 @@ if TYPE_CHECKING:
     from ...actors.kernel.envelope import Item
     from ...actors.process.resource_limits import Limits
     from ...actors.process.worker_pool import Workers
+
+
+def leaving(cell: Cell, ignored: tuple[str, ...] = ()) -> Leaving:
+    """The side of a move that is where the actor lives now, in this process or in one of its own.
+
+    Args:
+        cell: its address.
+        ignored: children that are not the actor's own.
+
+    Raises:
+        CannotMove: its process has ended.
+    """
+    host = cell.host
+    if isinstance(host, TaskHost):
+        return FromRecordedHere(host, ignored)
+    if not isinstance(host, ProcessHost):
+        return FromHere(ignored)
+    worker = host.worker_of(cell)
+    if worker is None:
+        raise CannotMove(cell.path, "its process has ended")
+    return FromRecordedWorker(worker) if isinstance(host, RecordedProcessHost) else FromWorker(worker)
 
 
 class Detached:
@@ -285,10 +307,10 @@ class RecordedArrival(Arrival):
         life = self._life = Life(self.other, home, host.method, host.page)
         life.begins_suspended = suspended
         for record in switch.restore_records():
-            life.from_home(record)
+            life.to_life(record)
         self.other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
         life.begin(start, switch.state_turn, switch.stash)
-        switch.attach(LocalLife(life))
+        switch.attach(life)
         live.add_done_callback(lambda done: None if done.cancelled() else home.fail(done.exception()))
         return up
 

@@ -7,16 +7,15 @@ When the process dies, the homes keep what they hold until the subtree has been 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Coroutine
-from typing import TYPE_CHECKING, Any, Protocol
+from collections.abc import Callable, Iterable
+from typing import Any, Protocol
 
 from ...actors.control.orders_lane import Call, send_call
 from ...actors.errors import HoldfastError, StartFailed
 from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
-from ...actors.kernel import lifecycle, links
+from ...actors.kernel import lifecycle
 from ...actors.kernel.bindings import claim, doubt
-from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell, Host
-from ...actors.kernel.envelope import Item
+from ...actors.kernel.cell import GONE, RUNNING, Cell, Host
 from ...actors.kernel.mailbox import Bound
 from ...actors.persistence import child_key
 from ...actors.process.process_host import Elsewhere, ProcessHost
@@ -24,12 +23,10 @@ from ...actors.process.resource_limits import Limits
 from ...actors.process.stand_ins import know
 from ...actors.process.wire import frames
 from ...actors.process.worker_pool import Worker, Workers
+from ..method import hybrid
 from ..protocol import Begin, Closed, Started, ToHome, Wanted
-from .homes import HomeHost, Homes, seen
+from .homes import HomeHost, Homes
 from .recorded_hosts import RemoteLife, records_of
-
-if TYPE_CHECKING:
-    from .switch import Switch
 
 
 class Lived(Host, Protocol):
@@ -153,16 +150,12 @@ class SubtreeHome(HomeHost, Elsewhere):
     """
 
     def __init__(self, homes: Homes, path: str, protect: Protect) -> None:
-        self.homes, self.path = homes, path
-        self._protect = protect
+        super().__init__(homes, hybrid())  # The method is known when a life is wanted.
+        self.path, self._protect = path, protect
         self._group: Lived | None = None  # has the lives of a protected child
         self._next: Wanted | None = None  # begins when nothing is left of a group
         self.arriving: Callable[[ToHome], None] | None = None  # hears a life that is being handed over
         self.on_lost: Callable[[ExitReason], None] | None = None  # hears that the process of such a life has died
-        self.switch: Switch | None = None
-        self.clock = None
-        self.recovery = None
-        self._starting: asyncio.Task[None] | None = None
         self.cell: Cell | None = None
         self.restarting = False  # it is its supervisor that has ended
         self._top: Cell | None = None
@@ -232,13 +225,13 @@ class SubtreeHome(HomeHost, Elsewhere):
             port.to_life(Started(wanted.number, error.reason))
             return
         if self.is_gated:
-            self._run(cell, self._step_by_step(cell, wanted, live, recovering))
+            self._starting = lifecycle.outside_turn(cell, self._step_by_step(cell, wanted, live, recovering))
         else:
             self.isolated()
             self._launch(cell, wanted)
             switch.attach(port)
             self._send_calls(cell, worker)
-            self._run(cell, self._follow(cell, wanted, live, recovering))
+            self._starting = lifecycle.outside_turn(cell, self._follow(cell, wanted, live, recovering))
 
     def _begin_next(self, wanted: Wanted) -> None:
         if self._next is wanted:
@@ -289,10 +282,6 @@ class SubtreeHome(HomeHost, Elsewhere):
         cell.host = self._group
         self._group.begin(cell, wanted, port)
 
-    def _run(self, cell: Cell, start: Coroutine[Any, Any, None]) -> None:
-        self._starting = cell.node.loop.create_task(start, name=f"start of {cell.path}")
-        self._starting.add_done_callback(seen)
-
     def _launch(self, cell: Cell, wanted: Wanted) -> None:
         """S3, the new life with its state."""
         worker, switch = self._worker, self.switch
@@ -302,7 +291,7 @@ class SubtreeHome(HomeHost, Elsewhere):
         cell.state = RUNNING
         if self.homes.file is not None:
             self.homes.file.meet(self.path, wanted.kind)
-        self.subscribe(cell, wanted.topics)
+        self.subscribe(cell)
         port = RemoteLife(self.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
@@ -359,11 +348,7 @@ class SubtreeHome(HomeHost, Elsewhere):
             return
         recovers = recovers and self.recovers(reason)
         self.over(cell, running, str(reason), ordered=ordered, noticed=noticed, recovers=recovers)
-        cell.state = DOWN
-        more = cell.extra()
-        more.reason = reason
-        links.announce(cell, reason, recovering=recovers)
-        lifecycle.tell_enders(more, reason)
+        self.ended_below(cell, reason, recovers=recovers)
 
     def lost(self, worker: Worker, reason: ExitReason) -> None:
         """The process is gone, and the life with it."""
@@ -398,10 +383,6 @@ class SubtreeHome(HomeHost, Elsewhere):
         if worker is not None and cell.state is RUNNING:
             worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
 
-    def push(self, cell: Cell, item: Item) -> None:
-        if self.switch is not None:
-            self.switch.push(item)
-
     def control(self, cell: Cell, call: Call) -> None:
         if self._worker is not None and cell.state is RUNNING:
             send_call(self._worker, cell.path, call)
@@ -415,12 +396,17 @@ class SubtreeHome(HomeHost, Elsewhere):
         elif verb == "gone":
             self.restarting = bool(data["with_parent"])
 
+    def topics(self, cell: Cell) -> Iterable[str]:
+        return self._wanted.topics if self._wanted is not None else ()
+
+    def is_restarting(self, cell: Cell) -> bool:
+        return self.restarting
+
     def retired(self, cell: Cell) -> None:
         live = None if self.switch is None else self.switch.live
         if self._starting is not None and cell.state is GONE and (live is None or not live.done()):
             self._starting.cancel()  # Else it ends by itself, and tells how the recovery went.
-        topics = self._wanted.topics if self._wanted is not None else ()
-        self.give_up(cell, topics, restarting=self.restarting)
+        self.give_up(cell)
         self.vacate(cell)
 
     def vacate(self, cell: Cell) -> None:

@@ -13,15 +13,16 @@ from typing import TYPE_CHECKING, Any
 from ...actors import exit_reasons
 from ...actors.errors import StartFailed
 from ...actors.exit_reasons import ExitReason, pack_exit
-from ...actors.kernel.cell import DOWN, Cell
-from ...actors.kernel.envelope import Ask, Envelope, Item
+from ...actors.kernel.cell import DOWN, Cell, Host
+from ...actors.kernel.envelope import Envelope, Item
 from ...actors.kernel.mailbox import Bounded, Senders
 from ...actors.kernel.message import message_name
 from ..method import Method
-from ..protocol import Closed, Protected, Wanted
+from ..protocol import Begin, Closed, Over, Protected, Respec, Started, Wanted
 
 if TYPE_CHECKING:
     from ...actors.process.worker_node import Guest
+    from .recorded_life import Life
     from .worker_lives import Port
 
 
@@ -52,7 +53,7 @@ class Homeward:
         return None if self.has_room else self._senders.wait(self._loop)
 
 
-class ChildStub:
+class ChildStub(Host):
     """The host of such a child, as far as it is the same wherever its lives are lived."""
 
     takes_parcels = True
@@ -64,10 +65,33 @@ class ChildStub:
         self._homeward: Homeward | None = None
         self._number = 0  # of the life that is wanted
         self._up: asyncio.Future[None] | None = None
+        self.life: Life | None = None  # that is lived here
 
-    def joined(self, cell: Cell) -> Port:
+    def join(self, cell: Cell) -> Port:
         """The way home, on which we hear of lives from now on."""
+        self.cell = cell
+        port = self._port = self._port_of(cell.path)
+        port.stub = self
+        return port
+
+    def take_up(self, cell: Cell, number: int) -> None:
+        """A life that was begun elsewhere goes on as that of the address, as if it had been wanted as `number`."""
+        self._number = number
+        self.join(cell)
+        cell.host, cell.admit = self, self.way_home
+
+    def begin_here(self, record: Begin) -> None:
+        """Begin the life that is wanted, if it is to be lived here."""
+
+    def started(self, record: Started) -> None:
+        """The home tells how the start of a life went."""
         raise NotImplementedError
+
+    def closed_here(self) -> None:
+        """A life that was lived here is over, or its start has failed."""
+
+    def told_by_group(self, record: Over | Respec) -> None:
+        """Take what a group at the root says, if that lives it."""
 
     def ask_for_life(self, cell: Cell, method: Method, made: Protected | None = None) -> asyncio.Future[None]:
         """Ask the home for a life; the future ends when it is up. `made`: what a group at the root needs.
@@ -89,7 +113,7 @@ class ChildStub:
                 more.outlet = self._homeward = Homeward(node.loop, self.bound.capacity)
         self._number += 1
         self._up = node.loop.create_future()
-        port = self._port = self.joined(cell)
+        port = self.join(cell)
         kind, topics = message_name(start.kind), list(start.kind._topics)
         bindings = {name: target.path for name, target in more.bindings.items()}
         port.to_home(Wanted(self._number, kind, topics, method, self.bound, made, bindings))
@@ -131,10 +155,6 @@ class ChildStub:
     def recovers(self, reason: ExitReason) -> bool:
         """Whether an end for this reason is followed by a recovery."""
         return not reason.is_clean
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        """Whether the turn of an ask may have begun: only its home knows."""
-        return True
 
     def way_home(self, cell: Cell, item: Any) -> None:
         """Stands in `cell.admit`: the home numbers and journals, and feeds whoever lives there."""

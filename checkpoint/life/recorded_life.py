@@ -51,7 +51,7 @@ from ..snapshot.key_variables import check_keys, restore_state, save_state, vari
 from .determinism_guard import Guard
 from .readonly_guard import check_readonly
 from .recorded_context import RecordedContext
-from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, TakeSnapshot
+from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
 
 
@@ -73,6 +73,8 @@ class HomePort(Protocol):
 
 class Life:
     """One recorded life: the turn in hand, its outputs, and when the next snapshot is due."""
+
+    begins = True  # what is handed to it, whenever it has come to that
 
     def __init__(
         self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False
@@ -166,7 +168,7 @@ class Life:
 
     # -- records from home ------------------------------------------------------------------------------------------
 
-    def from_home(self, record: ToLife) -> None:
+    def to_life(self, record: ToLife) -> None:
         """Take what the home says, in order."""
         match record:
             case Feed():
@@ -498,3 +500,20 @@ class Life:
             self.cell.urge(call)
         self.port.closed()
         self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.
+
+
+class LifeHost(lifecycle.LocalHost):
+    """The host of a recorded actor whose turns run in this process."""
+
+    def __init__(self, life: Life | None = None) -> None:
+        self.life = life
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        if cell.state is RUNNING and self.life is not None:
+            cell.urge(StopRecorded(self.life, reason))
+
+    def recovers(self, reason: ExitReason) -> bool:
+        return not reason.is_clean
+
+    def retired(self, cell: Cell) -> None:
+        cell.node.here.retired(cell)

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
-from ...actors.exit_reasons import ExitReason
-from ...actors.kernel import lifecycle, links
-from ...actors.kernel.cell import DOWN, RUNNING, Cell, Host
+from ...actors.kernel import links
+from ...actors.kernel.cell import DOWN, Cell, Host
 from ...actors.kernel.envelope import Item
 from ...actors.persistence import child_key
 from ...actors.process.wire import frames
@@ -28,8 +27,7 @@ from ..protocol import (
     ToLife,
 )
 from .child_stub import ChildStub
-from .recorded_inbox import StopRecorded
-from .recorded_life import Life
+from .recorded_life import Life, LifeHost
 
 if TYPE_CHECKING:
     from ...actors.process.worker_node import Guest
@@ -73,7 +71,7 @@ class RecordedGuest:
         """
         port = self.port_of(cell.path)
         life = Life(cell, port, Method.of(options["method"]), self._guest.page, may_fork=True)
-        cell.host = OwnHost(self._guest, life)
+        cell.host = LifeHost(life)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
         life.begins_suspended = bool(options.get("suspended"))
@@ -148,10 +146,7 @@ class Port:
         self._guest, self._path = guest, path
         self.life: Life | None = None
         self._state: list[Restore] = []
-        self.on_begin: Callable[[Begin], None] | None = None
-        self.on_started: Callable[[Started], None] | None = None
-        self.on_closed: Callable[[], None] | None = None
-        self.on_group: Callable[[Over | Respec], None] | None = None  # of lives that are lived at the root
+        self.stub: ChildStub | None = None  # of a child: it hears of its lives
 
     def take(self, frame: frames.Record) -> None:
         """A record from home."""
@@ -160,18 +155,18 @@ class Port:
             case Restore():
                 self._state.append(record)
             case Begin():
-                if self.on_begin is not None:  # Else its address has gone meanwhile.
-                    self.on_begin(record)
+                if self.stub is not None:  # Else its address has gone meanwhile.
+                    self.stub.begin_here(record)
                 self._state.clear()
             case Started():
-                if self.on_started is not None:
-                    self.on_started(record)
+                if self.stub is not None:
+                    self.stub.started(record)
             case Over() | Respec():
-                if self.on_group is not None:
-                    self.on_group(record)
+                if self.stub is not None:
+                    self.stub.told_by_group(record)
             case _:
                 if self.life is not None:
-                    self.life.from_home(record)
+                    self.life.to_life(record)
 
     def begin(self, life: Life, turn: int, stash: list[int]) -> None:
         """Begin a life with the state that has come.
@@ -183,7 +178,7 @@ class Port:
         assert start is not None
         state, self._state = self._state, []
         for record in state:
-            life.from_home(record)
+            life.to_life(record)
         self.life = life
         life.begin(start, turn, stash)
 
@@ -196,70 +191,29 @@ class Port:
 
     def closed(self) -> None:
         self.life = None
-        if self.on_closed is not None:
-            self.on_closed()
-
-
-class LifeHost(lifecycle.LocalHost):
-    """The host of a recorded life in this process."""
-
-    _life: Life | None
-
-    def stop(self, cell: Cell, reason: ExitReason) -> None:
-        if cell.state is RUNNING and self._life is not None:
-            cell.urge(StopRecorded(self._life, reason))
-
-    def recovers(self, reason: ExitReason) -> bool:
-        return not reason.is_clean
-
-
-class OwnHost(LifeHost):
-    """The host of the process's own actor."""
-
-    def __init__(self, guest: Guest, life: Life) -> None:
-        self._guest, self._life = guest, life
-
-    def retired(self, cell: Cell) -> None:
-        if cell.queue:
-            cell.queue.clear()
-        self._guest.report_end(cell, cell.extra().reason)
+        if self.stub is not None:
+            self.stub.closed_here()
 
 
 class InnerLifeHost(ChildStub, LifeHost):
     """The host of a recorded child of a supervisor in this process, whose lives are lived here."""
 
-    def __init__(self, guest: Guest, method: Method, port_of: Callable[[str], Port]) -> None:
-        super().__init__(guest, method, port_of)
-        self._life = None
-
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the home to bring the actor back."""
         return self.ask_for_life(cell, self._with_ports(cell))
 
-    def joined(self, cell: Cell) -> Port:
-        port = self._port_of(cell.path)
-        port.on_begin = lambda record: self._begin(cell, record)
-        port.on_started = lambda record: self._started(cell, record)
-        port.on_closed = lambda: self._closed(cell)
-        return port
-
     def progress(self, cell: Cell) -> object:
-        life = self._life
+        life = self.life
         if life is None or (life.feed is None and not cell.queue):
             return object()  # It waits for its home.
         return life.turn
 
-    def take_up(self, cell: Cell, life: Life, number: int) -> None:
-        """A life that has come back here is that of the address, as if it had been wanted as `number`."""
-        self._life, self._number, self._port = life, number, self.joined(cell)
-        cell.host, cell.admit = self, self.way_home
-
     def let_go(self) -> Life:
         """The life that is lived here, which is at rest, is not the address's any more; its home hears no more."""
-        life, self._life = self._life, None
+        life, self.life = self.life, None
         assert life is not None
         assert self._port is not None
-        self._port.life = self._port.on_closed = None
+        self._port.life = None
         return life
 
     def _with_ports(self, cell: Cell) -> Method:
@@ -270,24 +224,25 @@ class InnerLifeHost(ChildStub, LifeHost):
         ports = tuple((port, target.path) for port, target in cell.extra().bindings.items() if port in state.to)
         return dataclasses.replace(self._method, safe_state=dataclasses.replace(state, ports=ports))
 
-    def _begin(self, cell: Cell, record: Begin) -> None:
-        port = self._port
+    def begin_here(self, record: Begin) -> None:
+        port, cell = self._port, self.cell
         if not self.is_starting(record.number) or cell.state is not DOWN:
             return
         assert port is not None
         cell.life = record.life - 1
         page = self._guest.page[record.slot : record.slot + 1]
-        self._life = life = Life(cell, port, self._method, page, may_fork=True)
-        port.on_closed = None  # A start that fails is told of here, with its reason.
+        life = Life(cell, port, self._method, page, may_fork=True)
         try:
             port.begin(life, record.turn, record.stash)
-            port.on_closed = lambda: self._closed(cell)
-        except StartFailed as error:
-            port.life = self._life = None
+        except StartFailed as error:  # Told of here, with its reason.
+            port.life = None
             self.fail(error)
             self.say_closed(cell, cell.extra().reason)
+        else:
+            self.life = life
 
-    def _started(self, cell: Cell, record: Started) -> None:
+    def started(self, record: Started) -> None:
+        cell = self.cell
         if not self.is_starting(record.number):
             return
         if not record.problem:
@@ -302,12 +257,14 @@ class InnerLifeHost(ChildStub, LifeHost):
         if self._up is not None and not self._up.done():
             self._up.set_result(None)
 
-    def _closed(self, cell: Cell) -> None:
-        life, self._life = self._life, None
+    def closed_here(self) -> None:
+        life, cell, self.life = self.life, self.cell, None
+        if life is None:
+            return  # It has not begun yet, or is not the address's any more.
         self.say_closed(cell, cell.extra().reason)
-        if life is not None and life.ignored_why is not None:
+        if life.ignored_why is not None:
             self.fail(StartIgnored(cell.path, life.ignored_why))
-        elif life is not None and life.is_live:
+        elif life.is_live:
             self._came_up()  # It was up, and has ended in a turn before its home could say so.
         else:
             self.fail(StartFailed(cell.path, str(cell.extra().reason)))

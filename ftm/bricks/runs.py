@@ -264,7 +264,7 @@ class Shadow(Server):
         life.outs = []
         for one in known:
             assert one is not None
-            life.from_home(one)
+            life.to_life(one)
 
     def _fail(self, why: str) -> None:
         self._why = self._why or why

@@ -15,7 +15,6 @@ from ...actors.errors import ActorStopped, AskFailed, AskTimeout, HoldfastError
 from ...actors.exit_reasons import KILLED
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import RUNNING
-from ...actors.process.process_host import ProcessHost
 from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Commit, Peer, Prepare
 from ..bricks.sealed_frames import Refused
@@ -249,7 +248,7 @@ async def killed(group: Group, name: str, life: int) -> None:
     cell = group.cell_of(name)
     if cell is None or cell.life != life or cell.state is not RUNNING:
         return
-    worker = cell.host.worker_of(cell) if isinstance(cell.host, ProcessHost) else None
+    worker = group.worker_of(name)
     if worker is None:
         cell.kill()
         await cell.ended()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError, StartFailed
@@ -17,9 +17,8 @@ from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
-from ...actors.kernel.envelope import Item
 from ...actors.migration.move import Gate
-from ...checkpoint.home.homes import Homes, seen
+from ...checkpoint.home.homes import HomeHost, Homes
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import Restore
 from ...supervision.backoff import Backoff
@@ -47,10 +46,11 @@ from .reconfiguration import (
     Reconfiguration,
     names_for,
 )
-from .steering import Steered
+from .steering import bind, bind_again, give_order
 from .transient_homes import UNKEPT, begin_afresh, begin_again, forget_later, is_unkept
 
 if TYPE_CHECKING:
+    from ...actors.control.orders_lane import Call
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import TurnEnd
     from ...checkpoint.snapshot.snapshot_record import Meta
@@ -71,7 +71,7 @@ BRICKS_INTENSITY = 100
 BRICKS_PERIOD = 5.0
 
 
-class GroupHost(Steered):
+class GroupHost(HomeHost):
     """Lives that are lived by replicas, each in a process of its own."""
 
     def __init__(self, homes: Homes, method: Method | None, mechanism: Any) -> None:
@@ -86,7 +86,6 @@ class GroupHost(Steered):
         self.on_switched: Callable[[], None] = lambda: None
         self.ended_at = time.time()  # when the last group ended, by the system's clock
         self.probation: Probation | None = None  # of the stack that there is, if it is not trusted yet
-        self._starting: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
         self._careful: set[int] = set()
@@ -106,11 +105,8 @@ class GroupHost(Steered):
         assert start is not None
         cell.table = start.kind._table
         self._stop_wanted = None
-        task = self._starting = cell.node.loop.create_task(
-            self._recover(cell, *self.enter(cell)), name=f"start of {cell.path}"
-        )
-        task.add_done_callback(seen)
-        return task
+        self._starting = lifecycle.outside_turn(cell, self._recover(cell, *self.enter(cell)))
+        return self._starting
 
     def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
         opened = super().open(cell)
@@ -120,14 +116,7 @@ class GroupHost(Steered):
         self._copy = None
         return opened
 
-    def topics(self, cell: Cell) -> Iterable[str]:
-        """Those that the class subscribes to."""
-        start = cell.extra().start
-        return start.kind._topics if start is not None else ()
-
     async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        clock = self.clock
-        assert clock is not None
         await self.gate("restart")
         if not self.is_gated:
             self.isolated()
@@ -137,13 +126,9 @@ class GroupHost(Steered):
         cell.state = RUNNING
         try:
             group = await self.build(cell, switch)
-            self.subscribe(cell, self.topics(cell))
+            self.subscribe(cell)
             await self.lead(group, switch)
-            clock.mark("restart")
-            await self.gate("replay")
-            if not live.done():  # Else it has ended meanwhile.
-                switch.attach(group)
-            await self.until_live(cell, live, recovering)
+            await self.replay(cell, group, live, recovering)
             await self.protected(group)
         except BaseException as error:
             if isinstance(error, asyncio.CancelledError):
@@ -206,7 +191,7 @@ class GroupHost(Steered):
         group.went_back = lambda back: self._went_back(cell, group, back)
         if self.probation is not None:
             self.probation.moved(group)
-        group.on_joining = lambda name: self._bind_all(cell, group, name)
+        group.on_joining = lambda name: bind_again(cell, group, name)
 
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
         parts = (
@@ -497,12 +482,8 @@ class GroupHost(Steered):
             self._stop_wanted = reason
             return
         group.is_stopping = True
-        self._ending = cell.node.loop.create_task(
-            self._finish(cell, group, reason),
-            name=f"stop of {cell.path}",
-            context=cell.node.base_context.copy(),  # Not in the name of whoever happens to tell us.
-        )
-        self._ending.add_done_callback(seen)
+        context = cell.node.base_context.copy()  # Not in the name of whoever happens to tell us.
+        self._ending = lifecycle.outside_turn(cell, self._finish(cell, group, reason), "stop", context)
 
     async def _finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:
         """A last snapshot, then `on_stop`, by whoever leads; if that one dies of it, so be it."""
@@ -548,8 +529,7 @@ class GroupHost(Steered):
         if self._ending is not None and not self._ending.done():
             return
         end = self._end(cell, reason, None, running, ordered=ordered)
-        self._ending = cell.node.loop.create_task(end, name=f"end of {cell.path}")
-        self._ending.add_done_callback(seen)
+        self._ending = lifecycle.outside_turn(cell, end, "end")
 
     async def _end(
         self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int = -1, *, ordered: bool = True
@@ -611,17 +591,18 @@ class GroupHost(Steered):
             ftm.kill()
         if self.probation is not None:
             self.probation.end(is_kept=True)
-        self.give_up(cell, self.topics(cell), restarting=self.is_restarting(cell))
-
-    def is_restarting(self, cell: Cell) -> bool:
-        """Whether a retired address may have its supervisor, and so itself, started again."""
-        return lifecycle.parent_ended(cell)
+        self.give_up(cell)
 
     # -- what else a host does --------------------------------------------------------------------------------------
 
-    def push(self, cell: Cell, item: Item) -> None:
-        if self.switch is not None:
-            self.switch.push(item)
+    def control(self, cell: Cell, call: Call) -> None:
+        give_order(self.group if self.is_up(cell) else None, cell, call)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """Links and monitors are the home's; a binding is that of the actor in each replica."""
+        if verb == "bind" and self.group is not None:
+            for name in self.group.names:
+                bind(self.group, name, data)
 
     def is_up(self, cell: Cell) -> bool:
         return super().is_up(cell) and self.group is not None and not self.group.is_over

@@ -22,6 +22,7 @@ from .securing import Securing
 
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
+    from ...actors.process.worker_pool import Worker
     from .detector import Detection
 
 
@@ -117,6 +118,11 @@ class Members(Securing):
     def cell_of(self, name: str) -> Cell | None:
         """The cell of an actor of the mechanism, if there is one now."""
         return self.node.find(self.place(name))
+
+    def worker_of(self, name: str) -> Worker | None:
+        """The process of a replica, if it has one now."""
+        cell = self.cell_of(name)
+        return cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None
 
     def bind_proxy(self) -> None:
         """Show who leads: the proxy is bound to its RequestProtocol."""
@@ -238,8 +244,7 @@ class Members(Securing):
         return min(max(0.0, self.starved(name) - starved), self.detection.hopeless) + self.at_work(name)
 
     def _pid_of(self, name: str) -> int | None:
-        cell = self.cell_of(name)
-        worker = cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None
+        worker = self.worker_of(name)
         return None if worker is None else worker.pid
 
     def broken(self, name: str, life: int, why: str) -> None:

@@ -187,13 +187,14 @@ class ToGroup(Entering):
 
 
 class FromRecordedGroup(Leaving):
-    """A recorded life comes out of a group."""
+    """A recorded life comes out of a group; `is_below`: its supervisor is in another process."""
 
-    def __init__(self, cell: Cell) -> None:
+    def __init__(self, cell: Cell, *, is_below: bool) -> None:
         old = cell.host
         if not isinstance(old, GroupHost) or old.group is None or old.switch is None:
             raise CannotMove(cell.path, "it is being recovered; try again")
         self.host, self._group, self._switch = old, old.group, old.switch
+        self._is_below = is_below
         self._home: Detached | None = None
         self._over = self._group.on_over
         self._has_fallen = False
@@ -267,6 +268,9 @@ class FromRecordedGroup(Leaving):
         self.move.ending = asyncio.ensure_future(host.dismantle(self.cell))
 
     def resume(self) -> None:
+        if self._is_below and self.move.is_late:
+            settle_in(self)
+            return
         group, transit = self._group, self.move.transit
         group.is_stopping = False
         if transit is not None:
@@ -286,8 +290,8 @@ class FromRecordedGroup(Leaving):
 class FromGroup(FromRecordedGroup):
     """A life without recovery comes out of a group; it has no home any more."""
 
-    def __init__(self, cell: Cell) -> None:
-        super().__init__(cell)
+    def __init__(self, cell: Cell, *, is_below: bool) -> None:
+        super().__init__(cell, is_below=is_below)
         self._stash: list[int] = []
 
     async def collect(self, epoch: int, end: float) -> None:
@@ -346,3 +350,10 @@ def arrived(cell: Cell, kind: str, body: bytes) -> Exit | Down:
     if kind == EXIT:
         return Exit(source, reason)
     return Down(Monitor(cell, source, for_good=data["verb"] == "watch"), reason, bool(data["recovering"]))
+
+
+def settle_in(side: Leaving) -> None:
+    """The life that was on its way has ended: the next one, if it has begun already, has its own place."""
+    cell, transit = side.cell, side.move.transit
+    if transit is not None:
+        transit.over(cell, transit.old if cell.host is transit else cell.host)

@@ -61,18 +61,8 @@ class InnerGroupHost(ChildStub):
         layers = [msgspec.to_builtins(layer.describe()) for layer in compose(cell.spec.mechanism)]
         return self.ask_for_life(cell, self._method, Protected(pack_recipe(more.start, cell.path), layers))
 
-    def joined(self, cell: Cell) -> Port:
-        port = self._port_of(cell.path)
-        port.on_started = lambda record: self._started(cell, record)
-        port.on_group = lambda record: self._told_by_group(cell, record)
-        return port
-
-    def take_up(self, cell: Cell, number: int) -> None:
-        """A life that was lived here goes on at the root, as that which was wanted as `number`."""
-        self._number, self._port = number, self.joined(cell)
-        cell.host, cell.admit = self, self.way_home
-
-    def _started(self, cell: Cell, record: Started) -> None:
+    def started(self, record: Started) -> None:
+        cell = self.cell
         if not self.is_starting(record.number):
             return
         if record.problem or record.is_ignored:
@@ -84,7 +74,8 @@ class InnerGroupHost(ChildStub):
         assert self._up is not None
         self._up.set_result(None)
 
-    def _told_by_group(self, cell: Cell, record: Over | Respec) -> None:
+    def told_by_group(self, record: Over | Respec) -> None:
+        cell = self.cell
         if isinstance(record, Respec):
             respec(cell, record.layers)
         elif record.number == self._number and cell.state is RUNNING:
@@ -207,7 +198,8 @@ class RecordedChild:
         """From here on the new life is the one."""
         settle_with_queue(arriving.other, cell)
         arriving.life.cell = cell
-        arriving.host.take_up(cell, arriving.life, arriving.number)
+        arriving.host.life = arriving.life
+        arriving.host.take_up(cell, arriving.number)
         respec(cell, [])
         lifecycle.up(cell)
 

@@ -6,11 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import CannotMove
 from ...actors.kernel.lifecycle import LOCAL
-from ...actors.migration.here import FromHere
 from ...actors.migration.move import Move
 from ...actors.process.wire.peer import OutsideHost
 from ...checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
-from ...checkpoint.home.recorded_moves import FromRecordedHere, FromRecordedWorker
+from ...checkpoint.home.recorded_moves import leaving
 from ...checkpoint.home.subtree_homes import SubtreeHome
 from ..group.group_host import GroupHost
 from ..group.transient_homes import UNKEPT, is_unkept
@@ -18,9 +17,7 @@ from .group_moves import FromGroup, FromRecordedGroup, ToGroup
 from .subtree_groups import SubtreeGroup
 from .subtree_moves import (
     FromRecordedSubtree,
-    FromRecordedSubtreeGroup,
     FromSubtree,
-    FromSubtreeGroup,
     ToRecordedSubtree,
     ToSubtree,
     group_for,
@@ -44,17 +41,11 @@ def into_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> Move
         CannotMove: it lives somewhere else.
     """
     old = cell.host
-    if isinstance(old, TaskHost):
-        group = GroupHost(homes, old.method, mechanism)
-        return Move(cell, FromRecordedHere(old, PART), ToGroup(group, old.switch), timeout)
-    if isinstance(old, RecordedProcessHost):
-        worker = old.worker_of(cell)
-        if worker is None:
-            raise CannotMove(cell.path, "its process has ended")
-        group = GroupHost(homes, old.method, mechanism)
-        return Move(cell, FromRecordedWorker(worker), ToGroup(group, old.switch), timeout)
     if old is LOCAL:
-        return Move(cell, FromHere(PART), ToGroup(GroupHost(homes, None, mechanism), None), timeout)
+        return Move(cell, leaving(cell, PART), ToGroup(GroupHost(homes, None, mechanism), None), timeout)
+    if isinstance(old, (TaskHost, RecordedProcessHost)):
+        group = GroupHost(homes, old.method, mechanism)
+        return Move(cell, leaving(cell, PART), ToGroup(group, old.switch), timeout)
     if isinstance(old, SubtreeHome):
         spec = spec_of(cell)
         below = group_for(old, spec, old.method, mechanism)
@@ -73,11 +64,10 @@ def out_of_group(cell: Cell, entering: Entering, timeout: float) -> Move:
         CannotMove: it is being recovered.
     """
     old = cell.host
-    if not isinstance(old, SubtreeGroup):
-        return Move(cell, FromGroup(cell) if is_plain(cell) else FromRecordedGroup(cell), entering, timeout)
-    if is_plain(cell):
-        return Move(cell, FromSubtreeGroup(cell), ToSubtree(cell, old), timeout)
-    return Move(cell, FromRecordedSubtreeGroup(cell), ToRecordedSubtree(cell, old), timeout)
+    from_group, to_subtree = (FromGroup, ToSubtree) if is_plain(cell) else (FromRecordedGroup, ToRecordedSubtree)
+    if isinstance(old, SubtreeGroup):
+        return Move(cell, from_group(cell, is_below=True), to_subtree(cell, old), timeout)
+    return Move(cell, from_group(cell, is_below=False), entering, timeout)
 
 
 def is_plain(cell: Cell) -> bool:

@@ -17,13 +17,12 @@ import msgspec
 
 from ...actors.errors import HoldfastError, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
-from ...actors.kernel import lifecycle, links
+from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Start
 from ...actors.kernel.bindings import settle_claims
-from ...actors.kernel.cell import DOWN, RUNNING, Cell
+from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.migration.move import Gate
 from ...actors.process.wire.start_codec import pack_recipe
-from ...checkpoint.home.homes import seen
 from ...checkpoint.protocol import Closed, Over, Respec, Started, Wanted
 from ...supervision.respec import recipe_spec
 from ..group.group_host import GroupHost
@@ -51,7 +50,6 @@ class SubtreeGroup(GroupHost):
         self._topics: list[str] = []
         self._port: RemoteLife | None = None  # to the supervisor in the process
         self._last: tuple[int, bool, float] | None = None  # how a life has ended of which that one has not said yet
-        self._is_restarting = False  # it is its supervisor that has ended
 
     # -- what the supervisor says -----------------------------------------------------------------------------------
 
@@ -61,7 +59,7 @@ class SubtreeGroup(GroupHost):
         assert made is not None
         self._wanted, self._port = wanted, port
         self._recipe, self._topics = made.recipe, wanted.topics
-        self._stop_wanted, self._is_restarting, self._last = None, False, None
+        self._stop_wanted = self._last = None
         spec = recipe_spec(cell)
         settle_claims(cell, {} if spec is None else spec.bindings)
         try:
@@ -70,12 +68,8 @@ class SubtreeGroup(GroupHost):
             self._wanted = None
             port.to_life(Started(wanted.number, error.reason))
             return
-        self._starting = cell.node.loop.create_task(
-            self._begin(cell, wanted, port, entered),
-            name=f"start of {cell.path}",
-            context=cell.node.base_context.copy(),  # Not in that of the socket, which is whoever's had the process.
-        )
-        self._starting.add_done_callback(seen)
+        context = cell.node.base_context.copy()  # Not in that of the socket, which is whoever's had the process.
+        self._starting = lifecycle.outside_turn(cell, self._begin(cell, wanted, port, entered), context=context)
 
     async def _begin(self, cell: Cell, wanted: Wanted, port: RemoteLife, entered: Any) -> None:
         outcome = Started(wanted.number)
@@ -163,10 +157,8 @@ class SubtreeGroup(GroupHost):
         self.over(cell, running, str(reason), ordered=ordered, noticed=noticed, reason=reason, recovers=recovers)
         if is_unkept(self.method) and self.switch is not None:
             forget_later(self.switch, str(reason))
-        more = cell.extra()
-        cell.state, more.reason, more.suspended = DOWN, reason, 0
-        links.announce(cell, reason, recovering=recovers)
-        lifecycle.tell_enders(more, reason)
+        cell.extra().suspended = 0
+        self.ended_below(cell, reason, recovers=recovers)
 
     # -- what a host does -------------------------------------------------------------------------------------------
 
@@ -179,7 +171,7 @@ class SubtreeGroup(GroupHost):
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         if verb == "gone":
-            self._is_restarting = bool(data["with_parent"])
+            self.place.told(cell, verb, data)
         else:
             super().told(cell, verb, data)
 
@@ -193,7 +185,7 @@ class SubtreeGroup(GroupHost):
             self.place.vacate(cell)
 
     def is_restarting(self, cell: Cell) -> bool:
-        return self._is_restarting
+        return self.place.restarting
 
     def topics(self, cell: Cell) -> Iterable[str]:
         return self._topics

@@ -36,7 +36,7 @@ from ...checkpoint.protocol import Closed, Protected, ToHome, Wanted
 from ...supervision.respec import recipe_spec
 from ..group.transient_homes import UNKEPT
 from ..model.mechanism import compose
-from .group_moves import FromGroup, FromRecordedGroup
+from .group_moves import settle_in
 from .subtree_groups import SubtreeGroup
 from .unrecorded_luggage import pack, refuse, unpack
 
@@ -385,24 +385,3 @@ class ToSubtree(IntoSubtree):
 
     def settled(self) -> None:
         self.cell.spec = None  # Its supervisor is not here.
-
-
-class FromRecordedSubtreeGroup(FromRecordedGroup):
-    """A recorded life comes out of a group, and its supervisor is in another process."""
-
-    def resume(self) -> None:
-        settle_in(self) if self.move.is_late else super().resume()
-
-
-class FromSubtreeGroup(FromGroup):
-    """The same, without recovery."""
-
-    def resume(self) -> None:
-        settle_in(self) if self.move.is_late else super().resume()
-
-
-def settle_in(side: Leaving) -> None:
-    """The life that was on its way has ended: the next one, if it has begun already, has its own place."""
-    cell, transit = side.cell, side.move.transit
-    if transit is not None:
-        transit.over(cell, transit.old if cell.host is transit else cell.host)

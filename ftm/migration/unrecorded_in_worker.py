@@ -24,7 +24,6 @@ from ...actors.migration.luggage import Stays, check_sendable, pack_rest
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
 from ...actors.process.wire.connection import BadFrame
-from ...actors.process.worker_node import GuestHost, InnerHost
 from ...checkpoint.snapshot.key_variables import restore_state, save_state
 from .protected_stand_ins import InnerGroupHost, respec
 from .unrecorded_luggage import pack, refuse, unpack
@@ -68,7 +67,7 @@ class PlainChild:
 
     def _come_to_rest(self) -> None:
         cell = self._guest.node.find(self._path)
-        if cell is None or cell.state is not RUNNING or not isinstance(cell.host, InnerHost):
+        if cell is None or cell.state is not RUNNING or cell.host is not self._guest.node.here:
             self._say("refused", why="it is being restarted; try again")
             return
         take = Take(_owe, self._at_rest, lambda why: self._say("refused", why=why))
@@ -128,7 +127,7 @@ class PlainChild:
         for watch in [one for one in more.watching if one.life == cell.life]:
             watch.cancel()
             guest.command(watch.target, "monitor", {"watcher": cell.path, "for_good": watch.for_good})
-        more.monitors = [one for one in more.monitors if isinstance(one.watcher.host, (GuestHost, InnerHost))]
+        more.monitors = [one for one in more.monitors if one.watcher.host is guest.node.here]
         for topic in list(more.topics):
             Topics.unsubscribe(guest.node.topics, topic, cell)
 
@@ -199,7 +198,7 @@ class PlainChild:
         host = cell.host
         assert isinstance(host, InnerGroupHost)
         has_ended = arrival.other.state is not RUNNING  # by its background work
-        guest.recovery.port_of(self._path).on_group = None
+        guest.recovery.port_of(self._path).stub = None
         cell.host = guest.node.here
         bound = None if host.bound is None else Bound(host.bound.capacity, host.bound.overflow)
         queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])

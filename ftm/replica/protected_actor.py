@@ -263,7 +263,7 @@ class Server(Reports):
                 life.outs = []
                 for one in known:
                     assert one is not None
-                    life.from_home(one)
+                    life.to_life(one)
                 return
         if self.is_front:
             self._let_out(life)
@@ -461,7 +461,7 @@ class Server(Reports):
         if isinstance(record, Outcome):
             self.heard[record.turn, record.k] = record
             if life is not None:
-                life.from_home(record)
+                life.to_life(record)
         else:
             self.want_snapshot()
 

@@ -190,7 +190,7 @@ class Points(lifecycle.LocalHost):
                 data = point.data.whole()
             except DamagedValue as error:
                 raise StartFailed(self.address, str(error)) from error
-            life.from_home(Restore(data))
+            life.to_life(Restore(data))
         turn = self._start_turn if point is None else point.turn
         life.begin(start, turn, [] if point is None else point.stash_ids)
         self.life = life
@@ -322,7 +322,7 @@ class Points(lifecycle.LocalHost):
         queue_of = mailbox.queue_of(life.cell)
         for feed, end in feeds:
             if end is None:
-                life.from_home(feed)
+                life.to_life(feed)
             else:
                 queue_of.append(Skip(life, end))
         self._put(())

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, cast
 from ...errors import AskDeadlock, BadMessage, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
+from ...kernel.cell import Cell, Host
 from ...kernel.codec import Codec, Parcel, Raw
 from ...kernel.envelope import Ask, Envelope, Item
 from ...kernel.message import Message, message_name
@@ -21,7 +22,6 @@ from .pending_sends import Offered
 
 if TYPE_CHECKING:
     from ...control.orders_lane import Call
-    from ...kernel.cell import Cell
     from ...kernel.node import Node
 
 Coroutine_ = types.CoroutineType
@@ -47,6 +47,13 @@ class Peer:
         self._record_takers: dict[frames.Name, frames.TakeRecord] = {}
 
     # -- out --------------------------------------------------------------------------------------------------------
+
+    def require_granted(self, path: str, order: str) -> None:
+        """See whether an actor of this process may give an order to one that is outside of it; the root's may.
+
+        Raises:
+            NotGranted: it may not.
+        """
 
     def send_item(self, cell: Cell, path: str, item: Any, number: int) -> None:
         """Send what `cell.admit` was given to the actor at `path` on the other side.
@@ -356,7 +363,7 @@ class RelayedAsk(Ask, eq=False):
             self.page = [0, 0]  # The real one counts in the order of arrival: a late number would undo later ones.
 
 
-class OutsideHost:
+class OutsideHost(Host):
     """The host of stand-ins for actors in other processes: everything goes over the connection."""
 
     takes_parcels = True
@@ -368,22 +375,15 @@ class OutsideHost:
         raise HoldfastError(f"{cell.path} is in another process")
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.peer.require_granted(cell.path, "stop")
         self.told(cell, "stop", {"reason": pack_exit(reason)})
 
     def kill(self, cell: Cell) -> None:
+        self.peer.require_granted(cell.path, "kill")
         self.told(cell, "kill", {})
 
     def retired(self, cell: Cell) -> None:
         pass
-
-    def progress(self, cell: Cell) -> object:
-        return None
-
-    def recovers(self, reason: ExitReason) -> bool:
-        return False
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        return True
 
     def push(self, cell: Cell, item: Item) -> None:
         send_signal(self.peer, cell.path, item)
