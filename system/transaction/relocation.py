@@ -152,10 +152,14 @@ class Relocation:
         """Note what its mechanisms are now, for the next root, and whether they are trusted."""
         if not self._adapts:
             return
-        cell = self._place.living(system.node)
+        self._give_back(system)
         notes, path = system.mechanism_notes, self._place.path
-        before, after = self._before.mechanism, mechanism_of(cell)
-        probation = self.probation = getattr(cell.host, "probation", None)  # None: there is no mechanism.
+        before, after = self._before.mechanism, self._after.mechanism
+        cell = self._place.cell
+        if cell is not None and not cell.is_dead:  # Else its next life begins as its spec says.
+            after = mechanism_of(cell)
+            self.probation = getattr(cell.host, "probation", None)  # None: there is no mechanism.
+        probation = self.probation
         notes.put(path, before, after, is_trusted=probation is None or probation.is_over)
         notes.over(path)
 
@@ -168,7 +172,6 @@ class Relocation:
 
         if probation is not None:
             probation.when_over(over)
-        self._give_back(system)
         notes.flush()
 
     # -- given up -----------------------------------------------------------------------------------------------------

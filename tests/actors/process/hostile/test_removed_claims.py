@@ -39,13 +39,6 @@ CHECKS = {
         CLAIMS,
         "test_a_claim_is_known_and_grants_nothing and protected",
     ),
-    "a bind that is undone leaves a claim": Check(
-        "system/transaction/wiring.py",
-        "is_claimed=self._was_claimed)",
-        "is_claimed=False)",
-        CLAIMS,
-        "test_a_bind_that_is_undone_leaves_a_claim",
-    ),
     "bindings that a process claims are addresses, and few": Check(
         "checkpoint/home/recorded_hosts.py",
         "            gate.claims(record.bindings)\n",
