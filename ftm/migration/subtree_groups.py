@@ -85,6 +85,11 @@ class SubtreeGroup(GroupHost):
                 self._wanted = None
             port.to_life(outcome)
 
+    @property
+    def starting(self) -> asyncio.Future[None] | None:
+        """The start that is under way, or the last one; its supervisor hears of its end."""
+        return self._starting
+
     def prepare(self, recipe: bytes, topics: list[str]) -> None:
         """A life is to be handed over, of an actor that begins so."""
         self._recipe, self._topics = recipe, topics

@@ -265,6 +265,12 @@ class IntoSubtree(Entering):
         self._group, self.place = group, group.place
         self.worker = worker_of(group.place, cell)
 
+    async def prepare(self) -> None:
+        """Wait until the supervisor knows of the life that is to come: it would not heed what is said of it."""
+        starting = self._group.starting
+        if starting is not None:
+            await self.move.within(asyncio.wait((starting,)), self.move.timeout, lambda: "its start was not over")
+
     def discard(self) -> None:
         self.place.arriving = None
         if self.move.transit is not None:
