@@ -37,12 +37,17 @@ class Gate:
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self.opened: asyncio.Future[None] = loop.create_future()
         self.reached: asyncio.Future[None] = loop.create_future()
-        self.is_waiting = False
+        self.is_waiting = self.is_closed = False
 
     def open(self) -> None:
         """All that comes may pass from now on."""
         if not self.opened.done():
             self.opened.set_result(None)
+
+    def close(self) -> None:
+        """Nothing passes any more, also what comes later."""
+        self.is_closed = True
+        self.open()
 
     @contextlib.contextmanager
     def waiting(self) -> Iterator[asyncio.Future[None]]:
@@ -212,11 +217,15 @@ class Move:
 
     async def _allowed(self) -> None:
         """Wait for leave to go on, for as long as it takes. Raises CannotMove: it was given up meanwhile."""
-        if self.gate is not None and not self.gate.opened.done():
+        if self.gate is None:
+            return
+        if not self.gate.opened.done():
             with self.gate.waiting() as opened:
                 await asyncio.wait((opened, self.given_up), return_when=asyncio.FIRST_COMPLETED)
-            if self.given_up.done():
-                raise CannotMove(self.cell.path, self.given_up.result())
+        if self.gate.is_closed:
+            self.give_up("it is not wanted any more")
+        if self.given_up.done():
+            raise CannotMove(self.cell.path, self.given_up.result())
 
     def commit(self) -> None:
         """From here on the new life is the one: nowhere else is it decided where an address lives.

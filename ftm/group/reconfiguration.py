@@ -370,6 +370,8 @@ class AdaptationEngine(Actor):
             with change.gate.waiting() as opened:
                 if not await self._ends(opened, change, self._now() + ALLOWED_WITHIN, "nobody has said that it may be"):
                     return False
+        if change.gate is not None and change.gate.is_closed:
+            change.give_up("it is not wanted any more")
         return not change.why and self._is_as_prepared(change)
 
     def _check_stands(self, change: Reconfiguration, stands: dict[str, Stand], primary: str) -> None:

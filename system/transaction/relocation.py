@@ -180,6 +180,8 @@ class Relocation:
         """It goes on where it is."""
         try:
             task = self._task
+            if self._gate is not None:
+                self._gate.close()
             if task is not None and not task.done():
                 cell = self._place.cell
                 while cell is not None and not task.done():  # What has only begun may not hear it yet.
