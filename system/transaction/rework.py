@@ -13,7 +13,7 @@ import msgspec
 
 from ...actors.control.orders import Conclude, Order, Prepare, ReplaceCode, ReplaceState, Resume, Suspend
 from ...actors.control.orders_lane import order
-from ...actors.errors import ActorStopped, AskFailed, ControlFailed
+from ...actors.errors import ActorStopped, AskFailed, ControlFailed, NotSuspended
 from ...actors.kernel import mailbox
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
@@ -179,7 +179,12 @@ class Rework:
         cell = self._place.living(system.node)
         switch = switch_of(cell)
         before = 0 if switch is None else len(switch.unsaved)
-        await asyncio.shield(self._concluded)
+        try:
+            await asyncio.shield(self._concluded)
+        except (AskFailed, ActorStopped, NotSuspended):
+            # That life has ended, as any may: the next one has what its home keeps, and begins as its spec says.
+            if self._held == (cell, cell.life) and cell.host.is_up(cell):
+                raise
         if switch is not None and len(switch.unsaved) > before:
             problem = f"the new state could not be saved ({switch.unsaved[-1]})"
             raise ControlFailed(cell.path, "replace_state", problem)

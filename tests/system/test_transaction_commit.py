@@ -426,6 +426,40 @@ async def test_a_binding_of_a_spec_follows_an_actor_and_not_its_old_address(syst
         assert await ref(system, path).ask(Where()) == "/app/pool/a"
 
 
+class Killed(hf.Operation):
+    """A step at whose commit the process of an actor is killed, which the root hears of later."""
+
+    verb = "kill"
+
+    def __init__(self, pid: int) -> None:
+        super().__init__(f"process {pid}")
+        self._pid = pid
+
+    async def check(self, system: hf.ActorSystem, draft: Any) -> None: ...
+
+    def commit(self, system: hf.ActorSystem) -> None:
+        os.kill(self._pid, signal.SIGKILL)
+
+
+@pytest.mark.parametrize("place", [0, 1, 2])
+async def test_a_process_that_dies_at_the_commit_loses_nothing_of_it(system: hf.ActorSystem, place: int) -> None:
+    recovery = hf.hybrid(interval=900.0)
+    a = await system.start(hf.child("a", hf.start(Counter, 500), recovery=recovery, isolation="process"))
+    b = await system.start(hf.child("b", hf.start(Counter, 500), recovery=recovery))
+    with system.events() as stream:
+        async with system.transaction(timeout=IN_TIME) as change:
+            steps: list[Callable[[], object]] = [
+                lambda: change.replace_state(a, taken),
+                lambda: change.replace_state(b, hundred),
+            ]
+            steps.insert(place, lambda: change.step(Killed(system.pid_of(a))))
+            for step in steps:
+                step()
+        assert (await a.ask(Add(0)), await b.ask(Add(0))) == (400, 600)
+        (told,) = [event for event in stream.take() if isinstance(event, hf.TransactionCommitted)]
+    assert told.problems == ()
+
+
 # -- the root ends ----------------------------------------------------------------------------------------------------
 
 
