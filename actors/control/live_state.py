@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 from ..errors import ControlFailed, error_text, portable, type_name
@@ -122,7 +122,7 @@ def tried_state(actor: Actor, changes: Iterable[Callable[[Any], Any]], verb: str
 
 
 @contextlib.contextmanager
-def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Iterator[None]:
+def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Generator[None]:
     """Have the state as it was before, behind a trial and behind whatever raises."""
     ctx = actor.ctx
     ctx.may_replace()

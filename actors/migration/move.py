@@ -11,7 +11,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import dataclasses
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Generator
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from ..errors import CannotMove, StartFailed
@@ -50,7 +50,7 @@ class Gate:
         self.open()
 
     @contextlib.contextmanager
-    def waiting(self) -> Iterator[asyncio.Future[None]]:
+    def waiting(self) -> Generator[asyncio.Future[None]]:
         """A change is ready, and waits for the future that it is given, or gives up."""
         self.is_waiting = True
         if not self.reached.done():

@@ -67,6 +67,7 @@ async def test_messages_that_were_queued_before_the_suspension_wait_too(
     suspended = asyncio.create_task(system.suspend(one))
     await asyncio.sleep(0)
     one.tell(Add(2))
+    await system.get_status(one)  # Answered in the turn: where the actor lives, what was sent before has come.
     gate.touch()
     assert await waiting == "waited"
     await suspended
