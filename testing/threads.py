@@ -35,22 +35,45 @@ class Threads:
         self._foreign = {thread for thread in threading.enumerate() if thread not in pools._threads_queues}
 
     def at_work(self) -> list[str]:
-        """The names of the threads that do not merely wait for another thread; none where the kernel does not tell."""
+        """The names of the threads that do not merely wait for another thread; none where the kernel does not tell.
+
+        Two looks must be alike: between two looks at one thread, another may have woken it and come to rest itself.
+        """
         if threading.active_count() == 1:
             return []
+        before = self._look()
+        at_work = [thread for thread, runs in before.items() if runs is None]
+        if not at_work and before:
+            at_work = [thread for thread, runs in self._look().items() if runs is None or runs != before.get(thread)]
+        return [thread.name for thread in at_work]
+
+    def _look(self) -> dict[threading.Thread, str | None]:
+        """How often each of the others had run when it began to wait for a lock; None: it is at work."""
         own = threading.current_thread()
         others = [thread for thread in threading.enumerate() if thread is not own and thread not in self._foreign]
-        return [thread.name for thread in others if not isinstance(thread, Onlooker) and _is_at_work(thread)]
+        return {thread: _runs(thread) for thread in others if not isinstance(thread, Onlooker)}
 
 
-def _is_at_work(thread: threading.Thread) -> bool:
-    """Whether a thread runs, sleeps, or waits for something other than a lock."""
+def _runs(thread: threading.Thread) -> str | None:
+    """How often a thread has run until it began to wait for a lock; None: it is at work."""
     try:
-        with open(f"/proc/self/task/{thread.native_id}/syscall", encoding="ascii") as file:
-            words = file.read().split()
+        # In this order: who has been woken is in its futex call until it runs, and only its status tells.
+        status, syscall = (_told(thread, file) for file in ("status", "syscall"))
     except OSError:
-        return False  # It has ended meanwhile, or this system has no such file.
+        return ""  # It has ended meanwhile, or this system has no such files.
+    return status.partition("ctxt_switches:")[2] if waits_for_a_lock(status, syscall) else None
+
+
+def _told(thread: threading.Thread, file: str) -> str:
+    with open(f"/proc/self/task/{thread.native_id}/{file}", encoding="ascii", errors="replace") as told:
+        return told.read()
+
+
+def waits_for_a_lock(status: str, syscall: str) -> bool:
+    """Whether a thread of which the kernel tells this goes on only when another thread lets it."""
+    words = syscall.split()
     if words[0] != str(FUTEX):
-        return FUTEX >= 0
+        return FUTEX < 0
     operation, value, timeout = int(words[2], 16) & 0x7F, int(words[3], 16), int(words[4], 16)
-    return operation not in WAITS or timeout != 0 or (operation, value) == MUTEX
+    is_lock = operation in WAITS and timeout == 0 and (operation, value) != MUTEX
+    return is_lock and "State:\tS" in status

@@ -13,7 +13,6 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
 import holdfast as hf
@@ -48,11 +47,13 @@ async def test_its_output_is_logged_under_the_path_of_its_actor(system: hf.Actor
 
 
 async def test_it_can_be_asked_how_it_is(system: hf.ActorSystem) -> None:
-    await system.start(sh("i=0; while [ $i -lt 30 ]; do echo $i; i=$((i+1)); done; printf 'end'; exec sleep 99"))
-    await until_line(system, "end")
+    script = 'i=0; while [ $i -lt 30 ]; do echo $i; i=$((i+1)); done; printf "end of $$"; exec sleep 99'
+    await system.start(sh(script))
+    pid = (await info(system)).pid
+    await until_line(system, f"end of {pid}")
     status = await info(system)
-    assert status.lines == [*map(str, range(11, 30)), "end"], "the last twenty, the one without an end too"
-    assert psutil.Process(status.pid).name() == "sleep"
+    assert status.lines == [*map(str, range(11, 30)), f"end of {pid}"], "the last twenty, the one without an end too"
+    assert status.pid == pid
     assert 0 < status.uptime < 30
 
 

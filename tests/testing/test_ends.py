@@ -12,6 +12,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.testing import GuardedSystem, NotIdle, Probe, VirtualClockLoop, advance, idle, probe
+from holdfast.testing.threads import FUTEX, Threads, waits_for_a_lock
 from tests.testing.players import Add, Counter, Total
 
 T = TypeVar("T")
@@ -200,6 +201,52 @@ def test_work_in_any_thread_holds_virtual_time_still(way: Callable[[Work], Await
 
     OLD_POOL.submit(int).result()  # Its thread runs before the loop is made.
     assert run(main) == 5.0
+
+
+def test_a_thread_that_was_woken_is_at_work_before_it_runs() -> None:
+    threads, lock, runs = Threads(), threading.Lock(), 0
+    is_over = False
+    lock.acquire()
+
+    def work() -> None:
+        nonlocal runs
+        while not is_over:
+            lock.acquire()
+            runs += 1
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    try:
+        for number in range(3000):
+            while threads.at_work():
+                time.sleep(0.0001)
+            assert runs == number
+            lock.release()
+            assert threads.at_work() or runs == number + 1
+    finally:
+        is_over = True
+        lock.release()
+        thread.join()
+
+
+STATUS = "Name:\tpython\nState:\t{}\nvoluntary_ctxt_switches:\t7\nnonvoluntary_ctxt_switches:\t1\n"
+LOCK = f"{FUTEX} 0x55d7 0x189 0x0 0x0 0x0 0xffffffff 0x7f 0x7f"
+
+
+@pytest.mark.parametrize(
+    ("state", "syscall", "waits"),
+    [
+        ("S (sleeping)", LOCK, True),
+        ("R (running)", LOCK, False),
+        ("S (sleeping)", LOCK.replace("0x189 0x0 0x0", "0x189 0x0 0x7ffe"), False),
+        ("S (sleeping)", LOCK.replace("0x189 0x0", "0x80 0x2"), False),
+        ("S (sleeping)", "230 0x1 0x0 0x7f 0x0 0x0 0x0 0x7f 0x7f", False),
+        ("R (running)", "running", False),
+    ],
+    ids=["lock", "woken", "with_a_limit", "mutex", "sleep", "runs"],
+)
+def test_only_who_waits_for_a_lock_is_not_at_work(state: str, syscall: str, waits: bool) -> None:
+    assert waits_for_a_lock(STATUS.format(state), syscall) is waits
 
 
 def test_a_thread_that_does_not_come_to_an_end_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
