@@ -118,6 +118,8 @@ class StartChild(Order[Any]):
 
     `spec` is a child spec; a dynamic supervisor takes a bare `start(...)` too. From a template a child is started by
     `StartChild(args=(...), kwargs={...}, id=...)`. With `fresh` nothing comes back that was recorded at its address.
+    A `candidate` (a number that nobody else uses) may be asked for twice, and withdrawn: nobody knows what has become
+    of a request when its supervisor ends.
     """
 
     spec: Any = None
@@ -125,6 +127,7 @@ class StartChild(Order[Any]):
     kwargs: dict[str, Any] = msgspec.field(default_factory=dict[str, Any])
     id: str | None = None
     fresh: bool = False
+    candidate: int = 0
 
     def __post_init__(self) -> None:
         msgspec.structs.force_setattr(self, "spec", boxed(self.spec))
@@ -167,6 +170,13 @@ class DeleteChild(Order[None]):
 
     id: str
     erase: bool = True
+
+
+class WithdrawChild(Order[None]):
+    """Stop and forget a child, and what was recorded of it, if it was started as this candidate; else do nothing."""
+
+    id: str
+    candidate: int
 
 
 class ChildInfo(Message[None]):

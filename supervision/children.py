@@ -37,6 +37,7 @@ class Child:
     retry: int = 0  # the number of the retry that counts; stale ones are dropped
     up: asyncio.Future[None] | None = None  # a start that is waited for outside our turn; None once it is known or void
     row: Row | None = None  # those that are started one after another, and it is one of them
+    candidate: int = 0  # as whose candidate it was started; 0: it is none
 
     @property
     def is_running(self) -> bool:

@@ -27,6 +27,7 @@ from .admin import (
     RestartChild,
     StartChild,
     TerminateChild,
+    WithdrawChild,
     opened,
 )
 from .change import check_place, new_plan, succession
@@ -491,8 +492,11 @@ class Supervisor(Inquiries):
 
     async def _add(self, message: StartChild) -> Any:
         spec = self._spec_in(message)
+        known = self._candidate(spec.id, message.candidate)
+        if known is not None:
+            return known.cell.ref if known.cell is not None else None
         self._check_free(spec)
-        one = Child(spec)
+        one = Child(spec, candidate=message.candidate)
         return await self._start_by_hand(one, self._enlist, self._unlist, fresh=message.fresh)
 
     async def _start_by_hand(
@@ -539,6 +543,27 @@ class Supervisor(Inquiries):
         check_spec("StartChild", spec, self._flags.auto_shutdown)
         check_place("StartChild", (spec,), own.node)
         return spec
+
+    def _candidate(self, name: str, candidate: int) -> Child | None:
+        """The child that was started as this candidate."""
+        one = self._children.get(name)
+        return one if one is not None and candidate and one.candidate == candidate else None
+
+    @on(WithdrawChild)
+    def _withdraw_child(self, message: WithdrawChild) -> ReplyHandle[Any]:
+        """Stop and forget a candidate."""
+        return self._answered(self._withdraw(message))
+
+    async def _withdraw(self, message: WithdrawChild) -> None:
+        one = self._candidate(message.id, message.candidate)
+        if one is None:
+            return
+        if one.up is not None and one.cell is not None:
+            one.cell.kill()  # Its start would hold up who gives it up for as long as it likes.
+        await self._stop(one)
+        if self._children.get(message.id) is one:
+            self._erase(one)
+            self._forget(one)
 
     @on(TerminateChild)
     def _terminate_child(self, message: TerminateChild) -> ReplyHandle[Any]:

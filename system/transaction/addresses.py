@@ -13,18 +13,16 @@ class Moved:
 
     def __init__(self, node: Node, outside: Callable[[str], Cell | None]) -> None:
         self._node, self._outside = node, outside
-        self._cells: dict[str, Cell] = {}
+        self._cells = node.vacated
 
     def leave(self, path: str, cell: Cell) -> None:
-        """The actor at `path` has another address now."""
-        # Who was restarted since it came here has another cell now, and goes on with it.
-        known = {old: cell if other.path == path else other for old, other in self._cells.items()}
-        self._cells = {old: other for old, other in known.items() if old != cell.path}
-        self._cells[path] = cell
-
-    def forget(self, path: str) -> None:
-        """Nobody ever had this address."""
-        self._cells.pop(path, None)
+        """The actor at `path` has another address now, and all who move with it have theirs."""
+        for old, other in list(self._cells.items()):
+            if other.path == path:  # Who was restarted since it came here has another cell now, and goes on with it.
+                self._cells[old] = cell
+        self._cells.pop(cell.path, None)
+        if self._at(path) is None:
+            self._cells[path] = cell
 
     def find(self, path: str) -> Cell | None:
         """What the node asks when nobody lives at `path` now."""
@@ -42,9 +40,10 @@ class Moved:
 
     def _living(self, cell: Cell) -> Cell | None:
         """The cell, or who lives at its address now (never found through an address that was left: no circles)."""
-        if cell.state is not GONE:
-            return cell
+        return cell if cell.state is not GONE else self._at(cell.path)
+
+    def _at(self, path: str) -> Cell | None:
         at: Cell | None = self._node.root
-        for name in cell.path.split("/")[2:]:
+        for name in path.split("/")[2:]:
             at = (at.children or {}).get(name) if at is not None else None
         return at

@@ -24,9 +24,12 @@ from .operation import wrong
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
+    from .arrangement import Arrangement
     from .relocation import Relocation
     from .rework import Rework
 
+START_TIMEOUT = 3600.0
+"""Seconds a child may take to start; the transaction's own time limit is shorter."""
 Target = ActorRef[Any] | str
 """What an operation is about: a ref, or the address at that point of the transaction."""
 
@@ -35,6 +38,7 @@ class Place:
     """One address in the draft. `cell` is None while nobody has lived there: it is to be added."""
 
     __slots__ = (
+        "before",
         "bindings",
         "cell",
         "children",
@@ -44,6 +48,7 @@ class Place:
         "is_planned",
         "is_stopped",
         "is_suspended",
+        "is_switched",
         "kind",
         "name",
         "names",
@@ -51,7 +56,8 @@ class Place:
         "relocation",
         "rework",
         "spec",
-        "was",
+        "wanted",
+        "was_below",
     )
 
     def __init__(self, name: str, parent: Place | None, cell: Cell | None, spec: ChildSpec | None) -> None:
@@ -66,7 +72,10 @@ class Place:
         self.is_suspended = cell is not None and cell.more is not None and cell.more.suspended
         self.bindings: dict[str, Place] = {}
         self.names: list[str] = []
-        self.was = (parent, name)  # where it is before the transaction
+        self.was_below = parent  # before the transaction
+        self.before: frozenset[str] = frozenset()  # the names of those that are below it before the transaction
+        self.is_switched = False  # its spec says otherwise whether it is started with the others
+        self.wanted: dict[str, Any] = {}  # flags that change
         self.rework: Rework | None = None  # what is changed in the actor itself
         self.relocation: Relocation | None = None  # and where it lives
 
@@ -74,6 +83,17 @@ class Place:
     def path(self) -> str:
         """The address at this point."""
         return self.name if self.parent is None else f"{self.parent.path}/{self.name}"
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether it is below another supervisor than before."""
+        return not self.is_planned and self.parent is not self.was_below
+
+    @property
+    def comes_last(self) -> bool:
+        """Whether it is added where somebody lives until the transaction is in force: it is started then."""
+        above = self.parent
+        return self.is_planned and above is not None and not above.is_planned and self.name in above.before
 
     @property
     def is_supervisor(self) -> bool:
@@ -122,8 +142,16 @@ class Place:
             raise NoSuchActor(self.path)
         return cell
 
-    def check_lived_in(self, node: Node) -> None:
-        """Whether somebody lives here at this point. Raises NoSuchActor, or SpecError: a step before stops it."""
+    def check_lived_in(self, node: Node, *, before_commit: bool = True) -> None:
+        """Whether somebody lives here at this point, and also before the transaction is in force.
+
+        Raises:
+            NoSuchActor: nobody does. SpecError: a step before stops it, or it is started only when all is in force.
+        """
+        if self.comes_last and before_commit:
+            raise wrong(
+                self.path, "its address is free only when this transaction is in force: do this in the next one"
+            )
         if not self.is_stopped:
             return
         self.living(node)
@@ -163,11 +191,13 @@ def rules() -> Any:
 class Draft:
     """All places, as they are at this point of the transaction."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, arrangement: Arrangement) -> None:
         root = node.root
         assert root is not None
         self.node = node
         self.by_cell: dict[Cell, Place] = {}
+        self._asked: set[Place] = set()  # supervisors of other processes that have told us whom they have
+        self.arrangement = arrangement
         self.root = self._survey(root, root.path, None, None)
         for cell, place in list(self.by_cell.items()):
             for port, target in (cell.more.bindings if cell.more is not None else {}).items():
@@ -197,6 +227,7 @@ class Draft:
         for child in below.values():
             own = child.spec if isinstance(child.spec, ChildSpec) else None
             place.children[child.name] = self._survey(child, child.name, place, own)
+        place.before = frozenset(place.children)
         return place
 
     def find(self, target: Target, *, parts: bool = False) -> Place:
@@ -209,7 +240,7 @@ class Draft:
         Raises:
             NoSuchActor: there will be nobody at that point. SpecError: a step before removes it, or it is such a part.
         """
-        place = self.by_cell.get(target._cell) if isinstance(target, ActorRef) else None
+        place = self._of(target._cell) if isinstance(target, ActorRef) else None
         if place is None:
             place = self._at(target if isinstance(target, str) else target.path)
         at: Place | None = place
@@ -220,6 +251,12 @@ class Draft:
         if not parts:
             self._check_no_part(place.path, place.parent)
         return place
+
+    def _of(self, cell: Cell) -> Place | None:
+        """Where an actor is at this point, whose life may be over: then it is who has followed it before all steps."""
+        if cell not in self.by_cell and cell.state is GONE:
+            cell = self.node.successor(cell) or cell
+        return self.by_cell.get(cell)
 
     def _check_no_part(self, path: str, above: Place | None) -> None:
         """Whether what is below `above` is nobody's mechanism. Raises SpecError."""
@@ -260,10 +297,14 @@ class Draft:
         if place.actor is None:
             if not is_elsewhere(cell):
                 raise ActorRestarting(place.path)
-            ref: ActorRef[Supervisor] = ActorRef(cell)
-            for info in await ref.ask(WhichChildren()):  # It is in another process: it knows best.
-                if info.id not in place.children:
-                    place.children[info.id] = Place(info.id, place, None, None)
+            if place not in self._asked:  # It is in another process, and knows best.
+                self._asked.add(place)
+                ref: ActorRef[Supervisor] = ActorRef(cell)
+                known = place.children
+                below = [info.id for info in await ref.ask(WhichChildren())]
+                told = {name: known.get(name) or Place(name, place, None, None) for name in below}
+                place.children = {**told, **{name: one for name, one in known.items() if name not in told}}
+                place.before = frozenset(place.children)
         return place
 
     def check(self) -> None:

@@ -44,39 +44,15 @@ def keep(cell: Cell, edit: Edit) -> None:
     _put(holder, cell, Start(start.kind, (flags_after, children), start.kwargs))
 
 
-def without(name: str) -> Edit:
-    """The child of this id is no more."""
-    return lambda flags, specs: (flags, tuple(spec for spec in specs if spec.id != name))
-
-
-def with_child(spec: ChildSpec) -> Edit:
-    """One more child, behind the others."""
-    return lambda flags, specs: (flags, (*(other for other in specs if other.id != spec.id), spec))
-
-
-def changed(name: str, **fields: Any) -> Edit:
-    """The child of this id with other fields in its spec."""
-    return lambda flags, specs: (
-        flags,
-        tuple(dataclasses.replace(spec, **fields) if spec.id == name else spec for spec in specs),
-    )
-
-
-def in_order(ids: list[str]) -> Edit:
-    """The children in another order; those that are not mentioned behind the others."""
-    rank = {name: number for number, name in enumerate(ids)}
-    return lambda flags, specs: (flags, tuple(sorted(specs, key=lambda spec: rank.get(spec.id, len(rank)))))
-
-
 class Renamed:
-    """Specs and recipes in which the address of an actor that has moved, and those below it, are the new ones."""
+    """Specs and recipes in which the addresses of actors that have moved, and of those below them, are the new ones."""
 
-    def __init__(self, was: str, now: str) -> None:
-        self._was, self._now = was, now
+    def __init__(self, now: dict[str, str]) -> None:
+        self._now = dict(sorted(now.items(), key=lambda one: -len(one[0])))  # Who is below comes first.
         self._made: dict[int, tuple[Any, Any]] = {}  # by the identity of the old: what was one stays one
 
     def keep(self, root: Cell) -> None:
-        """Have all that look after others, at and below this cell, know it by its new address."""
+        """Have all that look after others, at and below this cell, know them by their new addresses."""
         waiting = [root]
         while waiting:
             cell = waiting.pop()
@@ -90,8 +66,10 @@ class Renamed:
                     one.spec = self._spec(one.spec)
 
     def _path(self, path: str) -> str:
-        is_meant = path == self._was or path.startswith(f"{self._was}/")
-        return self._now + path[len(self._was) :] if is_meant else path
+        for was, now in self._now.items():
+            if path == was or path.startswith(f"{was}/"):
+                return now + path[len(was) :]
+        return path
 
     def _spec(self, spec: ChildSpec) -> ChildSpec:
         if id(spec) not in self._made:

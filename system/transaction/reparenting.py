@@ -4,19 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.lifecycle import LOCAL
 from ...checkpoint.home.homes import Homes
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.admin import NotSupported
-from ...supervision.children import STOPPED, UP, Child
-from ...supervision.supervisor import Supervisor
-from .addresses import Moved
+from ...supervision.children import STOPPED, UP
+from .arrangement import busy, child_of
 from .draft import Draft, Place, Target, is_elsewhere
-from .lasting import Renamed, keep, with_child, without
 from .operation import Operation, wrong
-from .structure import busy, check_child, child_of, text_of
+from .structure import check_child, text_of
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -31,7 +28,6 @@ class Move(Operation):
         super().__init__(text_of(target))
         self._at, self._to = target, supervisor
         self._place: Place | None = None
-        self._draft: Draft | None = None
         self._above: Place | None = None  # the new supervisor, at this point
         self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
         self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
@@ -58,65 +54,29 @@ class Move(Operation):
         check_child(new, place.spec)
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
-        self._place, self._draft, self._above = place, draft, new
+        self._place, self._above = place, new
         self._leads = not (place.is_moved or place.is_planned)  # Who is added is started where it is to be.
         place.is_moved = True
         self.between_turns_of = (old, new)
-
-    def _ends(self, system: ActorSystem) -> tuple[Cell, Cell] | None:
-        """The supervisors that it leaves and comes to; None if it is to stay, or another step moves it."""
-        place = self._place
-        assert place is not None
-        old, new = place.was[0], place.parent
-        assert old is not None
-        assert new is not None
-        return (old.living(system.node), new.living(system.node)) if self._leads and old is not new else None
+        for holder in (old, new):
+            draft.arrangement.touch(holder, self)
 
     def ready(self, system: ActorSystem) -> str:
-        ends = self._ends(system)
-        if ends is None:
-            return ""
         place = self._place
         assert place is not None
-        for holder in ends:
-            if why := busy(holder):
-                return why
-        old, new = ends
+        if not (self._leads and place.has_moved):
+            return ""
+        assert place.was_below is not None
+        old = place.was_below.living(system.node)
+        if why := busy(old):
+            return why
         one = child_of(old, place.name)
         if one is None:
             raise wrong(old.path, f"it has no child {place.name!r} any more")
         if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
             return f"{self.target} is being restarted"
-        self._check_free(new, place.name)
         settle_senders(system.homes, self._asked)
         return WAITING if unsettled(system.homes) else ""
-
-    def _check_free(self, new: Cell, name: str) -> None:
-        """Raises SpecError: somebody came to live at the new address meanwhile, and stays there."""
-        assert self._draft is not None
-        known = child_of(new, name)
-        cell = (new.children or {}).get(name) or (known.cell if known is not None else None)
-        place = self._draft.by_cell.get(cell) if cell is not None else None
-        if (known is not None or cell is not None) and (place is None or not place.is_moved):
-            raise wrong(new.path, f"it has a child {name!r} already")
-
-    def commit(self, system: ActorSystem) -> None:
-        ends = self._ends(system)
-        if ends is None:
-            return
-        assert self._place is not None
-        old, new = (cell.actor for cell in ends)
-        assert isinstance(old, Supervisor)
-        assert isinstance(new, Supervisor)
-        one = old._children[self._place.name]
-        keep(ends[0], without(one.spec.id))
-        if one.spec.restart != "temporary":
-            keep(ends[1], with_child(one.spec))
-        was = f"{ends[0].path}/{one.spec.id}"
-        move_child(old, new, one, system.moved_addresses)
-        root = system.node.root
-        assert root is not None
-        Renamed(was, f"{ends[1].path}/{one.spec.id}").keep(root)
 
 
 def check_movable(place: Place) -> None:
@@ -132,22 +92,6 @@ def check_movable(place: Place) -> None:
         cell is not None and cell.host is not LOCAL
     ):
         raise wrong(place.path, "its journal is kept by its address: a recorded actor cannot be moved")
-
-
-def move_child(old: Supervisor, new: Supervisor, one: Child, moved: Moved) -> None:
-    """Put a child from one supervisor under another, between two turns of both."""
-    name, cell = one.spec.id, one.cell
-    del old._children[name]
-    new._children[name] = one
-    if cell is None or cell.state is GONE:
-        return
-    was, above = cell.path, new.ctx.cell
-    (old.ctx.cell.children or {}).pop(name, None)
-    above.children = {**(above.children or {}), name: cell}
-    cell.parent = above
-    moved.leave(was, cell)
-    if cell.state is DOWN and one.state == UP:
-        return  # Its end waits in the old supervisor's queue, which hands it on.
 
 
 WAITING = "recorded actors may have to repeat what they sent to it: their snapshots are waited for"

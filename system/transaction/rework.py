@@ -22,8 +22,8 @@ from ...actors.process.wire.start_codec import unpack_recipe
 from ...checkpoint.home.outputs import switch_of
 from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
+from .arrangement import busy
 from .operation import wrong
-from .structure import busy
 
 if TYPE_CHECKING:
     from ..system import ActorSystem

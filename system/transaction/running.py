@@ -10,10 +10,10 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import NotSupported, RestartChild, TerminateChild
 from ...supervision.supervisor import Supervisor
-from .draft import Draft, Place, Target, check_awake, is_elsewhere
-from .lasting import changed, keep
+from .arrangement import child_of
+from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
 from .operation import Operation, wrong
-from .structure import START_TIMEOUT, busy, child_of, text_of
+from .structure import text_of
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
@@ -24,13 +24,14 @@ class OnChild(Operation):
 
     def __init__(self, target: str) -> None:
         super().__init__(target)
-        self._above: Place | None = None
         self._place: Place | None = None
         self._name = ""
 
-    def _take(self, above: Place, place: Place, *, starts: bool) -> None:
-        self._above, self._place, self._name = above, place, place.name
-        self.target, self.between_turns_of = f"{above.path}/{place.name}", (above,)
+    def _take(self, draft: Draft, place: Place, *, starts: bool) -> None:
+        above = place.parent
+        assert above is not None
+        self._place, self._name = place, place.name
+        self.target, self.between_turns_of = place.path, (above,)
         if above.is_dynamic or above.is_partitioned:
             raise NotSupported("a child without a place of its own cannot be stopped for a while: remove it")
         if above.cell is None or is_elsewhere(above.cell):
@@ -38,37 +39,8 @@ class OnChild(Operation):
         check_awake(above)
         assert place.spec is not None
         place.spec = dataclasses.replace(place.spec, autostart=starts)
-        place.is_stopped = not starts
-
-    def _supervisor(self, system: ActorSystem) -> Cell:
-        """Who looks after it at this instant: another step may move it."""
-        assert self._above is not None
-        cell = self._place.cell if self._place is not None else None
-        if cell is not None and not cell.is_dead and cell.parent is not None:
-            return cell.parent
-        return self._above.living(system.node)
-
-    def ready(self, system: ActorSystem) -> str:
-        supervisor = self._supervisor(system)
-        if why := busy(supervisor):
-            return why
-        if child_of(supervisor, self._name) is None:
-            raise NoSuchActor(self.target)
-        return ""
-
-    def _put(self, system: ActorSystem, *, starts: bool) -> None:
-        """From now on its supervisor starts it with the others, or does not."""
-        supervisor = self._supervisor(system)
-        one = child_of(supervisor, self._name)
-        assert one is not None
-        one.spec = dataclasses.replace(one.spec, autostart=starts)
-        if one.cell is not None:
-            one.cell.spec = one.spec
-        keep(supervisor, changed(self._name, autostart=starts))
-
-    async def _stop(self, supervisor: Cell) -> None:
-        above: ActorRef[Supervisor] = ActorRef(supervisor)
-        await above.ask(TerminateChild(self._name), START_TIMEOUT)
+        place.is_stopped, place.is_switched = not starts, True
+        draft.arrangement.touch(above, self)
 
 
 class StopChild(OnChild):
@@ -89,18 +61,32 @@ class StopChild(OnChild):
             raise wrong(place.path, "it is added by this very transaction")
         if place.spec.restart == "temporary":
             raise wrong(place.path, "its spec is temporary, and would not stay: remove it")
-        self._take(place.parent, place, starts=False)
+        self._take(draft, place, starts=False)
         stopped = set(place.walk())
         for owner in draft.staying():
             bound = next((to for to in owner.bindings.values() if to in stopped), None)
             if bound is not None and owner not in stopped:
                 raise wrong(owner.path, f"a binding of it would point at {bound.path}, which is stopped")
 
-    def commit(self, system: ActorSystem) -> None:
-        self._put(system, starts=False)
+    def ready(self, system: ActorSystem) -> str:
+        place = self._place
+        assert place is not None
+        assert place.was_below is not None
+        if child_of(place.was_below.living(system.node), self._name) is None:
+            raise NoSuchActor(self.target)
+        return ""
 
     async def finish(self, system: ActorSystem) -> None:
-        await self._stop(self._supervisor(system))
+        place = self._place
+        assert place is not None
+        assert place.parent is not None
+        await stop_child(place.parent.living(system.node), self._name)
+
+
+async def stop_child(supervisor: Cell, name: str) -> None:
+    """Stop a child whose spec stays."""
+    ref: ActorRef[Supervisor] = ActorRef(supervisor)
+    await ref.ask(TerminateChild(name), START_TIMEOUT)
 
 
 class StartAgain(OnChild):
@@ -122,9 +108,15 @@ class StartAgain(OnChild):
             raise NoSuchActor(self.target)
         if not place.is_stopped:
             raise wrong(self.target, "it runs")
-        self._take(above, place, starts=True)
+        self._take(draft, place, starts=True)
         if place.cell is not None and not place.cell.is_dead:
             raise wrong(self.target, "it is stopped by this very transaction")
+
+    def _supervisor(self, system: ActorSystem) -> Cell:
+        """Who has it until the transaction is in force: there it is started, and goes from there if it is moved."""
+        assert self._place is not None
+        assert self._place.was_below is not None
+        return self._place.was_below.living(system.node)
 
     async def prepare(self, system: ActorSystem) -> None:
         supervisor = self._supervisor(system)
@@ -140,18 +132,14 @@ class StartAgain(OnChild):
             self._place.cell = ref._cell
 
     def ready(self, system: ActorSystem) -> str:
-        if why := super().ready(system):
-            return why
         supervisor = self._supervisor(system)
+        if child_of(supervisor, self._name) is None:
+            raise NoSuchActor(self.target)
         if supervisor is not self._asked or supervisor.life != self._life:
             return f"{supervisor.path} has been restarted"
         cell = (supervisor.children or {}).get(self._name)
-        return (
-            "" if self._is_over or (cell is not None and cell.host.is_up(cell)) else f"{self.target} is being started"
-        )
-
-    def commit(self, system: ActorSystem) -> None:
-        self._put(system, starts=True)
+        is_up = self._is_over or (cell is not None and cell.host.is_up(cell))
+        return "" if is_up else f"{self.target} is being started"
 
     async def release(self, system: ActorSystem) -> None:
         supervisor = self._asked
@@ -160,4 +148,4 @@ class StartAgain(OnChild):
         cell = (supervisor.children or {}).get(self._name)
         if cell is not None and not cell.host.is_up(cell):
             cell.kill()  # Its start would hold up its supervisor, and us, for as long as it likes.
-        await self._stop(supervisor)
+        await stop_child(supervisor, self._name)

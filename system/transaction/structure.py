@@ -3,39 +3,37 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+import itertools
+from typing import TYPE_CHECKING, Any, ClassVar
 
-from ...actors.errors import ActorStopped, AskTimeout, HoldfastError, StartFailed
+from ...actors.errors import ActorStopped, StartFailed
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import (
     AlreadyPresent,
     Boxed,
-    ChangeSupervisor,
+    ChildBusy,
     DeleteChild,
     MaxChildren,
     NoSuchChild,
     NotSupported,
+    RestartChild,
     StartChild,
     TerminateChild,
+    WithdrawChild,
 )
 from ...supervision.change import check_subtree
-from ...supervision.children import Child
 from ...supervision.dynamic import check_dynamic
 from ...supervision.spec import NAMELESS, ChildSpec, Flags, Plan, check_spec, child
 from ...supervision.supervisor import Supervisor
-from .draft import Draft, Place, Target, check_awake, is_elsewhere
-from .lasting import Specs, in_order, keep, recipe_flags, recipe_specs, with_child, without
+from .arrangement import planned_spec
+from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
+from .lasting import recipe_specs
 from .operation import Operation, wrong
 
 if TYPE_CHECKING:
     from ..system import ActorSystem
-
-T = TypeVar("T")
-
-START_TIMEOUT = 3600.0
-"""Seconds a child may take to start; the transaction's own time limit is shorter."""
 
 
 def text_of(target: Target) -> str:
@@ -52,15 +50,14 @@ class Add(Operation):
         super().__init__(f"{text_of(supervisor)}/{spec.id}")
         self._at, self.spec = supervisor, spec
         self._place: Place | None = None
-        self._asked: Cell | None = None  # the supervisor that was asked, and is not known to have refused
+        self._candidate = next(CANDIDATES)
+        self._asked: Cell | None = None  # the supervisor that was asked
         self._life = 0  # of that supervisor
         self._is_over = False  # it has been up, and has ended by itself as it may
-        self._comes_last = False  # its address is free only when the transaction is in force
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         above, spec = await draft.supervisor(self._at), self.spec
         check_child(above, spec)
-        self._comes_last = any(one.was == (above, spec.id) for one in draft.by_cell.values())
         check_awake(above)
         if above.cell is not None and is_elsewhere(above.cell):
             check_subtree(above.path, (spec,))
@@ -68,35 +65,28 @@ class Add(Operation):
         self.between_turns_of = (above,)
         self._place = _planned(draft, above, spec)
         self.target = self._place.path
+        draft.arrangement.touch(above, self)
 
     @property
     def _own(self) -> tuple[Place, Place] | None:
-        """The supervisor and the child; None if it comes with a supervisor that is added too."""
+        """The supervisor and the child; None if it is not started before the commit by order."""
         place = self._place
         assert place is not None
         above = place.parent
         assert above is not None
-        return None if above.is_planned else (above, place)
+        return None if above.is_planned or place.comes_last or self._is_over else (above, place)
 
     async def prepare(self, system: ActorSystem) -> None:
-        if self._own is None or self._is_over or self._comes_last:
+        if self._own is None:
             return
         above, place = self._own
-        await self._start(system, above, place)
-
-    async def _start(self, system: ActorSystem, above: Place, place: Place) -> None:
         cell = above.living(system.node)
         if self._asked is cell and self._life == cell.life and place.name in (cell.children or {}):
             return  # It is being restarted.
         supervisor: ActorRef[Supervisor] = ActorRef(cell)
         self._asked, self._life = cell, cell.life
-        try:
-            ref = await supervisor.ask(StartChild(planned_spec(place, in_force=False)), START_TIMEOUT)
-        except AskTimeout:
-            raise
-        except HoldfastError:
-            self._asked = None  # It has refused, or the start has failed: nothing is left of it.
-            raise
+        spec = planned_spec(place, in_force=False)
+        ref = await supervisor.ask(StartChild(spec, candidate=self._candidate), START_TIMEOUT)
         if ref is None:
             self._is_over = True  # It did not want to be started.
             return
@@ -105,7 +95,7 @@ class Add(Operation):
             _grant(place)
 
     def ready(self, system: ActorSystem) -> str:
-        if self._own is None or self._is_over or self._comes_last:
+        if self._own is None:
             return ""
         above, place = self._own
         supervisor = above.living(system.node)
@@ -123,59 +113,33 @@ class Add(Operation):
         _fill(place, cell)
         return ""
 
-    def commit(self, system: ActorSystem) -> None:
-        if self._own is None:
-            return
-        above, place = self._own
-        supervisor, spec = above.living(system.node), planned_spec(place, in_force=True)
-        child = child_of(supervisor, place.name)
-        if child is not None and not self._comes_last:
-            child.spec = spec
-            if child.cell is not None:
-                child.cell.spec, child.cell.extra().start = spec, spec.start
-        if spec.restart != "temporary" and not above.is_dynamic:
-            keep(supervisor, with_child(spec))
-
     async def finish(self, system: ActorSystem) -> None:
-        if self._own is not None and self._comes_last:
-            await self._start(system, *self._own)
+        place = self._place
+        assert place is not None
+        if not place.comes_last:
+            return
+        assert place.parent is not None
+        supervisor: ActorRef[Supervisor] = ActorRef(place.parent.living(system.node))
+        try:
+            ref = await supervisor.ask(RestartChild(place.name), START_TIMEOUT)
+        except ChildBusy:
+            return  # Its supervisor was restarted, and has started it.
+        if ref is not None:
+            _fill(place, ref._cell)
 
     async def release(self, system: ActorSystem) -> None:
         supervisor = self._asked
-        if supervisor is None or supervisor.is_dead or supervisor.life != self._life:
+        if supervisor is None or supervisor.is_dead:
             return  # What was started has ended with it.
-        cell = (supervisor.children or {}).get(self.spec.id)
-        if cell is not None and not cell.host.is_up(cell):
-            cell.kill()  # Its start would hold up its supervisor, and us, for as long as it likes.
-        await forget(supervisor, self.spec.id)
+        ref: ActorRef[Supervisor] = ActorRef(supervisor)
+        try:
+            await ref.ask(WithdrawChild(self.spec.id, self._candidate), START_TIMEOUT)
+        except ActorStopped:
+            pass  # The same.
 
 
-def child_of(supervisor: Cell, name: str) -> Child | None:
-    """A child as its supervisor has it, if that lives in this process."""
-    actor = supervisor.actor
-    return actor._listed().get(name) if isinstance(actor, Supervisor) else None
-
-
-def planned_spec(place: Place, *, in_force: bool) -> ChildSpec:
-    """The spec of a child that is added, with all that the transaction says of it and of those below it.
-
-    Its bindings are those that its start finds, or those that are in force with the transaction.
-    """
-    spec = place.spec
-    assert spec is not None
-    bound = {port: to for port, to in place.bindings.items() if port in spec.bindings}
-    paths = {port: to.path if in_force or to.cell is None else to.cell.path for port, to in bound.items()}
-    changes: dict[str, Any] = {"bindings": {**spec.bindings, **paths}}
-    if place.flags is not None and len(spec.start.args) == 2 and not place.is_dynamic:
-        below = tuple(
-            planned_spec(one, in_force=in_force)
-            for one in place.children.values()
-            if one.is_planned and one.spec is not None and not one.is_leaving
-        )
-        changes["start"] = Start(spec.start.kind, (place.flags, below), spec.start.kwargs)
-    elif place.flags is not None and len(spec.start.args) == 2:
-        changes["start"] = Start(spec.start.kind, (place.flags, spec.start.args[1]), spec.start.kwargs)
-    return dataclasses.replace(spec, **changes)
+CANDIDATES = itertools.count(1)
+"""Each child that a transaction starts is known by a number, should its supervisor end before it has answered."""
 
 
 def check_child(above: Place, spec: ChildSpec) -> None:
@@ -258,21 +222,8 @@ class Remove(Operation):
             raise wrong(place.path, "it is added by this very transaction")
         self.target = place.path
         place.is_leaving = True
-
-    def ready(self, system: ActorSystem) -> str:
-        place = self._place
-        assert place is not None
-        above = place.parent
-        if above is not None and above.cell is not None and above.is_supervisor:
-            above.living(system.node)
-        return ""
-
-    def commit(self, system: ActorSystem) -> None:
-        place = self._place
-        assert place is not None
-        above = place.parent
-        if above is not None and above.cell is not None and above.is_supervisor:
-            keep(above.living(system.node), without(place.name))
+        if above.is_supervisor:
+            draft.arrangement.touch(above, self, only_recipe=True)
 
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
@@ -297,45 +248,7 @@ class OnSupervisor(Operation):
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         place = self._place = await draft.supervisor(self._at)
         self.target, self.between_turns_of = place.path, (place,)
-
-    def _cell(self, system: ActorSystem) -> Cell:
-        assert self._place is not None
-        return self._place.living(system.node)
-
-    @property
-    def _is_elsewhere(self) -> bool:
-        return self._place is not None and self._place.cell is not None and is_elsewhere(self._place.cell)
-
-    def ready(self, system: ActorSystem) -> str:
-        assert self._place is not None
-        if self._place.is_planned:
-            return ""
-        return "" if self._is_elsewhere else busy(self._cell(system))
-
-    def commit(self, system: ActorSystem) -> None:
-        assert self._place is not None
-        if self._place.is_planned and not self._place.is_dynamic:
-            return  # Its spec says so already.
-        cell = self._cell(system)
-        keep(cell, self._edit)
-        if isinstance(cell.actor, Supervisor):
-            self._arrange(cell.actor)
-
-    def _edit(self, flags: Flags, specs: Specs) -> tuple[Flags, Specs]:
-        """Flags and children of the recipe as they are from now on."""
-        raise NotImplementedError
-
-    def _arrange(self, supervisor: Supervisor) -> None:
-        """The same of one that lives in this process."""
-        raise NotImplementedError
-
-    async def finish(self, system: ActorSystem) -> None:
-        if not self._is_elsewhere:
-            return
-        cell = self._cell(system)
-        flags, specs = recipe_flags(cell), recipe_specs(cell)
-        ref: ActorRef[Supervisor] = ActorRef(cell)
-        await ref.ask(ChangeSupervisor(flags=flags, children=list(specs or ())), START_TIMEOUT)
+        draft.arrangement.touch(place, self, is_told=True)
 
 
 class Reorder(OnSupervisor):
@@ -366,15 +279,8 @@ class Reorder(OnSupervisor):
             specs = recipe_specs(place.cell)
             if specs is None or set(self._ids) - {spec.id for spec in specs}:
                 raise NotSupported("it lives in another process, and its specs are known there only")
-        place.children = sorted_first(place.children, self._ids)
-
-    def _edit(self, flags: Flags, specs: Specs) -> tuple[Flags, Specs]:
-        return in_order(self._ids)(flags, specs)
-
-    def _arrange(self, supervisor: Supervisor) -> None:
-        supervisor._children = sorted_first(supervisor._children, self._ids)
-        cell = supervisor.ctx.cell
-        cell.children = sorted_first(cell.children or {}, list(supervisor._children))
+        first = {name: place.children[name] for name in self._ids}
+        place.children = {**first, **place.children}
 
 
 class SetFlags(OnSupervisor):
@@ -397,28 +303,9 @@ class SetFlags(OnSupervisor):
                 "it lives in another process and its class has an init of its own: only it knows its flags"
             )
         place.flags = dataclasses.replace(place.flags, **self._wanted)
+        place.wanted.update(self._wanted)
         if place.is_dynamic:
             check_dynamic(place.path, Plan.of(place.flags, ()))
-
-    def _edit(self, flags: Flags, specs: Specs) -> tuple[Flags, Specs]:
-        return dataclasses.replace(flags, **self._wanted), specs
-
-    def _arrange(self, supervisor: Supervisor) -> None:
-        supervisor._flags = dataclasses.replace(supervisor._flags, **self._wanted)
-
-
-def busy(supervisor: Cell) -> str:
-    """Why a supervisor of this process is not between two turns; "" if it is."""
-    actor, more = supervisor.actor, supervisor.more
-    if not isinstance(actor, Supervisor) or "_children" not in actor.__dict__ or (more is not None and more.turn):
-        return f"{supervisor.path} is in the middle of something"
-    return ""
-
-
-def sorted_first(known: dict[str, T], ids: list[str]) -> dict[str, T]:
-    """With these first, in this order; the others behind them."""
-    first = {name: known[name] for name in ids if name in known}
-    return {**first, **{name: one for name, one in known.items() if name not in first}}
 
 
 def named_spec(supervisor: Target, spec: ChildSpec | Start[Any], taken: set[str], system: ActorSystem) -> ChildSpec:

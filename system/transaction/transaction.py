@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from ...actors.errors import HoldfastError, SpecError, error_text, type_name
 from ...actors.kernel.ref import current
 from ...supervision.arbiter import on_errand
+from .arrangement import Arrangement
 from .change import Change
 from .draft import Draft, difference
 from .errors import TransactionFailed, TransactionRefused
@@ -43,6 +44,7 @@ class Transaction:
         self._system, self._shared = system, shared
         self._dry_run, self._timeout = dry_run, timeout
         self._change = Change(system)
+        self._arrangement = Arrangement()
         self._draft: Draft | None = None
         self._task: asyncio.Task[Any] | None = None
         self._problems: list[str] = []  # of what is in force, and could not be followed
@@ -100,7 +102,7 @@ class Transaction:
     async def _check(self, deadline: float) -> None:
         """All checks of all steps, each against the tree as it will be."""
         change, system = self._change, self._system
-        draft = self._draft = Draft(system.node)
+        draft = self._draft = Draft(system.node, self._arrangement)
         before = draft.lines()
         for operation in change.operations:
             await self._in_time(operation.text, deadline, lambda one=operation: one.check(system, draft))  # type: ignore[misc]
@@ -135,9 +137,12 @@ class Transaction:
                             late = operation
                             break
                     if late is None:
-                        break
+                        failed, waiting = "", self._arrangement.ready(system)
+                        if not waiting:
+                            break
                     await asyncio.sleep(LOOK_AGAIN)
-                    await late.prepare(system)
+                    if late is not None:
+                        await late.prepare(system)
             failed, waiting = "commit", ""
             system.homes.journal.barrier()
             self._commit()  # In the same step of the loop in which all were ready.
@@ -146,6 +151,7 @@ class Transaction:
                 cause = f"not within {self._timeout:g} s{f': {waiting}' if waiting else ''}"
             else:
                 cause = said(error)
+            failed = failed or self._arrangement.step
             undone, kept = await self._release(begun)
             self._emit(TransactionRolledBack(self._address, self._texts, failed, cause, kept))
             if isinstance(error, (HoldfastError, TimeoutError)):
@@ -156,11 +162,14 @@ class Transaction:
         """Put all of it in force, with no wait in between: there is no way back from here."""
         try:
             with self._system.homes.journal.together():
-                for operation in self._change.operations:
+                for text, commit in [
+                    (self._arrangement.step, self._arrangement.commit),
+                    *((one.text, one.commit) for one in self._change.operations),
+                ]:
                     try:
-                        operation.commit(self._system)
+                        commit(self._system)
                     except Exception as error:  # It had said that it is ready: the others are in force all the same.
-                        self._problems.append(f"{operation.text}: {said(error)}")
+                        self._problems.append(f"{text}: {said(error)}")
         except HoldfastError as error:
             self._problems.append(f"it is not in the store, which has failed: {said(error)}")
 
@@ -206,11 +215,14 @@ class Transaction:
     async def _finish_all(self) -> None:
         problems = self._problems
         try:
-            for operation in self._change.operations:
+            for text, finish in [
+                (self._arrangement.step, self._arrangement.finish),
+                *((one.text, one.finish) for one in self._change.operations),
+            ]:
                 try:
-                    await operation.finish(self._system)
+                    await finish(self._system)
                 except Exception as error:  # The tree has changed; the others are tidied up all the same.
-                    problems.append(f"{operation.text}: {said(error)}")
+                    problems.append(f"{text}: {said(error)}")
         finally:
             self._shared.lock.release()
             self._emit(TransactionCommitted(self._address, self._texts, tuple(problems)))

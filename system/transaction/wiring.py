@@ -36,7 +36,7 @@ class Bind(Operation):
         self._bound = draft.find(self._to)
         self.target = owner.path
         for place in (owner, self._bound):
-            place.check_lived_in(system.node)
+            place.check_lived_in(system.node, before_commit=False)
         kind = owner.kind
         if kind is not None and self._port not in kind._bindings:
             known = ", ".join(sorted(kind._bindings)) or "none"
@@ -46,8 +46,9 @@ class Bind(Operation):
     def ready(self, system: ActorSystem) -> str:
         assert self._owner is not None
         assert self._bound is not None
-        self._owner.living(system.node)
-        self._bound.living(system.node)
+        for place in (self._owner, self._bound):
+            if not place.comes_last:
+                place.living(system.node)
         return ""
 
     def commit(self, system: ActorSystem) -> None:

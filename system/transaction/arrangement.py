@@ -1,0 +1,242 @@
+"""What a transaction makes of the supervisors: who has which children, in which order, and by which flags.
+
+The steps say so in the draft. At the commit all supervisors that they are about follow it at once, and their recipes
+with them, so that a restart of a supervisor keeps it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from ...actors.errors import HoldfastError
+from ...actors.kernel.actor import Start
+from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.ref import ActorRef
+from ...supervision.admin import ChangeSupervisor
+from ...supervision.children import Child, new_cell
+from ...supervision.spec import ChildSpec, Flags
+from ...supervision.supervisor import Supervisor
+from .draft import START_TIMEOUT, Place, is_elsewhere
+from .lasting import Renamed, Specs, keep, recipe_flags, recipe_specs
+from .operation import Operation, wrong
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from ..system import ActorSystem
+
+
+class Arrangement:
+    """The supervisors that change, and the steps that say so."""
+
+    def __init__(self) -> None:
+        self._steps: dict[Place, Operation] = {}  # the first one about each
+        self._rearranged: set[Place] = set()  # whose children, as they live now, change too
+        self._told: set[Place] = set()  # to be told, if they live in another process
+        self.step = ""
+        """The step that is in the way, or has failed."""
+
+    def touch(self, place: Place, step: Operation, *, only_recipe: bool = False, is_told: bool = False) -> None:
+        """A step is about this supervisor."""
+        self._steps.setdefault(place, step)
+        if not only_recipe:
+            self._rearranged.add(place)
+        if is_told:
+            self._told.add(place)
+
+    @property
+    def _places(self) -> list[Place]:
+        """Those that are there already; what is added begins as its spec says. Who is above comes first."""
+        return sorted((one for one in self._steps if not one.is_planned), key=lambda one: one.path.count("/"))
+
+    def ready(self, system: ActorSystem) -> str:
+        """What is in the way of a commit at this very instant, in words; "" if nothing is.
+
+        Raises:
+            HoldfastError: it cannot be done any more.
+        """
+        for place in self._places:
+            self.step = self._steps[place].text
+            cell = place.living(system.node)
+            if is_elsewhere(cell) or place not in self._rearranged:
+                continue
+            if why := busy(cell):
+                return why
+            for name, child in place.children.items():
+                is_taken = child_of(cell, name) is not None or name in (cell.children or {})
+                if child.has_moved and is_taken and name not in place.before:
+                    raise wrong(place.path, f"it has a child {name!r} already")
+        return ""
+
+    def commit(self, system: ActorSystem) -> None:
+        """Put it in force."""
+        cells = {place: place.living(system.node) for place in self._places}
+        here = {
+            place: cell.actor
+            for place, cell in cells.items()
+            if place in self._rearranged and isinstance(cell.actor, Supervisor)
+        }
+        moved = [child for place in here for child in place.children.values() if child.has_moved]
+        was = {child: f"{cells[_left(child)].path}/{child.name}" for child in moved}
+        if moved:
+            settle_bindings(system.node.root)
+        taken = {child: here[_left(child)]._children.pop(child.name) for child in moved}
+        for place, supervisor in here.items():
+            _arrange(place, supervisor, taken)
+        _readdress(here, taken)
+        for child, path in was.items():
+            cell = taken[child].cell
+            if cell is not None and cell.state is not GONE:
+                system.moved_addresses.leave(path, cell)
+        for place, supervisor in here.items():
+            _respecify(place, supervisor)
+        for place, cell in cells.items():
+            keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
+        if moved and system.node.root is not None:
+            Renamed({path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}).keep(
+                system.node.root
+            )
+
+    async def finish(self, system: ActorSystem) -> None:
+        """Tell those that live in other processes."""
+        for place in self._told - {place for place in self._told if place.is_planned}:
+            cell = place.living(system.node)
+            if is_elsewhere(cell):
+                flags, specs = recipe_flags(cell), recipe_specs(cell)
+                ref: ActorRef[Supervisor] = ActorRef(cell)
+                await ref.ask(ChangeSupervisor(flags=flags, children=list(specs or ())), START_TIMEOUT)
+
+
+def busy(supervisor: Cell) -> str:
+    """Why a supervisor of this process is not between two turns; "" if it is."""
+    actor, more = supervisor.actor, supervisor.more
+    if not isinstance(actor, Supervisor) or "_children" not in actor.__dict__ or (more is not None and more.turn):
+        return f"{supervisor.path} is in the middle of something"
+    return ""
+
+
+def child_of(supervisor: Cell, name: str) -> Child | None:
+    """A child as its supervisor has it, if that lives in this process."""
+    actor = supervisor.actor
+    return actor._listed().get(name) if isinstance(actor, Supervisor) else None
+
+
+def settle_bindings(root: Cell | None) -> None:
+    """Who is bound to a life that is over is bound to the one that has followed it, wherever that goes now."""
+    waiting = [] if root is None else [root]
+    while waiting:
+        cell = waiting.pop()
+        waiting.extend((cell.children or {}).values())
+        if cell.more is None:
+            continue
+        for bindings in (cell.more.bindings, cell.more.turn.rebinds if cell.more.turn is not None else None):
+            for port, target in (bindings or {}).items():
+                lives = cell.node.successor(target) if target.state is GONE else None
+                if bindings is not None and lives is not None:
+                    bindings[port] = lives
+
+
+def planned_spec(place: Place, *, in_force: bool) -> ChildSpec:
+    """The spec of a child that is added, with all that the transaction says of it and of those below it.
+
+    Its bindings are those that its start finds, or those that are in force with the transaction.
+    """
+    spec = place.spec
+    assert spec is not None
+    bound = {port: to for port, to in place.bindings.items() if port in spec.bindings}
+    paths = {port: to.path if in_force or to.cell is None else to.cell.path for port, to in bound.items()}
+    changes: dict[str, Any] = {"bindings": {**spec.bindings, **paths}}
+    if place.flags is not None and len(spec.start.args) == 2 and not place.is_dynamic:
+        below = tuple(
+            planned_spec(one, in_force=in_force)
+            for one in place.children.values()
+            if one.is_planned and one.spec is not None and not one.is_leaving
+        )
+        changes["start"] = Start(spec.start.kind, (place.flags, below), spec.start.kwargs)
+    elif place.flags is not None and len(spec.start.args) == 2:
+        changes["start"] = Start(spec.start.kind, (place.flags, spec.start.args[1]), spec.start.kwargs)
+    return dataclasses.replace(spec, **changes)
+
+
+def _below(place: Place) -> Place:
+    """Whose child it is now."""
+    assert place.parent is not None
+    return place.parent
+
+
+def _left(place: Place) -> Place:
+    """Whose child it was before the transaction."""
+    assert place.was_below is not None
+    return place.was_below
+
+
+def _arrange(place: Place, supervisor: Supervisor, taken: dict[Place, Child]) -> None:
+    """The children in the order of the draft; those that came meanwhile, and are not known there, behind them."""
+    known, children = supervisor._children, dict[str, Child]()
+    for name, child in place.children.items():
+        one = taken.get(child) or known.get(name)
+        if one is None and child.comes_last:
+            one = Child(planned_spec(child, in_force=True))
+        if one is not None:
+            children[name] = one
+    supervisor._children = {**children, **{name: one for name, one in known.items() if name not in children}}
+    supervisor._flags = dataclasses.replace(supervisor._flags, **place.wanted)
+
+
+def _readdress(here: dict[Place, Supervisor], taken: dict[Place, Child]) -> None:
+    """Each cell below the supervisor that has it now, in the order of the children."""
+    cells: dict[Place, Cell] = {}
+    for child, one in taken.items():
+        if one.cell is not None and one.cell.state is not GONE and one.cell.parent is not None:
+            (one.cell.parent.children or {}).pop(child.name, None)
+            cells[child] = one.cell
+    for child, cell in cells.items():  # If it is between two lives, the old supervisor hands on what it hears of it.
+        above = here[_below(child)].ctx.cell
+        above.children = {**(above.children or {}), child.name: cell}
+        cell.parent = above
+    for supervisor in here.values():
+        cell = supervisor.ctx.cell
+        below = cell.children or {}
+        first = {name: below[name] for name in supervisor._children if name in below}
+        cell.children = {**first, **below}
+
+
+def _respecify(place: Place, supervisor: Supervisor) -> None:
+    """What the specs say from now on; who comes now has an address, at which messages wait for its start."""
+    for name, child in place.children.items():
+        one = supervisor._children.get(name)
+        if one is None:
+            continue
+        if child.is_planned:
+            one.spec = planned_spec(child, in_force=True)
+        elif child.is_switched and child.spec is not None:
+            one.spec = dataclasses.replace(one.spec, autostart=child.spec.autostart)
+        else:
+            continue
+        if child.comes_last:
+            try:
+                child.cell = one.cell = new_cell(supervisor.ctx.cell, one)
+            except HoldfastError:
+                pass  # Its start will say so.
+        elif one.cell is not None:
+            one.cell.spec, one.cell.extra().start = one.spec, one.spec.start
+
+
+def _edited(place: Place, flags: Flags, specs: Specs, taken: dict[Place, Child]) -> tuple[Flags, Specs]:
+    """A supervisor's recipe as it is from now on."""
+    known = {spec.id: spec for spec in specs}
+    left = place.before - place.children.keys()
+    after: list[ChildSpec] = []
+    for name, child in place.children.items():
+        spec = known.pop(name, None)
+        if child.is_planned:
+            spec = planned_spec(child, in_force=True)
+        elif child in taken:
+            spec = taken[child].spec
+        elif spec is not None and child.is_switched and child.spec is not None:
+            spec = dataclasses.replace(spec, autostart=child.spec.autostart)
+        if spec is not None and not child.is_leaving and spec.restart != "temporary":
+            after.append(spec)
+    after += [spec for name, spec in known.items() if name not in left]
+    return dataclasses.replace(flags, **place.wanted), tuple(after)
