@@ -493,10 +493,11 @@ class Supervisor(Inquiries):
     async def _add(self, message: StartChild) -> Any:
         spec = self._spec_in(message)
         known = self._candidate(spec.id, message.candidate)
-        if known is not None:
+        if known is not None and known.state != STOPPED:
             return known.cell.ref if known.cell is not None else None
-        self._check_free(spec)
-        one = Child(spec, candidate=message.candidate)
+        if known is None:
+            self._check_free(spec)
+        one = known or Child(spec, candidate=message.candidate)
         return await self._start_by_hand(one, self._enlist, self._unlist, fresh=message.fresh)
 
     async def _start_by_hand(

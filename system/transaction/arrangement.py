@@ -47,8 +47,9 @@ class Arrangement:
 
     @property
     def _places(self) -> list[Place]:
-        """Those that are there already; what is added begins as its spec says. Who is above comes first."""
-        return sorted((one for one in self._steps if not one.is_planned), key=lambda one: one.path.count("/"))
+        """Those that change, from above. What is added begins as its spec says, but others may come there."""
+        there = [place for place in self._steps if not place.is_planned or place.is_moved_to]
+        return sorted(there, key=lambda one: one.path.count("/"))
 
     def ready(self, system: ActorSystem) -> str:
         """What is in the way of a commit at this very instant, in words; "" if nothing is.
@@ -100,9 +101,9 @@ class Arrangement:
 
     async def finish(self, system: ActorSystem) -> None:
         """Tell those that live in other processes."""
-        for place in self._told - {place for place in self._told if place.is_planned}:
-            cell = place.living(system.node)
-            if is_elsewhere(cell):
+        for place in self._told:
+            cell = place.living(system.node) if not place.is_planned else None
+            if cell is not None and is_elsewhere(cell):
                 flags, specs = recipe_flags(cell), recipe_specs(cell)
                 ref: ActorRef[Supervisor] = ActorRef(cell)
                 await ref.ask(ChangeSupervisor(flags=flags, children=list(specs or ())), START_TIMEOUT)
@@ -177,7 +178,7 @@ def _arrange(place: Place, supervisor: Supervisor, taken: dict[Place, Child]) ->
     for name, child in place.children.items():
         one = taken.get(child) or known.get(name)
         if one is None and child.comes_last:
-            one = Child(planned_spec(child, in_force=True))
+            one = Child(planned_spec(child, in_force=True), candidate=child.candidate)
         if one is not None:
             children[name] = one
     supervisor._children = {**children, **{name: one for name, one in known.items() if name not in children}}

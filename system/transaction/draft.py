@@ -40,6 +40,7 @@ class Place:
     __slots__ = (
         "before",
         "bindings",
+        "candidate",
         "cell",
         "children",
         "flags",
@@ -75,6 +76,7 @@ class Place:
         self.was_below = parent  # before the transaction
         self.before: frozenset[str] = frozenset()  # the names of those that are below it before the transaction
         self.is_switched = False  # its spec says otherwise whether it is started with the others
+        self.candidate = 0  # as which it is started, if it is added
         self.wanted: dict[str, Any] = {}  # flags that change
         self.rework: Rework | None = None  # what is changed in the actor itself
         self.relocation: Relocation | None = None  # and where it lives
@@ -88,6 +90,11 @@ class Place:
     def has_moved(self) -> bool:
         """Whether it is below another supervisor than before."""
         return not self.is_planned and self.parent is not self.was_below
+
+    @property
+    def is_moved_to(self) -> bool:
+        """Whether somebody else's child comes here."""
+        return any(child.has_moved for child in self.children.values())
 
     @property
     def comes_last(self) -> bool:
@@ -132,6 +139,13 @@ class Place:
         yield self
         for child in self.children.values():
             yield from child.walk()
+
+    def upwards(self) -> Iterator[Place]:
+        """This place, and all above it."""
+        at: Place | None = self
+        while at is not None:
+            yield at
+            at = at.parent
 
     def living(self, node: Node) -> Cell:
         """The cell that lives here now. Raises NoSuchActor."""
@@ -243,11 +257,9 @@ class Draft:
         place = self._of(target._cell) if isinstance(target, ActorRef) else None
         if place is None:
             place = self._at(target if isinstance(target, str) else target.path)
-        at: Place | None = place
-        while at is not None:
+        for at in place.upwards():
             if at.is_leaving:
                 raise wrong(place.path, f"{at.path} is removed by this very transaction")
-            at = at.parent
         if not parts:
             self._check_no_part(place.path, place.parent)
         return place
@@ -317,7 +329,7 @@ class Draft:
             if place.is_suspended and any(child.is_leaving for child in place.children.values()):
                 check_awake(place)
             for port, target in place.bindings.items():
-                if any(above.is_leaving for above in _upwards(target)):
+                if any(above.is_leaving for above in target.upwards()):
                     raise wrong(place.path, f"its binding {port!r} would point at {target.path}, which is removed")
 
     def staying(self) -> Iterator[Place]:
@@ -343,13 +355,6 @@ def check_awake(place: Place) -> None:
 def is_elsewhere(cell: Cell) -> bool:
     """Whether an actor lives in another process than the root's."""
     return isinstance(cell.host, (ProcessHost, OutsideHost))
-
-
-def _upwards(place: Place) -> Iterator[Place]:
-    at: Place | None = place
-    while at is not None:
-        yield at
-        at = at.parent
 
 
 def difference(before: list[str], after: list[str]) -> list[str]:

@@ -49,6 +49,11 @@ class Move(Operation):
         for above in (old, new):
             if above.cell is not None and is_elsewhere(above.cell):
                 raise wrong(above.path, "it lives in another process, which a life cannot enter or leave")
+        for above in new.upwards():
+            if above.comes_last:
+                raise wrong(
+                    new.path, "it is started only when this transaction is in force: move to it in the next one"
+                )
         for one in place.walk():
             check_movable(one)
         check_child(new, place.spec)

@@ -12,13 +12,12 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import (
     AlreadyPresent,
+    AlreadyStarted,
     Boxed,
-    ChildBusy,
     DeleteChild,
     MaxChildren,
     NoSuchChild,
     NotSupported,
-    RestartChild,
     StartChild,
     TerminateChild,
     WithdrawChild,
@@ -50,7 +49,6 @@ class Add(Operation):
         super().__init__(f"{text_of(supervisor)}/{spec.id}")
         self._at, self.spec = supervisor, spec
         self._place: Place | None = None
-        self._candidate = next(CANDIDATES)
         self._asked: Cell | None = None  # the supervisor that was asked
         self._life = 0  # of that supervisor
         self._is_over = False  # it has been up, and has ended by itself as it may
@@ -64,6 +62,7 @@ class Add(Operation):
             Boxed(spec).packed()
         self.between_turns_of = (above,)
         self._place = _planned(draft, above, spec)
+        self._place.candidate = next(CANDIDATES)
         self.target = self._place.path
         draft.arrangement.touch(above, self)
 
@@ -86,7 +85,7 @@ class Add(Operation):
         supervisor: ActorRef[Supervisor] = ActorRef(cell)
         self._asked, self._life = cell, cell.life
         spec = planned_spec(place, in_force=False)
-        ref = await supervisor.ask(StartChild(spec, candidate=self._candidate), START_TIMEOUT)
+        ref = await supervisor.ask(StartChild(spec, candidate=place.candidate), START_TIMEOUT)
         if ref is None:
             self._is_over = True  # It did not want to be started.
             return
@@ -121,19 +120,19 @@ class Add(Operation):
         assert place.parent is not None
         supervisor: ActorRef[Supervisor] = ActorRef(place.parent.living(system.node))
         try:
-            ref = await supervisor.ask(RestartChild(place.name), START_TIMEOUT)
-        except ChildBusy:
-            return  # Its supervisor was restarted, and has started it.
-        if ref is not None:
-            _fill(place, ref._cell)
+            await supervisor.ask(
+                StartChild(planned_spec(place, in_force=True), candidate=place.candidate), START_TIMEOUT
+            )
+        except (AlreadyPresent, AlreadyStarted):
+            pass  # Its supervisor was restarted, and knows it from its recipe.
 
     async def release(self, system: ActorSystem) -> None:
-        supervisor = self._asked
-        if supervisor is None or supervisor.is_dead:
+        supervisor, place = self._asked, self._place
+        if supervisor is None or supervisor.is_dead or place is None:
             return  # What was started has ended with it.
         ref: ActorRef[Supervisor] = ActorRef(supervisor)
         try:
-            await ref.ask(WithdrawChild(self.spec.id, self._candidate), START_TIMEOUT)
+            await ref.ask(WithdrawChild(place.name, place.candidate), START_TIMEOUT)
         except ActorStopped:
             pass  # The same.
 
