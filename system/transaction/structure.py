@@ -40,52 +40,40 @@ def text_of(target: Target) -> str:
     return target if isinstance(target, str) else target.path
 
 
-class Add(Operation):
-    """Start one more child of a supervisor. It runs before the commit, and is nobody's child for good until then."""
+CANDIDATES = itertools.count(1)
+"""Each child that a transaction starts is known by a number, should its supervisor end before it has answered."""
 
-    verb: ClassVar[str] = "add"
 
-    def __init__(self, supervisor: Target, spec: ChildSpec) -> None:
-        super().__init__(f"{text_of(supervisor)}/{spec.id}")
-        self._at, self.spec = supervisor, spec
-        self._place: Place | None = None
+class Newcomer:
+    """A child that is added. Its supervisor starts it before the commit, and gives it up if there is none.
+
+    If that supervisor is added too it begins with it; where somebody lives until the commit it is started behind it.
+    """
+
+    def __init__(self, place: Place) -> None:
+        self.place = place
+        place.candidate = next(CANDIDATES)
         self._asked: Cell | None = None  # the supervisor that was asked
         self._life = 0  # of that supervisor
         self._is_over = False  # it has been up, and has ended by itself as it may
 
-    async def check(self, system: ActorSystem, draft: Draft) -> None:
-        above, spec = await draft.supervisor(self._at), self.spec
-        check_child(above, spec)
-        check_awake(above)
-        if above.cell is not None and is_elsewhere(above.cell):
-            check_subtree(above.path, (spec,))
-            Boxed(spec).packed()
-        self.between_turns_of = (above,)
-        self._place = _planned(draft, above, spec)
-        self._place.candidate = next(CANDIDATES)
-        self.target = self._place.path
-        draft.arrangement.touch(above, self)
-
     @property
-    def _own(self) -> tuple[Place, Place] | None:
-        """The supervisor and the child; None if it is not started before the commit by order."""
-        place = self._place
-        assert place is not None
-        above = place.parent
+    def _above(self) -> Place | None:
+        """Its supervisor; None if that one is not asked to start it before the commit."""
+        place, above = self.place, self.place.parent
         assert above is not None
-        return None if above.is_planned or place.comes_last or self._is_over else (above, place)
+        return None if above.is_planned or place.comes_last or self._is_over else above
 
     async def prepare(self, system: ActorSystem) -> None:
-        if self._own is None:
+        """Have it started."""
+        above, place = self._above, self.place
+        if above is None:
             return
-        above, place = self._own
         cell = above.living(system.node)
         if self._asked is cell and self._life == cell.life and place.name in (cell.children or {}):
             return  # It is being restarted.
-        supervisor: ActorRef[Supervisor] = ActorRef(cell)
         self._asked, self._life = cell, cell.life
-        spec = planned_spec(place, in_force=False)
-        ref = await supervisor.ask(StartChild(spec, candidate=place.candidate), START_TIMEOUT)
+        ref = await self._start(cell, in_force=False)
         if ref is None:
             self._is_over = True  # It did not want to be started.
             return
@@ -93,17 +81,26 @@ class Add(Operation):
         if is_elsewhere(cell):
             _grant(place)
 
+    async def _start(self, above: Cell, *, in_force: bool) -> ActorRef[Any] | None:
+        supervisor: ActorRef[Supervisor] = ActorRef(above)
+        spec = planned_spec(self.place, in_force=in_force)
+        ref: ActorRef[Any] | None = await supervisor.ask(
+            StartChild(spec, candidate=self.place.candidate), START_TIMEOUT
+        )
+        return ref
+
     def ready(self, system: ActorSystem) -> str:
-        if self._own is None:
+        """Whether it is up, as the child of the life that its supervisor lives now."""
+        above, place = self._above, self.place
+        if above is None:
             return ""
-        above, place = self._own
         supervisor = above.living(system.node)
         if supervisor is not self._asked or supervisor.life != self._life:
             return f"{above.path} has been restarted"
         cell = (supervisor.children or {}).get(place.name)
         if cell is None and place.cell is not None:
-            reason = place.cell.extra().reason
-            if place.cell.is_dead and reason.is_clean and self.spec.restart != "permanent":
+            reason, spec = place.cell.extra().reason, place.spec
+            if place.cell.is_dead and reason.is_clean and spec is not None and spec.restart != "permanent":
                 self._is_over = True
                 return ""
             raise StartFailed(place.path, f"it has ended: {reason}")
@@ -113,32 +110,62 @@ class Add(Operation):
         return ""
 
     async def finish(self, system: ActorSystem) -> None:
-        place = self._place
-        assert place is not None
-        if not place.comes_last:
+        """Start it where its address was not free before."""
+        if not self.place.comes_last:
             return
-        assert place.parent is not None
-        supervisor: ActorRef[Supervisor] = ActorRef(place.parent.living(system.node))
+        assert self.place.parent is not None
         try:
-            await supervisor.ask(
-                StartChild(planned_spec(place, in_force=True), candidate=place.candidate), START_TIMEOUT
-            )
+            await self._start(self.place.parent.living(system.node), in_force=True)
         except (AlreadyPresent, AlreadyStarted):
             pass  # Its supervisor was restarted, and knows it from its recipe.
 
-    async def release(self, system: ActorSystem) -> None:
-        supervisor, place = self._asked, self._place
-        if supervisor is None or supervisor.is_dead or place is None:
+    async def release(self) -> None:
+        """Nothing is left of it."""
+        if self._asked is None or self._asked.is_dead:
             return  # What was started has ended with it.
-        ref: ActorRef[Supervisor] = ActorRef(supervisor)
+        supervisor: ActorRef[Supervisor] = ActorRef(self._asked)
         try:
-            await ref.ask(WithdrawChild(place.name, place.candidate), START_TIMEOUT)
+            await supervisor.ask(WithdrawChild(self.place.name, self.place.candidate), START_TIMEOUT)
         except ActorStopped:
             pass  # The same.
 
 
-CANDIDATES = itertools.count(1)
-"""Each child that a transaction starts is known by a number, should its supervisor end before it has answered."""
+class Add(Operation):
+    """Start one more child of a supervisor, and those that come with it."""
+
+    verb: ClassVar[str] = "add"
+
+    def __init__(self, supervisor: Target, spec: ChildSpec) -> None:
+        super().__init__(f"{text_of(supervisor)}/{spec.id}")
+        self._at, self.spec = supervisor, spec
+        self._newcomers: list[Newcomer] = []
+
+    async def check(self, system: ActorSystem, draft: Draft) -> None:
+        above, spec = await draft.supervisor(self._at), self.spec
+        check_child(above, spec)
+        check_awake(above)
+        if above.cell is not None and is_elsewhere(above.cell):
+            check_subtree(above.path, (spec,))
+            Boxed(spec).packed()
+        self.between_turns_of = (above,)
+        self._newcomers = [Newcomer(place) for place in _planned(draft, above, spec).walk()]
+        self.target = self._newcomers[0].place.path
+        draft.arrangement.touch(above, self)
+
+    async def prepare(self, system: ActorSystem) -> None:
+        for one in self._newcomers:
+            await one.prepare(system)
+
+    def ready(self, system: ActorSystem) -> str:
+        return next((why for one in self._newcomers if (why := one.ready(system))), "")
+
+    async def finish(self, system: ActorSystem) -> None:
+        for one in self._newcomers:
+            await one.finish(system)
+
+    async def release(self, system: ActorSystem) -> None:
+        for one in reversed(self._newcomers):
+            await one.release()
 
 
 def check_child(above: Place, spec: ChildSpec) -> None:

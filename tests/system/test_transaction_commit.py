@@ -183,6 +183,29 @@ SHAPES: dict[str, Callable[[hf.Change], object]] = {
     "reorder": lambda change: change.reorder("/app/left", ["c", "a"]),
     "strategy": lambda change: change.strategy("/app/left", "rest_for_one"),
     "intensity": lambda change: change.intensity("/app/left", 77, 7.0),
+    "move and add": lambda change: (
+        change.move("/app/left/b", "/app/right"),
+        change.add("/app/right", counter("g")),
+        change.reorder("/app/right", ["g", "d"]),
+        change.move("/app/left/a", "/app/right"),
+    ),
+    "replace": lambda change: (change.move("/app/left/b", "/app/right"), change.add("/app/left", counter("b", 100))),
+    "replace stopped": lambda change: (
+        change.move("/app/right/e", "/app/left"),
+        change.add("/app/right", counter("e", 100)),
+    ),
+    "move and start": lambda change: (change.move("/app/right/e", "/app/left"), change.start("/app/left", "e")),
+    "move and stop": lambda change: (change.move("/app/left/b", "/app/right"), change.stop("/app/right/b")),
+    "swap": lambda change: (
+        change.add("/app/right", hf.supervisor("way", children=[counter("b", 100)])),
+        change.move("/app/left/b", "/app/right"),
+        change.move("/app/right/way/b", "/app/left"),
+    ),
+    "move to what is added": lambda change: (
+        change.add("/app/right", hf.supervisor("new")),
+        change.move("/app/left/b", "/app/right/new"),
+        change.add("/app/right/new", counter("g")),
+    ),
 }
 
 
@@ -278,6 +301,23 @@ async def test_what_is_committed_is_in_force_though_a_supervisor_was_restarted_i
             assert after["/app/left"][0].strategy == "rest_for_one"
         case "intensity":
             assert after["/app/left"][0].intensity == 77
+        case "move and add":
+            assert [child for child, _ in after["/app/left"][1]] == ["c"]
+            assert [child for child, _ in after["/app/right"][1]] == ["g", "d", "e", "client", "b", "a"]
+        case "replace" | "swap":
+            assert [child for child, _ in after["/app/left"][1]] == ["a", "c", "b"]
+            assert await ref(system, "/app/left/b").ask(Add(1)) == 101
+            assert await ref(system, "/app/right/b").ask(Add(1)) == 1
+        case "replace stopped":
+            assert ("e", "stopped") in after["/app/left"][1]
+            assert await ref(system, "/app/right/e").ask(Add(1)) == 101
+        case "move and start":
+            assert ("e", "running") in after["/app/left"][1]
+        case "move and stop":
+            assert ("b", "stopped") in after["/app/right"][1]
+        case "move to what is added":
+            tree = [path for path in after["tree"] if path.startswith("/app/right/new")]
+            assert tree == ["/app/right/new", "/app/right/new/b", "/app/right/new/g"]
         case _:
             assert "/app/left/b" in after["tree"]
 
@@ -300,6 +340,129 @@ async def test_several_steps_about_one_child_are_all_in_force(system: hf.ActorSy
     assert await ref(system, "/app/right/sub/y").ask(Add(1)) == 1
     flags = ref(system, "/app/right/sub")._cell.actor._flags  # type: ignore[union-attr]
     assert flags.strategy == "one_for_all"
+
+
+# -- addresses --------------------------------------------------------------------------------------------------------
+
+
+async def test_the_children_stand_in_the_order_that_the_steps_say(system: hf.ActorSystem) -> None:
+    async with system.transaction(dry_run=True) as dry:
+        SHAPES["move and add"](dry)
+    async with system.transaction(timeout=IN_TIME) as change:
+        SHAPES["move and add"](change)
+    cell = ref(system, "/app/right")._cell
+    assert isinstance(cell.actor, hf.Supervisor)
+    assert list(cell.actor._children) == ["g", "d", "e", "client", "b", "a"]
+    assert list(cell.children or {}) == ["g", "d", "client", "b", "a"]
+    assert dry.difference == change.difference
+
+
+async def test_who_comes_to_an_address_that_was_left_can_be_bound_at_once(system: hf.ActorSystem) -> None:
+    """It has its address, at which messages wait for its start, from the commit on."""
+    client, moved = ref(system, "/app/right/client"), ref(system, "/app/left/a")
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(moved, "/app/pool")
+        change.add("/app/left", counter("a", 100))
+        change.bind(client, "peer", "/app/left/a")
+    assert await client.ask(Where()) == "/app/left/a"
+    assert await client._cell.extra().bindings["peer"].ref.ask(Add(1)) == 101
+    assert await moved.ask(Add(1)) == 1
+
+
+@pytest.mark.parametrize("what", ["register", "suspend", "replace_state", "move to it"])
+async def test_what_needs_it_earlier_is_refused(system: hf.ActorSystem, what: str) -> None:
+    with pytest.raises(hf.TransactionRefused, match="when this transaction is in force"):
+        async with system.transaction() as change:
+            change.move("/app/left/a", "/app/pool")
+            change.add("/app/left", hf.supervisor("a") if what == "move to it" else counter("a"))
+            match what:
+                case "register":
+                    change.register("third", "/app/left/a")
+                case "suspend":
+                    change.suspend("/app/left/a")
+                case "replace_state":
+                    change.replace_state("/app/left/a", hundred)
+                case _:
+                    change.move("/app/left/b", "/app/left/a")
+
+
+async def test_who_was_bound_to_a_life_that_is_over_stays_with_the_actor_and_not_its_address(
+    system: hf.ActorSystem,
+) -> None:
+    client, before = ref(system, "/app/right/client"), ref(system, "/app/left/a")
+    await crashed(system, "/app/left")  # The cells below it are other ones now.
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move(before, "/app/pool")
+        change.add("/app/left", counter("a", 100))
+        change.register("third", before)
+    assert await client.ask(Where()) == "/app/pool/a"
+    assert system.node.names["third"].path == "/app/pool/a"
+
+
+async def test_an_address_that_somebody_else_has_leads_to_nobody_else_while_that_one_is_restarted(
+    system: hf.ActorSystem,
+) -> None:
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move("/app/left/a", "/app/pool")
+    assert await ref(system, "/app/left/a").ask(Add(1)) == 1  # It is found at the address that it had.
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.add("/app/left", counter("a", 100))
+    left = ref(system, "/app/left")._cell
+    left.kill()
+    seen: set[int | None] = set()
+    while (found := system.node.find("/app/left/a")) is None or found.state != "running" or not seen - {None}:
+        seen.add(None if found is None else found.parent is not None and id(found.parent))
+        await asyncio.sleep(0)
+    assert seen <= {None, id(left)}
+    assert await ref(system, "/app/left/a").ask(Add(1)) == 101
+
+
+async def test_a_chain_of_moves_in_one_transaction_renames_nobody_twice(system: hf.ActorSystem) -> None:
+    users = [
+        hf.child("to_b", hf.start(Client), bindings={"peer": "/app/left/b"}),
+        hf.child("to_d", hf.start(Client), bindings={"peer": "/app/right/d"}),
+    ]
+    await system.start(hf.supervisor("users", children=users))
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move("/app/left/b", "/app/pool")
+        change.add("/app", hf.supervisor("spare"))
+        change.move("/app/right/d", "/app/spare")
+        change.move("/app/pool/b", "/app/right")
+        change.move("/app/spare/d", "/app/left")
+    await crashed(system, "/app/users")
+    assert await ref(system, "/app/users/to_b").ask(Where()) == "/app/right/b"
+    assert await ref(system, "/app/users/to_d").ask(Where()) == "/app/left/d"
+
+
+async def test_a_request_that_waited_in_the_queue_of_a_restarted_supervisor_leaves_nobody_behind(
+    system: hf.ActorSystem,
+) -> None:
+    """The supervisor ends between the request and its answer: the newcomer that its next life starts is known."""
+    for give_up in (False, True):
+        left = ref(system, "/app/left")._cell
+        done: list[object] = []
+
+        async def restarted(running: hf.ActorSystem, left: Any = left, done: list[object] = done) -> None:
+            left.kill()  # The request comes before its next life does.
+            done.append(None)
+
+        path = "/app/left/g"
+        change: hf.Change
+        try:
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.step(Slot(restarted, fails=False))
+                change.add("/app/left", counter("g"))
+                if give_up:
+                    change.step(Stumble())
+        except hf.TransactionFailed as error:
+            assert give_up
+            assert error.kept == ()
+            assert system.node.find(path) is None
+        else:
+            assert await ref(system, path).ask(Add(1)) == 1
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.remove(path)
+        assert done
 
 
 # -- stopping ---------------------------------------------------------------------------------------------------------
