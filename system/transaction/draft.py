@@ -19,7 +19,7 @@ from ...supervision.services.partition import PartitionSupervisor
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
 from ..protection import part_of
-from .lasting import recipe_flags
+from .lasting import recipe_flags, recipe_specs
 from .operation import wrong
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ class Place:
         "candidate",
         "cell",
         "children",
+        "comes_back",
         "flags",
         "is_leaving",
         "is_moved",
@@ -57,6 +58,7 @@ class Place:
         "relocation",
         "rework",
         "spec",
+        "spec_bindings",
         "wanted",
         "was_below",
     )
@@ -72,10 +74,12 @@ class Place:
         self.is_stopped = cell is None or cell.is_dead  # a child whose spec stays, and which does not run
         self.is_suspended = cell is not None and cell.more is not None and cell.more.suspended
         self.bindings: dict[str, Place] = {}
+        self.spec_bindings: dict[str, Place] = {}  # as its next life in a new address has them, if it is there already
         self.names: list[str] = []
         self.was_below = parent  # before the transaction
         self.before: frozenset[str] = frozenset()  # the names of those that are below it before the transaction
         self.is_switched = False  # its spec says otherwise whether it is started with the others
+        self.comes_back = False  # with its supervisor, whose recipe says so
         self.candidate = 0  # as which it is started, if it is added
         self.wanted: dict[str, Any] = {}  # flags that change
         self.rework: Rework | None = None  # what is changed in the actor itself
@@ -146,6 +150,17 @@ class Place:
         while at is not None:
             yield at
             at = at.parent
+
+    def comes_back_with(self, supervisor: Place) -> bool:
+        """Whether it is started when a supervisor above it is."""
+        one = self
+        while one is not supervisor and one.parent is not None:
+            is_new = one.is_planned or one.has_moved
+            is_kept = one.spec is not None and one.spec.restart != "temporary" and not one.parent.is_dynamic
+            if not (is_kept if is_new else one.comes_back):
+                return False
+            one = one.parent
+        return True
 
     def living(self, node: Node) -> Cell:
         """The cell that lives here now. Raises NoSuchActor."""
@@ -218,12 +233,17 @@ class Draft:
                 lives = node.successor(target) if target.state is GONE else target
                 if lives is not None and lives in self.by_cell:
                     place.bindings[port] = self.by_cell[lives]
+            for port, path in place.spec.bindings.items() if place.spec is not None else ():
+                lives = node.find(path)
+                if lives is not None and lives in self.by_cell:
+                    place.spec_bindings[port] = self.by_cell[lives]
         self.named: dict[str, Place] = {}
         """Who has which name before the transaction."""
         for name, cell in node.names.items():
             if cell in self.by_cell:
                 self.by_cell[cell].names.append(name)
                 self.named[name] = self.by_cell[cell]
+        self._early = self._started_too_early()
 
     def _survey(self, cell: Cell | None, name: str, parent: Place | None, spec: ChildSpec | None) -> Place:
         place = Place(name, parent, cell, spec)
@@ -235,9 +255,11 @@ class Draft:
         place.flags = actor._flags if actor is not None else recipe_flags(cell)
         below = dict(cell.children or {})
         known: list[Child] = list(actor._children.values()) if actor is not None else []
+        planned = {spec.id for spec in recipe_specs(cell) or ()} | (actor._planned if actor is not None else set())
         for one in known:
             child = below.pop(one.spec.id, None)
             place.children[one.spec.id] = self._survey(child, one.spec.id, place, one.spec)
+            place.children[one.spec.id].comes_back = one.spec.id in planned and not place.is_dynamic
         for child in below.values():
             own = child.spec if isinstance(child.spec, ChildSpec) else None
             place.children[child.name] = self._survey(child, child.name, place, own)
@@ -323,14 +345,32 @@ class Draft:
         """What must hold when all is done.
 
         Raises:
-            SpecError: a binding would point at nobody, or a suspended supervisor would have to stop a child.
+            SpecError: a binding would point at nobody, also when a supervisor is restarted, or a suspended supervisor
+                would have to stop a child.
         """
+        for place, port in self._started_too_early() - self._early:
+            why = f"it is started before the one to which its spec binds {port!r}"
+            raise wrong(place.path, f"{why}: a restart of a supervisor of both would fail")
         for place in self.staying():
             if place.is_suspended and any(child.is_leaving for child in place.children.values()):
                 check_awake(place)
             for port, target in place.bindings.items():
                 if any(above.is_leaving for above in target.upwards()):
                     raise wrong(place.path, f"its binding {port!r} would point at {target.path}, which is removed")
+
+    def _started_too_early(self) -> set[tuple[Place, str]]:
+        """Whose spec binds a port to somebody whom a supervisor of both, below the root, starts later."""
+        found: set[tuple[Place, str]] = set()
+        seen: set[Place] = set()
+        for place in self.staying():
+            seen.add(place)
+            for port in place.spec.bindings if place.spec is not None else ():
+                target = (place.bindings if place.is_planned else place.spec_bindings).get(port)
+                if target is not None and target not in seen:
+                    both = next((above for above in target.upwards() if above in set(place.upwards())), self.root)
+                    if both is not self.root and place.comes_back_with(both):
+                        found.add((place, port))
+        return found
 
     def staying(self) -> Iterator[Place]:
         """All that is there when all is done, parents first."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import os
 import signal
 import sys
@@ -183,30 +184,48 @@ SHAPES: dict[str, Callable[[hf.Change], object]] = {
     "reorder": lambda change: change.reorder("/app/left", ["c", "a"]),
     "strategy": lambda change: change.strategy("/app/left", "rest_for_one"),
     "intensity": lambda change: change.intensity("/app/left", 77, 7.0),
-    "move and add": lambda change: (
-        change.move("/app/left/b", "/app/right"),
-        change.add("/app/right", counter("g")),
-        change.reorder("/app/right", ["g", "d"]),
-        change.move("/app/left/a", "/app/right"),
-    ),
-    "replace": lambda change: (change.move("/app/left/b", "/app/right"), change.add("/app/left", counter("b", 100))),
-    "replace stopped": lambda change: (
-        change.move("/app/right/e", "/app/left"),
-        change.add("/app/right", counter("e", 100)),
-    ),
-    "move and start": lambda change: (change.move("/app/right/e", "/app/left"), change.start("/app/left", "e")),
-    "move and stop": lambda change: (change.move("/app/left/b", "/app/right"), change.stop("/app/right/b")),
-    "swap": lambda change: (
-        change.add("/app/right", hf.supervisor("way", children=[counter("b", 100)])),
-        change.move("/app/left/b", "/app/right"),
-        change.move("/app/right/way/b", "/app/left"),
-    ),
-    "move to what is added": lambda change: (
-        change.add("/app/right", hf.supervisor("new")),
-        change.move("/app/left/b", "/app/right/new"),
-        change.add("/app/right/new", counter("g")),
-    ),
+    "move and add": lambda change: move_and_add(change),
+    "replace": lambda change: replace(change, "/app/left", "b", "/app/right"),
+    "replace stopped": lambda change: replace(change, "/app/right", "e", "/app/left"),
+    "move and start": lambda change: move_and_start(change),
+    "move and stop": lambda change: move_and_stop(change),
+    "swap": lambda change: swap(change),
+    "move to what is added": lambda change: move_to_new(change),
 }
+
+
+def move_and_add(change: hf.Change) -> None:
+    change.move("/app/left/b", "/app/right")
+    change.add("/app/right", counter("g"))
+    change.reorder("/app/right", ["g", "d"])
+    change.move("/app/left/a", "/app/right")
+
+
+def replace(change: hf.Change, above: str, name: str, other: str) -> None:
+    change.move(f"{above}/{name}", other)
+    change.add(above, counter(name, 100))
+
+
+def move_and_start(change: hf.Change) -> None:
+    change.move("/app/right/e", "/app/left")
+    change.start("/app/left", "e")
+
+
+def move_and_stop(change: hf.Change) -> None:
+    change.move("/app/left/b", "/app/right")
+    change.stop("/app/right/b")
+
+
+def swap(change: hf.Change) -> None:
+    change.add("/app/right", hf.supervisor("way", children=[counter("b", 100)]))
+    change.move("/app/left/b", "/app/right")
+    change.move("/app/right/way/b", "/app/left")
+
+
+def move_to_new(change: hf.Change) -> None:
+    change.add("/app/right", hf.supervisor("new"))
+    change.move("/app/left/b", "/app/right/new")
+    change.add("/app/right/new", counter("g"))
 
 
 def there_and_back(change: hf.Change) -> None:
@@ -434,35 +453,51 @@ async def test_a_chain_of_moves_in_one_transaction_renames_nobody_twice(system: 
     assert await ref(system, "/app/users/to_d").ask(Where()) == "/app/left/d"
 
 
+@pytest.mark.parametrize("is_given_up", [False, True])
 async def test_a_request_that_waited_in_the_queue_of_a_restarted_supervisor_leaves_nobody_behind(
-    system: hf.ActorSystem,
+    system: hf.ActorSystem, is_given_up: bool
 ) -> None:
     """The supervisor ends between the request and its answer: the newcomer that its next life starts is known."""
-    for give_up in (False, True):
-        left = ref(system, "/app/left")._cell
-        done: list[object] = []
+    path = "/app/left/g"
 
-        async def restarted(running: hf.ActorSystem, left: Any = left, done: list[object] = done) -> None:
-            left.kill()  # The request comes before its next life does.
-            done.append(None)
+    async def restarted(running: hf.ActorSystem) -> None:
+        ref(running, "/app/left").kill()  # The request comes before its next life does.
 
-        path = "/app/left/g"
-        change: hf.Change
-        try:
-            async with system.transaction(timeout=IN_TIME) as change:
-                change.step(Slot(restarted, fails=False))
-                change.add("/app/left", counter("g"))
-                if give_up:
-                    change.step(Stumble())
-        except hf.TransactionFailed as error:
-            assert give_up
-            assert error.kept == ()
-            assert system.node.find(path) is None
-        else:
-            assert await ref(system, path).ask(Add(1)) == 1
-            async with system.transaction(timeout=IN_TIME) as change:
-                change.remove(path)
-        assert done
+    with pytest.raises(hf.TransactionFailed) if is_given_up else contextlib.nullcontext() as failed:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.step(Slot(restarted, fails=False))
+            change.add("/app/left", counter("g"))
+            if is_given_up:
+                change.step(Stumble())
+    if is_given_up:
+        assert isinstance(failed, pytest.ExceptionInfo)
+        assert failed.value.kept == ()
+        assert system.node.find(path) is None
+        assert [info.id for info in await ref(system, "/app/left").ask(hf.WhichChildren())] == ["a", "b", "c"]
+    else:
+        assert await ref(system, path).ask(Add(1)) == 1
+
+
+@pytest.mark.parametrize("what", ["reorder", "move", "add"])
+async def test_a_tree_that_could_not_be_started_again_is_refused(system: hf.ActorSystem, what: str) -> None:
+    """Its spec would bind somebody to one who is started later: the next restart of their supervisor would fail."""
+    users = [counter("first"), hf.child("user", hf.start(Client), bindings={"peer": "/app/top/first"})]
+    await system.start(hf.supervisor("top", children=[*users, hf.supervisor("sub", children=[counter("last")])]))
+    with pytest.raises(hf.TransactionRefused, match="a restart of a supervisor of both would fail"):
+        async with system.transaction() as change:
+            match what:
+                case "reorder":
+                    change.reorder("/app/top", ["user", "first"])
+                case "move":
+                    change.move("/app/top/first", "/app/top/sub")
+                case _:
+                    spec = hf.child("more", hf.start(Client), bindings={"peer": "/app/top/sub/last"})
+                    change.add("/app/top", spec)
+                    change.reorder("/app/top", ["first", "user", "more"])
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.reorder("/app/top", ["sub", "first", "user"])
+    await crashed(system, "/app/top")
+    assert await ref(system, "/app/top/user").ask(Where()) == "/app/top/first"
 
 
 # -- stopping ---------------------------------------------------------------------------------------------------------

@@ -13,8 +13,6 @@ from typing import Any, Literal
 ROOT = 0
 Kind = Literal["Tally", "Twice", "supervisor", "dynamic"]
 STRATEGIES = ("one_for_one", "one_for_all", "rest_for_one")
-RANKS = ("base", "left", "right", "pool")
-"""The supervisors at the top: a spec binds only to who is started before, so that no start waits for itself."""
 
 
 class Cannot(Exception):
@@ -75,6 +73,10 @@ class Spec:
         """Who was removed by an earlier step of the transaction that is being applied."""
         self.planned: set[int] = set()
         """Who was added by an earlier step of it."""
+        self.left: set[str] = set()
+        """Addresses that an earlier step of it has moved somebody away from, who was there before it."""
+        self.late: set[int] = set()
+        """Who was added there: started only when the transaction is in force."""
 
     def copy(self) -> Spec:
         """The same specification, to be changed."""
@@ -132,9 +134,11 @@ class Spec:
                 if owner.who not in inside and target is not None and not self.is_leaving(owner.who):
                     yield owner, self.nodes[target]
 
-    def rank(self, who: int) -> int:
-        """The place of the supervisor at the top that an actor is below."""
-        return RANKS.index(list(self.upwards(who))[-1].name)
+    def starts_first(self, who: int, other: int) -> bool:
+        """Whether a supervisor of both, below the root, starts the first one before the other."""
+        order = [node.who for node in self.walk(ROOT)]
+        tops = {list(self.upwards(one))[-1].who for one in (who, other)}
+        return len(tops) == 1 and order.index(who) < order.index(other)
 
     def ended_with(self, who: int) -> set[int]:
         """Whose lives may end when that of one ends: those below it, and its group by its supervisor's strategy."""
@@ -167,8 +171,13 @@ class Spec:
                 raise Cannot(f"a binding would point at {who}, which is removed")
         for who in self.leaving:
             self._forget(who)
+        for one in self.nodes.values():
+            if one.spec_peer is not None and self.starts_first(one.who, one.spec_peer):
+                raise Cannot(f"the spec of {one.who} would bind to who is started later")
         self.leaving.clear()
         self.planned.clear()
+        self.left.clear()
+        self.late.clear()
 
     def _forget(self, who: int) -> None:
         if who not in self.nodes:
@@ -197,6 +206,12 @@ class Spec:
             raise Cannot(f"{who} is a supervisor")
         return node
 
+    def _leaf_before(self, who: int) -> Node:
+        """One that lives before the transaction is in force."""
+        if who in self.late:
+            raise Cannot(f"{who} is started when all is in force")
+        return self._leaf(who)
+
     def _supervisor(self, who: int) -> Node:
         node = self._living(who)
         if not node.is_supervisor:
@@ -219,13 +234,13 @@ class Spec:
             raise Cannot("the dynamic supervisor has plain children only")
         if new.spec_peer is not None:
             self._leaf(new.spec_peer)
-            if self.rank(new.spec_peer) >= self.rank(above):
-                raise Cannot(f"{new.spec_peer} is started later")
         node = copy.deepcopy(new)
         node.above, node.peer, node.below = above, node.spec_peer, []
         self.nodes[node.who] = node
         supervisor.below.append(node.who)
         self.planned.add(node.who)
+        if self.path(node.who) in self.left:
+            self.late.add(node.who)
         self.free.discard(self.path(node.who))
 
     def _remove(self, who: int) -> None:
@@ -267,13 +282,11 @@ class Spec:
         self._living(node.above)
         if not node.is_supervisor:
             self.free.add(self.path(who))
+        self.left.add(self.path(who))
         self.nodes[node.above].below.remove(who)
         new.below.append(who)
         node.above = to
         self.free.discard(self.path(who))
-        for one in self.nodes.values():
-            if one.spec_peer is not None and self.rank(one.spec_peer) >= self.rank(one.who):
-                raise Cannot("a spec would bind to who is started later")
 
     def _reorder(self, who: int, order: tuple[int, ...]) -> None:
         node = self._supervisor(who)
@@ -305,13 +318,13 @@ class Spec:
         self._leaf(owner).peer = target
 
     def _unbind(self, owner: int) -> None:
-        node = self._leaf(owner)
+        node = self._leaf_before(owner)
         if node.peer is None or node.spec_peer is not None or node.isolation == "process":
             raise Cannot("there is nothing to unbind")
         node.peer = None
 
     def _register(self, name: str, who: int) -> None:
-        node = self._leaf(who)
+        node = self._leaf_before(who)
         if self.holder(name) not in (None, node):
             raise Cannot(f"{name} is taken")
         node.names.add(name)
@@ -323,13 +336,13 @@ class Spec:
         holder.names.discard(name)
 
     def _suspend(self, who: int) -> None:
-        self._leaf(who).is_suspended = True
+        self._leaf_before(who).is_suspended = True
 
     def _resume(self, who: int) -> None:
-        self._leaf(who).is_suspended = False
+        self._leaf_before(who).is_suspended = False
 
     def _replace_state(self, who: int) -> None:
-        self._leaf(who).states += 1
+        self._leaf_before(who).states += 1
 
     def _replace_code(self, who: int, kind: Kind) -> None:
-        self._leaf(who).kind = kind
+        self._leaf_before(who).kind = kind
