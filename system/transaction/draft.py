@@ -162,12 +162,16 @@ class Place:
             one = one.parent
         return True
 
+    def now(self, node: Node) -> Cell | None:
+        """The cell that lives here now, if one does: that of before, or the one that has followed it."""
+        if self.cell is not None and self.cell.state is GONE:
+            self.cell = node.successor(self.cell) or self.cell
+        return None if self.cell is None or self.cell.is_dead else self.cell
+
     def living(self, node: Node) -> Cell:
         """The cell that lives here now. Raises NoSuchActor."""
-        cell = self.cell
-        if cell is not None and cell.state is GONE:
-            cell = node.successor(cell)
-        if cell is None or cell.is_dead:
+        cell = self.now(node)
+        if cell is None:
             raise NoSuchActor(self.path)
         return cell
 

@@ -155,8 +155,8 @@ class Relocation:
         self._give_back(system)
         notes, path = system.mechanism_notes, self._place.path
         before, after = self._before.mechanism, self._after.mechanism
-        cell = self._place.cell
-        if cell is not None and not cell.is_dead:  # Else its next life begins as its spec says.
+        cell = self._place.now(system.node)
+        if cell is not None:  # Else its next life begins as its spec says.
             after = mechanism_of(cell)
             self.probation = getattr(cell.host, "probation", None)  # None: there is no mechanism.
         probation = self.probation
@@ -183,9 +183,10 @@ class Relocation:
             if self._gate is not None:
                 self._gate.close()
             if task is not None and not task.done():
-                cell = self._place.cell
-                while cell is not None and not task.done():  # What has only begun may not hear it yet.
-                    system._moves.give_up(cell, "it is not wanted any more")
+                while not task.done():  # What has only begun may not hear it yet.
+                    cell = self._place.now(system.node)
+                    if cell is not None:
+                        system._moves.give_up(cell, "it is not wanted any more")
                     await asyncio.wait((task,), timeout=AGAIN_AFTER)
             if self._grant is not None:
                 system.mechanism_notes.over(self._place.path)

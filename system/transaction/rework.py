@@ -193,15 +193,16 @@ class Rework:
         """It goes on as before."""
         if self._is_ordered:
             return
-        cell = self._place.cell
+        cell = self._place.now(system.node)
         try:
-            if cell is not None and not cell.is_dead and self._lock is not None:
+            if cell is not None and self._lock is not None:
                 await order(cell, Conclude(self._attempt, False, None), CONCLUDED_WITHIN)
         except (AskFailed, ActorStopped):
             pass  # The life that was held has ended.
         finally:
             if cell is not None:
                 self._over(cell)
+            self._let_go()
 
 
 def lives_here(cell: Cell) -> bool:

@@ -99,6 +99,23 @@ async def test_a_life_that_ends_in_the_middle_is_prepared_again(system: hf.Actor
     assert await one.ask(Add(0)) == acknowledged[0] + 100
 
 
+async def test_who_has_a_new_address_since_the_check_is_let_go_of_too(
+    system: hf.ActorSystem, one: hf.ActorRef[Any]
+) -> None:
+    """Its supervisor was restarted before it was held: it is not the same cell any more."""
+
+    async def meanwhile(running: hf.ActorSystem) -> None:
+        await crashed(running, "/app/top")
+
+    with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.step(Slot(meanwhile, fails=False))
+            change.replace_state(one, hundred)
+            change.step(Stumble())
+    assert failed.value.kept == ()
+    assert await ref(system, one.path).ask(Add(), IN_TIME) == 6
+
+
 @pytest.mark.parametrize("fails", [True, False])
 async def test_what_is_held_handles_nothing_before_the_end(
     system: hf.ActorSystem, one: hf.ActorRef[Any], fails: bool

@@ -215,11 +215,12 @@ class Machine:
 
     def _fits(self, draft: Spec) -> bool:
         """Whether the transaction could end here."""
+        after = draft.copy()
         try:
-            draft.copy().end()
+            after.end()
         except Cannot:
             return False
-        return True
+        return after.starts_alone()
 
     def _target(self, draft: Spec, draw: Draw) -> Callable[[int], Any]:
         """How a step names an actor: by its address at that point, or by a ref."""
@@ -394,7 +395,7 @@ class Run:
         return f"seed {self.seed}, hazards: {', '.join(sorted(self.hazards)) or 'none'}"
 
 
-async def carry_out(run: Run, plan: Plan, *, end: float = 3.0) -> None:
+async def carry_out(run: Run, plan: Plan, *, end: float = 15.0) -> None:
     """Carry out a plan in a new system. Raises Found: with what happened."""
     loop = asyncio.get_running_loop()
     faults, trace, leaving = list[str](), list[str](), 0.0
