@@ -1,4 +1,4 @@
-"""What a transaction makes of the supervisors: who has which children, in which order, and by which flags.
+"""What a transaction makes of the tree: who has which children, in which order, by which flags, and which names.
 
 The steps say so in the draft. At the commit all supervisors that they are about follow it at once, and their recipes
 with them, so that a restart of a supervisor keeps it.
@@ -9,9 +9,9 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING
 
-from ...actors.errors import HoldfastError
+from ...actors.errors import HoldfastError, NameTaken
 from ...actors.kernel.actor import Start
-from ...actors.kernel.cell import GONE, Cell
+from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.kernel.ref import ActorRef
 from ...supervision.admin import ChangeSupervisor
 from ...supervision.children import Child, new_cell
@@ -24,16 +24,18 @@ from .operation import Operation, wrong
 if TYPE_CHECKING:
     from typing import Any
 
+    from ...actors.kernel.node import Node
     from ..system import ActorSystem
 
 
 class Arrangement:
-    """The supervisors that change, and the steps that say so."""
+    """The supervisors and names that change, and the steps that say so."""
 
     def __init__(self) -> None:
         self._steps: dict[Place, Operation] = {}  # the first one about each
         self._rearranged: set[Place] = set()  # whose children, as they live now, change too
         self._told: set[Place] = set()  # to be told, if they live in another process
+        self._names: dict[str, tuple[Operation, Place | None, Place | None]] = {}  # the step; who had it, who has it
         self.step = ""
         """The step that is in the way, or has failed."""
 
@@ -44,6 +46,10 @@ class Arrangement:
             self._rearranged.add(place)
         if is_told:
             self._told.add(place)
+
+    def name(self, name: str, step: Operation, before: Place | None, after: Place | None) -> None:
+        """A step gives this name to somebody, or to nobody any more."""
+        self._names[name] = (step, before, after)
 
     @property
     def _places(self) -> list[Place]:
@@ -68,10 +74,31 @@ class Arrangement:
                 is_taken = child_of(cell, name) is not None or name in (cell.children or {})
                 if child.has_moved and is_taken and name not in place.before:
                     raise wrong(place.path, f"it has a child {name!r} already")
+        return self._names_ready(system.node)
+
+    def _names_ready(self, node: Node) -> str:
+        for name, (step, before, after) in self._names.items():
+            self.step = step.text
+            holder = node.names.get(name)
+            cell = after.living(node) if after is not None else None
+            if holder is not None and holder is not cell and (before is None or holder is not before.now(node)):
+                raise NameTaken(name)  # Its holder has ended meanwhile, and another one has it: that one keeps it.
+            if cell is not None and cell.state is not RUNNING:
+                return f"{cell.path} is being restarted"
         return ""
 
     def commit(self, system: ActorSystem) -> None:
         """Put it in force."""
+        self._arrange(system)
+        node, after = system.node, {name: place for name, (_, _, place) in self._names.items()}
+        for name, place in after.items():
+            if place is None or node.names.get(name) is not place.living(node):
+                node.unregister(name)
+        for name, place in after.items():
+            if place is not None:
+                node.register(name, place.living(node))
+
+    def _arrange(self, system: ActorSystem) -> None:
         cells = {place: place.living(system.node) for place in self._places}
         here = {
             place: cell.actor
@@ -90,14 +117,13 @@ class Arrangement:
             cell = taken[child].cell
             if cell is not None and cell.state is not GONE:
                 system.moved_addresses.leave(path, cell)
+        if moved and system.node.root is not None:  # First: what comes now is called by addresses as they are now.
+            now = {path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}
+            Renamed(now).keep(system.node.root)
         for place, supervisor in here.items():
             _respecify(place, supervisor)
         for place, cell in cells.items():
             keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
-        if moved and system.node.root is not None:
-            Renamed({path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}).keep(
-                system.node.root
-            )
 
     async def finish(self, system: ActorSystem) -> None:
         """Tell those that live in other processes."""

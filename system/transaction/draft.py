@@ -102,9 +102,23 @@ class Place:
 
     @property
     def comes_last(self) -> bool:
-        """Whether it is added where somebody lives until the transaction is in force: it is started then."""
-        above = self.parent
-        return self.is_planned and above is not None and not above.is_planned and self.name in above.before
+        """Whether it is added where somebody lives until the transaction is in force: it is started then.
+
+        So is who is added with a binding to such a one.
+        """
+        waiting, seen = [self], set[Place]()
+        while waiting:
+            place = waiting.pop()
+            if not place.is_planned or place in seen:
+                continue
+            above = place.parent
+            if above is not None and not above.is_planned and place.name in above.before:
+                return True
+            seen.add(place)
+            waiting += [
+                to for port, to in place.bindings.items() if place.spec is not None and port in place.spec.bindings
+            ]
+        return False
 
     @property
     def is_supervisor(self) -> bool:

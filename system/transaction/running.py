@@ -5,10 +5,10 @@ from __future__ import annotations
 import dataclasses
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.errors import NoSuchActor
+from ...actors.errors import ActorStopped, NoSuchActor
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.ref import ActorRef
-from ...supervision.admin import NotSupported, RestartChild, TerminateChild
+from ...supervision.admin import ChildBusy, NoSuchChild, NotSupported, RestartChild, TerminateChild
 from ...supervision.supervisor import Supervisor
 from .arrangement import child_of
 from .draft import START_TIMEOUT, Draft, Place, Target, check_awake, is_elsewhere
@@ -63,6 +63,8 @@ class StopChild(OnChild):
             raise wrong(place.path, "its spec is temporary, and would not stay: remove it")
         self._take(draft, place, starts=False)
         stopped = set(place.walk())
+        for one in stopped:
+            one.names.clear()  # They end with its life.
         for owner in draft.staying():
             bound = next((to for to in owner.bindings.values() if to in stopped), None)
             if bound is not None and owner not in stopped:
@@ -98,8 +100,10 @@ class StartAgain(OnChild):
         super().__init__(f"{text_of(supervisor)}/{name}")
         self._at, self._name = supervisor, name
         self._asked: Cell | None = None  # the supervisor that was asked
+        self._is_asked = False
         self._life = 0
         self._is_over = False  # it did not want to be started
+        self._is_automatic = False  # it would be started with the others
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         above = await draft.supervisor(self._at)
@@ -108,6 +112,7 @@ class StartAgain(OnChild):
             raise NoSuchActor(self.target)
         if not place.is_stopped:
             raise wrong(self.target, "it runs")
+        self._is_automatic = place.spec.autostart
         self._take(draft, place, starts=True)
         if place.cell is not None and not place.cell.is_dead:
             raise wrong(self.target, "it is stopped by this very transaction")
@@ -124,7 +129,13 @@ class StartAgain(OnChild):
             return  # It is being restarted.
         self._asked, self._life = supervisor, supervisor.life
         above: ActorRef[Supervisor] = ActorRef(supervisor)
-        ref = await above.ask(RestartChild(self._name), START_TIMEOUT)
+        is_asked_again, self._is_asked = self._is_asked, True
+        try:
+            ref = await above.ask(RestartChild(self._name), START_TIMEOUT)
+        except ChildBusy:
+            if not is_asked_again:
+                raise
+            return  # A life of its supervisor has ended before it answered; the next one has heard it too.
         assert self._place is not None
         if ref is None:
             self._is_over = True
@@ -143,9 +154,14 @@ class StartAgain(OnChild):
 
     async def release(self, system: ActorSystem) -> None:
         supervisor = self._asked
-        if supervisor is None or supervisor.is_dead or supervisor.life != self._life:
+        if supervisor is None or supervisor.is_dead:
             return
+        if supervisor.life != self._life and self._is_automatic:
+            return  # It was stopped by a message alone: it has come back with its supervisor.
         cell = (supervisor.children or {}).get(self._name)
         if cell is not None and not cell.host.is_up(cell):
             cell.kill()  # Its start would hold up its supervisor, and us, for as long as it likes.
-        await stop_child(supervisor, self._name)
+        try:
+            await stop_child(supervisor, self._name)
+        except (ActorStopped, NoSuchChild):
+            pass  # Its supervisor has ended, or somebody has removed it meanwhile.

@@ -104,15 +104,13 @@ class Register(Operation):
     def __init__(self, name: str, target: Target) -> None:
         super().__init__(text_of(target))
         self._name, self._at = name, target
-        self._place: Place | None = None
-        self._before: Place | None = None  # who has the name before the transaction, and gives it away
 
     @property
     def text(self) -> str:
         return f"register {self.target} as {self._name!r}"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        place = self._place = draft.find(self._at)
+        place = draft.find(self._at)
         self.target = place.path
         place.check_lived_in(system.node)
         holder = holder_of(self._name, draft)
@@ -120,23 +118,9 @@ class Register(Operation):
             raise NameTaken(self._name)
         if place.cell is not None and place.cell.state is not RUNNING:
             raise ActorStopped(place.path)
-        self._before = draft.named.get(self._name)
         if holder is None:
             place.names.append(self._name)
-
-    def ready(self, system: ActorSystem) -> str:
-        assert self._place is not None
-        holder, cell = system.node.names.get(self._name), self._place.living(system.node)
-        before = self._before.cell if self._before is not None else None
-        if holder is not None and holder is not cell and holder is not before:
-            raise NameTaken(self._name)
-        return "" if cell.state is RUNNING else f"{cell.path} is being restarted"
-
-    def commit(self, system: ActorSystem) -> None:
-        assert self._place is not None
-        cell = self._place.living(system.node)
-        if system.node.names.get(self._name) is not cell:
-            system.node.register(self._name, cell)
+        draft.arrangement.name(self._name, self, draft.named.get(self._name), place)
 
 
 class Unregister(Operation):
@@ -147,23 +131,13 @@ class Unregister(Operation):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self._name = name
-        self._holder: Place | None = None
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
-        holder = self._holder = holder_of(self._name, draft)
+        holder = holder_of(self._name, draft)
         if holder is None:
             raise NoSuchActor(self._name)
         holder.names.remove(self._name)
-
-    def ready(self, system: ActorSystem) -> str:
-        holder, before = system.node.names.get(self._name), self._holder
-        if holder is not None and before is not None and before.cell is not None and holder is not before.cell:
-            raise NameTaken(self._name)  # Its holder has ended meanwhile, and another one has it: that one keeps it.
-        return ""
-
-    def commit(self, system: ActorSystem) -> None:
-        if self._name in system.node.names:
-            system.node.unregister(self._name)
+        draft.arrangement.name(self._name, self, draft.named.get(self._name), None)
 
 
 def holder_of(name: str, draft: Draft) -> Place | None:

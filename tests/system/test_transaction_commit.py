@@ -405,6 +405,18 @@ async def test_who_comes_to_an_address_that_was_left_can_be_bound_at_once(system
     assert await moved.ask(Add(1)) == 1
 
 
+async def test_who_is_bound_to_one_that_comes_there_is_bound_to_no_other(system: hf.ActorSystem) -> None:
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.move("/app/left/a", "/app/pool")
+        change.add("/app/left", counter("a", 100))
+        change.add("/app/left", hf.child("user", hf.start(Client), bindings={"peer": "/app/left/a"}))
+    for _ in range(2):
+        user = ref(system, "/app/left/user")
+        assert await user.ask(Where()) == "/app/left/a"
+        assert await user._cell.extra().bindings["peer"].ref.ask(Add(1)) > 100
+        await crashed(system, "/app/left")
+
+
 @pytest.mark.parametrize("what", ["register", "suspend", "replace_state", "move to it"])
 async def test_what_needs_it_earlier_is_refused(system: hf.ActorSystem, what: str) -> None:
     with pytest.raises(hf.TransactionRefused, match="when this transaction is in force"):
@@ -608,6 +620,48 @@ async def test_a_name_that_somebody_else_took_meanwhile_is_left_to_it(system: hf
             change.register("till", a)
             change.step(Slot(meanwhile, fails=False))
     assert system.whereis("till") == c
+
+
+async def test_names_are_in_force_as_the_last_step_says(system: hf.ActorSystem) -> None:
+    a, b, d = (ref(system, path) for path in ("/app/left/a", "/app/left/b", "/app/right/d"))
+    async with system.transaction(timeout=IN_TIME) as change:  # Two change names, and a third one had one in between.
+        change.unregister("first")
+        change.register("first", d)
+        change.unregister("first")
+        change.unregister("second")
+        change.register("first", b)
+        change.register("second", a)
+        change.register("third", d)
+        change.unregister("third")
+    assert {name: cell.path for name, cell in system.node.names.items()} == {"first": b.path, "second": a.path}
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.unbind("/app/right/client", "peer")
+        change.stop(a)
+        change.register("second", d)
+    assert {name: cell.path for name, cell in system.node.names.items()} == {"first": b.path, "second": d.path}
+    assert d._cell.extra().names == ["second"]
+
+
+async def test_a_start_that_waited_in_the_queue_of_a_restarted_supervisor_is_taken_back(
+    system: hf.ActorSystem,
+) -> None:
+    await stopped_for_good(system)
+    before = shape(system)
+
+    async def restarted(running: hf.ActorSystem) -> None:
+        ref(running, "/app/right").kill()
+
+    with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.step(Slot(restarted, fails=False))
+            change.start("/app/right", "e")
+            change.step(Stumble())
+    assert failed.value.kept == ()
+    assert shape(system) == before
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.step(Slot(restarted, fails=False))
+        change.start("/app/right", "e")
+    assert await ref(system, "/app/right/e").ask(Add(1)) == 1
 
 
 async def test_a_binding_in_a_process_is_changed_by_the_commit_alone(

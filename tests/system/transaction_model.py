@@ -76,7 +76,9 @@ class Spec:
         self.left: set[str] = set()
         """Addresses that an earlier step of it has moved somebody away from, who was there before it."""
         self.late: set[int] = set()
-        """Who was added there: started only when the transaction is in force."""
+        """Who was added there, or bound by its spec to such a one: started only when the transaction is in force."""
+        self.reworked: set[int] = set()
+        """Whose state an earlier step of it has replaced."""
 
     def copy(self) -> Spec:
         """The same specification, to be changed."""
@@ -188,6 +190,7 @@ class Spec:
         self.planned.clear()
         self.left.clear()
         self.late.clear()
+        self.reworked.clear()
 
     def _forget(self, who: int) -> None:
         if who not in self.nodes:
@@ -249,7 +252,7 @@ class Spec:
         self.nodes[node.who] = node
         supervisor.below.append(node.who)
         self.planned.add(node.who)
-        if self.path(node.who) in self.left:
+        if self.path(node.who) in self.left or new.spec_peer in self.late:
             self.late.add(node.who)
         self.free.discard(self.path(node.who))
 
@@ -265,6 +268,8 @@ class Spec:
             raise Cannot(f"{who} cannot be stopped")
         if any(True for _ in self.bound_into(who)):
             raise Cannot(f"a binding would point at {who}, which is stopped")
+        if any(one.who in self.reworked for one in self.walk(who)):
+            raise Cannot(f"{who} has its new state until it is stopped, and then no more")
         node.is_stopped = True
         self.lose(who)
 
@@ -353,6 +358,7 @@ class Spec:
 
     def _replace_state(self, who: int) -> None:
         self._leaf_before(who).states += 1
+        self.reworked.add(who)
 
     def _replace_code(self, who: int, kind: Kind) -> None:
         self._leaf_before(who).kind = kind
