@@ -172,11 +172,17 @@ class DeleteChild(Order[None]):
     erase: bool = True
 
 
-class WithdrawChild(Order[None]):
-    """Stop and forget a child, and what was recorded of it, if it was started as this candidate; else do nothing."""
+class RemoveChild(Order[None]):
+    """Stop a child and forget its spec, and with `erase` what was recorded of it; nobody starts it in between.
+
+    With a `candidate` only if it was started as that one: if not, there is nothing to be done, and whoever has it keeps
+    it. Without one repair takes it for stopped by order.
+    """
 
     id: str
-    candidate: int
+    reason: dict[str, Any] | None = None
+    erase: bool = False
+    candidate: int = 0
 
 
 class ChildInfo(Message[None]):

@@ -24,10 +24,10 @@ from .admin import (
     ChildBusy,
     ChildParked,
     DeleteChild,
+    RemoveChild,
     RestartChild,
     StartChild,
     TerminateChild,
-    WithdrawChild,
     opened,
 )
 from .change import check_place, new_plan, succession
@@ -550,21 +550,28 @@ class Supervisor(Inquiries):
         one = self._children.get(name)
         return one if one is not None and candidate and one.candidate == candidate else None
 
-    @on(WithdrawChild)
-    def _withdraw_child(self, message: WithdrawChild) -> ReplyHandle[Any]:
-        """Stop and forget a candidate."""
-        return self._answered(self._withdraw(message))
+    @on(RemoveChild)
+    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
+        """Stop and forget a child."""
+        return self._answered(self._remove(message))
 
-    async def _withdraw(self, message: WithdrawChild) -> None:
-        one = self._candidate(message.id, message.candidate)
-        if one is None:
-            return
-        if one.up is not None and one.cell is not None:
-            one.cell.kill()  # Its start would hold up who gives it up for as long as it likes.
-        await self._stop(one)
-        if self._children.get(message.id) is one:
+    async def _remove(self, message: RemoveChild) -> None:
+        if message.candidate:
+            one = self._candidate(message.id, message.candidate)
+            if one is None:
+                return
+            if one.up is not None and one.cell is not None:
+                one.cell.kill()  # Its start would hold up who gives it up for as long as it likes.
+        else:
+            one = self._child(message.id)
+            self._parked.add(message.id)
+        self._forget(one)  # From here on nobody starts it again, with others or by itself.
+        reason = SHUTDOWN if message.reason is None else unpack_exit(message.reason)
+        await self._stop(one, reason)
+        if one.cell is not None:
+            lifecycle.retire(one.cell, reason)
+        if message.erase:
             self._erase(one)
-            self._forget(one)
 
     @on(TerminateChild)
     def _terminate_child(self, message: TerminateChild) -> ReplyHandle[Any]:

@@ -33,6 +33,10 @@ if TYPE_CHECKING:
     from ..checkpoint.home.homes import Homes
 
 
+Begun = Callable[[Any], None]
+"""Is told of the `Probation` of a stack of mechanisms, which may be over before anybody else could ask for it."""
+
+
 class Moves:
     """The moves of one system."""
 
@@ -94,15 +98,27 @@ class Moves:
             if self._node.watched:
                 self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
 
-    async def protect(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None = None) -> None:
+    async def protect(
+        self,
+        cell: Cell,
+        homes: Homes,
+        mechanism: Any,
+        timeout: float,
+        gate: Gate | None = None,
+        begun: Begun = lambda probation: None,
+    ) -> None:
         """Have a group of replicas live an actor's life. With a gate it waits there when all is ready.
+
+        `begun` is called with the probation of the mechanism, as soon as that begins.
 
         Raises:
             CannotMove, ActorStopped, AskTimeout, ProcessUnavailable: it goes on as it was.
         """
-        await self._alone(cell, self._protected(cell, homes, mechanism, timeout, gate), f"attach to {cell.path}")
+        await self._alone(cell, self._protected(cell, homes, mechanism, timeout, gate, begun), f"attach to {cell.path}")
 
-    async def _protected(self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None) -> None:
+    async def _protected(
+        self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun
+    ) -> None:
         from ..ftm.events import MechanismAttached
         from ..ftm.migration.protection import into_group
 
@@ -114,6 +130,7 @@ class Moves:
             probation = getattr(cell.host, "probation", None)
             if probation is not None:
                 probation.detach = lambda: self.unprotect(cell, timeout)
+                begun(probation)
 
         # Without recovery, only what lives in this process has what a group needs of its state.
         is_by_way_of_a_task = place_of(cell) == "process" and not isinstance(cell.host, RecordedProcessHost)
@@ -169,15 +186,24 @@ class Moves:
         if is_by_way_of_a_task:
             await self._settle_in(cell, "process", before.limits, timeout)
 
-    async def adapt(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None = None) -> None:
+    async def adapt(
+        self,
+        cell: Cell,
+        mechanism: Any,
+        timeout: float,
+        gate: Gate | None = None,
+        begun: Begun = lambda probation: None,
+    ) -> None:
         """Have a protected actor go on with another stack of mechanisms, all of it given. With a gate it waits there.
+
+        `begun` is called with the probation of the new stack, as soon as that begins.
 
         Raises:
             CannotAdapt, ActorStopped, AskTimeout: it stays as it was.
         """
-        await self._alone(cell, self._adapted(cell, mechanism, timeout, gate), f"adaptation of {cell.path}")
+        await self._alone(cell, self._adapted(cell, mechanism, timeout, gate, begun), f"adaptation of {cell.path}")
 
-    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None) -> None:
+    async def _adapted(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun) -> None:
         from ..ftm.events import MechanismChanged
         from ..ftm.group.group_host import GroupHost
         from ..ftm.group.reconfiguration import CannotAdapt
@@ -192,8 +218,13 @@ class Moves:
             if not isinstance(host, GroupHost):
                 raise CannotAdapt(cell.path, "it has no mechanism")
             old, life = host.layers, cell.life
+
+            def switched(host: GroupHost = host) -> None:
+                replace_mechanism(cell, wanted)
+                begun(host.probation)
+
             try:
-                change = await host.adapt(cell, mechanism, lambda: replace_mechanism(cell, wanted), gate=gate)
+                change = await host.adapt(cell, mechanism, switched, gate=gate)
                 break
             except CannotAdapt:
                 if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:

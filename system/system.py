@@ -35,7 +35,7 @@ from ..checkpoint.protocol import Wanted
 from ..checkpoint.recovery_file import RecoveryFile, load_recovery
 from ..checkpoint.recovery_settings import RecoveryHooks
 from ..checkpoint.stores import check_durability, check_system, open_journal
-from ..supervision.admin import DeleteChild, NoSuchChild, StartChild, TerminateChild
+from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.patience import end_within
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Flags
@@ -381,8 +381,7 @@ class ActorSystem(Recorded, Controls):
         if parent is not None and is_supervised(cell, parent):
             supervisor = ActorRef[Supervisor](parent)
             try:
-                await supervisor.ask(TerminateChild(cell.name, pack_exit(reason)), LONG)
-                await supervisor.ask(DeleteChild(cell.name, erase=False), ADMIN_TIMEOUT)
+                await supervisor.ask(RemoveChild(cell.name, pack_exit(reason)), LONG)
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:

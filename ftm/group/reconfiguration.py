@@ -21,7 +21,7 @@ from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
-from ...supervision.admin import AlreadyPresent, DeleteChild, StartChild, TerminateChild
+from ...supervision.admin import AlreadyPresent, RemoveChild, StartChild
 from ...supervision.spec import ChildSpec
 from ..bricks.brick_messages import ConfigMismatch, StaleEpoch
 from ..bricks.replica_orders import Abort, Commit, Prepare, Quiesce, Stand
@@ -476,8 +476,7 @@ class AdaptationEngine(Actor):
             if self._group.cell_of(name) is None:
                 continue
             try:
-                await above.ask(TerminateChild(name), STARTED_WITHIN)
-                await above.ask(DeleteChild(name), STARTED_WITHIN)
+                await above.ask(RemoveChild(name, erase=True), STARTED_WITHIN)
             except HoldfastError:
                 continue  # It is gone already.
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.cell import Cell
-from ...supervision.admin import DeleteChild, StartChild, TerminateChild
+from ...supervision.admin import RemoveChild, StartChild
 from ..bricks.replica_orders import Rehearse
 from .failover import killed, why_ended
 
@@ -86,15 +86,14 @@ async def rehearsed(group: Group, name: str) -> None:
 async def ended(group: Group, above: Cell) -> None:
     """End the replica that tries: its process is killed, whatever it does."""
     ref: Any = above.ref
-    for order in (TerminateChild(TRIAL), DeleteChild(TRIAL)):
-        cell = group.cell_of(TRIAL)
-        if cell is None:
-            return
-        await killed(group, TRIAL, cell.life)  # It is in nobody's hands: the change itself is made by leave.
-        try:
-            await ref.ask(order, STARTED_WITHIN)
-        except HoldfastError:
-            continue  # It is gone already.
+    cell = group.cell_of(TRIAL)
+    if cell is None:
+        return
+    await killed(group, TRIAL, cell.life)  # It is in nobody's hands: the change itself is made by leave.
+    try:
+        await ref.ask(RemoveChild(TRIAL, erase=True), STARTED_WITHIN)
+    except HoldfastError:
+        return  # It is gone already.
 
 
 async def until_given_up(work: Awaitable[T], given_up: asyncio.Future[str]) -> T:

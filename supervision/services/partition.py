@@ -16,7 +16,7 @@ from ...actors.kernel.message import Message, Order
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.resource_limits import Limits
 from ...actors.values import state_digest
-from ..admin import DeleteChild, NoPartitions, NotSupported, StartChild
+from ..admin import DeleteChild, NoPartitions, NotSupported, RemoveChild, StartChild
 from ..children import STOPPED, Child
 from ..spec import ChildSpec, Isolation, Plan, Restart, Shutdown, Strategy, check_spec, child
 from ..supervisor import Supervisor
@@ -130,6 +130,12 @@ class PartitionSupervisor(Supervisor):
     @on(StartChild)
     def _start_child(self, message: StartChild) -> Any:
         """Partitions are all alike."""
+        raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
+
+    @on(RemoveChild)
+    def _remove_child(self, message: RemoveChild) -> Any:
+        """They are no single ones."""
+        self._child(message.id)
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 
     @on(DeleteChild)

@@ -22,7 +22,7 @@ from ...actors.kernel.message import Message, Order
 from ...actors.kernel.node import Node
 from ...actors.kernel.ref import ActorRef
 from ...actors.persistence import child_key
-from ..admin import DeleteChild, NotSupported, StartChild
+from ..admin import DeleteChild, NotSupported, RemoveChild, StartChild
 from ..children import Child
 from ..rules import Rule
 from ..spec import ChildSpec, Isolation, Plan, Restart, Shutdown, check_spec, child
@@ -186,6 +186,12 @@ class PoolSupervisor(Supervisor):
     @on(StartChild)
     def _start_child(self, message: StartChild) -> Any:
         """Workers are all alike."""
+        raise NotSupported("the children of a pool are its workers: use ResizePool")
+
+    @on(RemoveChild)
+    def _remove_child(self, message: RemoveChild) -> Any:
+        """They are no single ones."""
+        self._child(message.id)
         raise NotSupported("the children of a pool are its workers: use ResizePool")
 
     @on(DeleteChild)

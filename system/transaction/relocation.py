@@ -98,9 +98,9 @@ class Relocation:
         elif wanted is None:
             work = moves.unprotect(cell, MOVED_WITHIN, gate)
         elif before is None:
-            work = moves.protect(cell, system.homes, wanted, MOVED_WITHIN, gate)
+            work = moves.protect(cell, system.homes, wanted, MOVED_WITHIN, gate, self._begun)
         else:
-            work = moves.adapt(cell, wanted, MOVED_WITHIN, gate)
+            work = moves.adapt(cell, wanted, MOVED_WITHIN, gate, self._begun)
         task = system.node.loop.create_task(
             to_its_end(cell.path, asyncio.ensure_future(work)),
             name=f"{self._text}",
@@ -108,6 +108,9 @@ class Relocation:
         )
         task.add_done_callback(_seen)
         return task
+
+    def _begun(self, probation: Probation) -> None:
+        self.probation = probation
 
     def ready(self, system: ActorSystem) -> str:
         """Whether it is at rest, and everything is ready for it."""
@@ -158,7 +161,6 @@ class Relocation:
         cell = self._place.now(system.node)
         if cell is not None:  # Else its next life begins as its spec says.
             after = mechanism_of(cell)
-            self.probation = getattr(cell.host, "probation", None)  # None: there is no mechanism.
         probation = self.probation
         notes.put(path, before, after, is_trusted=probation is None or probation.is_over)
         notes.over(path)

@@ -54,6 +54,8 @@ class Move(Operation):
                 raise wrong(
                     new.path, "it is started only when this transaction is in force: move to it in the next one"
                 )
+        if new.is_dynamic and place.is_stopped:
+            raise wrong(place.path, f"it is stopped, and {new.path} is dynamic: it keeps nobody who does not run")
         for one in place.walk():
             check_movable(one)
         check_child(new, place.spec)

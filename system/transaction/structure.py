@@ -14,13 +14,11 @@ from ...supervision.admin import (
     AlreadyPresent,
     AlreadyStarted,
     Boxed,
-    DeleteChild,
     MaxChildren,
     NoSuchChild,
     NotSupported,
+    RemoveChild,
     StartChild,
-    TerminateChild,
-    WithdrawChild,
 )
 from ...supervision.change import check_subtree
 from ...supervision.dynamic import check_dynamic
@@ -125,7 +123,9 @@ class Newcomer:
             return  # What was started has ended with it.
         supervisor: ActorRef[Supervisor] = ActorRef(self._asked)
         try:
-            await supervisor.ask(WithdrawChild(self.place.name, self.place.candidate), START_TIMEOUT)
+            await supervisor.ask(
+                RemoveChild(self.place.name, erase=True, candidate=self.place.candidate), START_TIMEOUT
+            )
         except ActorStopped:
             pass  # The same.
 
@@ -217,16 +217,6 @@ def _grant(place: Place) -> None:
                 one.cell.node.bind(one.cell, port, one.cell.node.cell_at(path))
 
 
-async def forget(supervisor: Cell, name: str) -> None:
-    """Stop a child, and have its supervisor forget it."""
-    ref: ActorRef[Supervisor] = ActorRef(supervisor)
-    try:
-        await ref.ask(TerminateChild(name), START_TIMEOUT)
-        await ref.ask(DeleteChild(name), START_TIMEOUT)
-    except (NoSuchChild, ActorStopped):
-        pass  # It was temporary, or its supervisor is dynamic or has ended: nothing is left of it.
-
-
 class Remove(Operation):
     """Stop an actor for good, when all else is in force."""
 
@@ -254,11 +244,15 @@ class Remove(Operation):
     async def finish(self, system: ActorSystem) -> None:
         place = self._place
         assert place is not None
-        cell, above = place.cell, place.parent
-        if cell is not None and not cell.is_dead:
+        cell, above = place.now(system.node), place.parent
+        if cell is not None:
             await system.stop(cell.ref)
-        elif above is not None and above.is_supervisor:
-            await forget(above.living(system.node), place.name)  # It was restarted before it was removed.
+        elif above is not None and above.is_supervisor:  # It does not run; its spec is there.
+            supervisor: ActorRef[Supervisor] = ActorRef(above.living(system.node))
+            try:
+                await supervisor.ask(RemoveChild(place.name), START_TIMEOUT)
+            except (NoSuchChild, ActorStopped):
+                pass  # Its supervisor was restarted, and does not know it any more.
 
 
 class OnSupervisor(Operation):

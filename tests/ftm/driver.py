@@ -112,7 +112,7 @@ class Driver:
             isolation=self.isolation,  # type: ignore[arg-type]
         )
         above = self.system.ref(f"{ADDRESS}/ftm", hf.Actor)
-        await above.ask(hf.StartChild(spec))
+        await above.ask(hf.StartChild(spec), 60.0)
 
     def path(self, name: str) -> str:
         return f"{ADDRESS}/ftm/{name}"

@@ -173,6 +173,47 @@ async def test_a_request_that_is_dropped_is_served_by_the_stack_before(
     assert stack(ref) == (below[0].name,)
 
 
+class Waits(hf.Operation):
+    """A step whose end waits until it is known what comes of the change that another one makes."""
+
+    verb = "wait"
+
+    def __init__(self, settled: Any) -> None:
+        super().__init__("probation")
+        self._settled = settled
+
+    async def check(self, system: hf.ActorSystem, draft: Any) -> None: ...
+
+    async def finish(self, system: hf.ActorSystem) -> None:
+        await self._settled
+
+
+@pytest.mark.parametrize("below", [(TR(),), ()], ids=["adapt", "attach"])
+async def test_how_a_change_went_is_told_however_late_one_asks(
+    system: hf.ActorSystem, below: tuple[Mechanism, ...]
+) -> None:
+    ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=below or None))
+    load = Load(ref)
+    await load.reached(20)
+    settled = asyncio.get_running_loop().create_future()
+
+    def seen(event: object) -> None:
+        if isinstance(event, MechanismSettled) and not settled.done():
+            settled.set_result(None)
+
+    system.node.events.add_sink(seen)
+    async with system.transaction(timeout=60) as change:
+        change.step(Waits(settled))
+        if below:
+            change.compose(ref, Dropping(), outside=True)
+        else:
+            change.attach(ref, Dropping())
+    await taken_back(change)
+    await load.reached(20)
+    await load.stop()
+    load.check(await ref.ask(Tags()))
+
+
 @pytest.mark.parametrize("part", ["before", "after"])
 @pytest.mark.parametrize(
     ("below", "whose"),

@@ -234,6 +234,7 @@ async def test_an_address_that_was_left_is_free_for_another(system: hf.ActorSyst
         (lambda change: change.isolation("/app/left/a", "thread"), "isolation must be one of"),
         (lambda change: change.remove("/app"), "leave the system"),
         (lambda change: change.suspend("/app/right/e"), "no actor at /app/right/e"),
+        (lambda change: change.move("/app/right/e", "/app/pool"), "keeps nobody who does not run"),
     ],
 )
 async def test_what_cannot_be_is_refused(system: hf.ActorSystem, step: Steps, why: str) -> None:

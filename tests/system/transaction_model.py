@@ -143,14 +143,15 @@ class Spec:
         return len(tops) == 1 and order.index(who) < order.index(other)
 
     def starts_alone(self) -> bool:
-        """Whether no two supervisors at the top wait for each other when both are restarted."""
+        """Whether no supervisor at the top waits for another one for more than an instant when both are restarted."""
         tops = self.nodes[ROOT].below
         led = [
             (tops.index(list(self.upwards(one))[-1].who), tops.index(list(self.upwards(node.who))[-1].who))
             for node in self.nodes.values()
             if (one := node.spec_peer) is not None
         ]
-        return all(to <= of for to, of in led)
+        late = {tops.index(list(self.upwards(node.who))[-1].who) for node in self.nodes.values() if node.is_late}
+        return all(to == of or (to < of and to not in late) for to, of in led)
 
     def ended_with(self, who: int) -> set[int]:
         """Whose lives may end when that of one ends: those below it, and its group by its supervisor's strategy."""
