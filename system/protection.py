@@ -81,7 +81,7 @@ class Protection:
             spec = self._completed_below(spec, address)
         if address not in self._loaded:
             return spec
-        from ..ftm.model.mechanism import Description, MechanismRefused, revive
+        from ..ftm.model.mechanism import MechanismRefused
 
         self._loaded.discard(address)
         declared, current, *before = self._kept[address]
@@ -94,10 +94,9 @@ class Protection:
             self.flush()
             self._homes.node.emit(AdaptationUndone(address, "probation"))
         try:
-            layers = tuple(map(revive, msgspec.convert(current or [], list[Description])))
+            mechanism = _mechanism(current)
         except MechanismRefused as error:
             raise SpecError(address, f"the mechanism that it had cannot be had any more: {error}") from error
-        mechanism = None if not layers else layers[0] if len(layers) == 1 else layers
         return dataclasses.replace(spec, mechanism=mechanism)
 
     def _completed_below(self, spec: ChildSpec, address: str) -> ChildSpec:
@@ -110,6 +109,10 @@ class Protection:
                 other = self._completed(child, path)
                 spec = dataclasses.replace(spec, start=rebuilt(spec.start, names, functools.partial(_instead, other)))
         return spec
+
+    def declared(self) -> dict[str, Any]:
+        """Which mechanisms the specs of addresses declare, of all that have others now."""
+        return {address: _mechanism(declared) for address, (declared, *_) in self._kept.items()}
 
     def put(self, address: str, before: Any, after: Any, *, is_trusted: bool = True) -> None:
         """The address has another mechanism from now on; kept with all others by the next `flush`.
@@ -157,6 +160,14 @@ class Protection:
 
 def _instead(other: ChildSpec, spec: ChildSpec) -> ChildSpec:
     return other
+
+
+def _mechanism(data: Any) -> Any:
+    """Layers from plain data. Raises MechanismRefused: they cannot be had any more."""
+    from ..ftm.model.mechanism import Description, revive
+
+    layers = tuple(map(revive, msgspec.convert(data or [], list[Description])))
+    return None if not layers else layers[0] if len(layers) == 1 else layers
 
 
 def _data(mechanism: Any) -> Any:

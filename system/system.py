@@ -48,6 +48,7 @@ from .protection import Protection, check_no_part
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
+from .specification import Specifications
 from .transaction.addresses import Moved
 from .transaction.transaction import Transaction, Transactions
 
@@ -174,6 +175,7 @@ class ActorSystem(Recorded, Controls):
         if self._log:
             self._sink = LogSink(self.name, node.loop, log_payloads=self._log_payloads)
             node.events.add_sink(self._sink)
+        self.specifications = Specifications(self._homes, is_kept=self._store is not None)
         self.mechanism_notes = Protection(self._homes)
         if self.mechanism_notes.is_needed:
             node.complete = self.mechanism_notes.completing(node.complete)
@@ -183,6 +185,7 @@ class ActorSystem(Recorded, Controls):
         if up is not None:
             await up
         root.ended().add_done_callback(self._root_ended)
+        await self.specifications.start_added(lambda spec: root.ref.ask(StartChild(spec), LONG))
         return self
 
     async def __aexit__(
@@ -331,7 +334,15 @@ class ActorSystem(Recorded, Controls):
         if not isinstance(spec, ChildSpec):
             raise SpecError("start", f"takes child(...) or supervisor(...), not {spec!r}")
         root = self._root_ref()
-        return cast("ActorRef[A]", await root.ask(StartChild(spec, fresh=fresh), LONG))
+        address, known = f"{root.path}/{spec.id}", self.specifications
+        if address in known.brought:  # The program says so itself now.
+            known.brought.discard(address)
+            await root.ask(RemoveChild(spec.id), LONG)
+        wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
+        ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
+        known.started(address)
+        await known.start_added(lambda one: root.ask(StartChild(one), LONG))
+        return ref
 
     def spawn(self, start: Start[A], name: str | None = None, *, mailbox: Bounded | None = None) -> ActorRef[A]:
         """Start an actor that nobody restarts, in this process, at once (its `on_start` is its first turn).

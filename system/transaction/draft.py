@@ -399,6 +399,20 @@ class Draft:
                 yield place
                 waiting.extend(reversed(list(place.children.values())))
 
+    def below_root(self) -> tuple[set[str], set[str]]:
+        """The addresses of those that come to the root from elsewhere, and of those of its children that go."""
+        top = self.root.children.values()
+        come = {one.path for one in top if one.is_planned or one.has_moved}
+        return come, {one.path for one in top if one.is_leaving}
+
+    def mechanisms(self) -> dict[str, Any]:
+        """Which mechanisms those have, at this instant, that are to have others."""
+        return {
+            place.path: place.relocation.before.mechanism
+            for place in self.staying()
+            if place.relocation is not None and not place.is_planned
+        }
+
     def lines(self) -> list[str]:
         """The tree when all is done, a line for each address."""
         return [line for place in self.staying() for line in (place.line(), *place.brick_lines())]

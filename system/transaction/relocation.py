@@ -34,7 +34,8 @@ class Relocation:
     def __init__(self, place: Place, text: str) -> None:
         self._place, self._text = place, text
         assert place.spec is not None
-        self._before: ChildSpec = place.spec
+        self.before: ChildSpec = place.spec
+        """What its spec says before the transaction."""
         self._task: asyncio.Task[None] | None = None
         self._gate: Gate | None = None
         self._grant: Grant | None = None
@@ -50,12 +51,12 @@ class Relocation:
     @property
     def _adapts(self) -> bool:
         """Whether its mechanisms are other ones."""
-        return bool(described(self._before.mechanism) != described(self._after.mechanism))
+        return bool(described(self.before.mechanism) != described(self._after.mechanism))
 
     @property
     def _moves(self) -> bool:
         """Whether it lives elsewhere, mechanisms aside."""
-        return self._before.isolation != self._after.isolation
+        return self.before.isolation != self._after.isolation
 
     @property
     def _comes_last(self) -> bool:
@@ -91,7 +92,7 @@ class Relocation:
 
     def _begin(self, system: ActorSystem, gate: Gate | None) -> asyncio.Task[None]:
         cell, moves = self._place.living(system.node), system._moves
-        wanted, before = self._after.mechanism, self._before.mechanism
+        wanted, before = self._after.mechanism, self.before.mechanism
         work: Coroutine[Any, Any, None]
         if not self._adapts:
             work = moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN, gate)
@@ -157,7 +158,7 @@ class Relocation:
             return
         self._give_back(system)
         notes, path = system.mechanism_notes, self._place.path
-        before, after = self._before.mechanism, self._after.mechanism
+        before, after = self.before.mechanism, self._after.mechanism
         cell = self._place.now(system.node)
         if cell is not None:  # Else its next life begins as its spec says.
             after = mechanism_of(cell)

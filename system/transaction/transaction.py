@@ -170,6 +170,9 @@ class Transaction:
                         commit(self._system)
                     except Exception as error:  # It had said that it is ready: the others are in force all the same.
                         self._problems.append(f"{text}: {said(error)}")
+                assert self._draft is not None
+                mechanisms = {**self._draft.mechanisms(), **self._system.mechanism_notes.declared()}
+                self._system.specifications.changed(*self._draft.below_root(), mechanisms)
         except HoldfastError as error:
             self._problems.append(f"it is not in the store, which has failed: {said(error)}")
 

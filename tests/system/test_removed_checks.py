@@ -9,6 +9,7 @@ from __future__ import annotations
 from tests.removing import Check, as_tests
 
 COMMIT = "tests/system/test_transaction_commit.py"
+KEPT = "tests/system/test_specification.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -17,6 +18,20 @@ CHECKS = {
         "            if True:\n",
         COMMIT,
         "test_a_root_that_is_killed and commit and task",
+    ),
+    "the specification is in the store with the states": Check(
+        "system/transaction/transaction.py",
+        "                self._system.specifications.changed(*self._draft.below_root(), mechanisms)\n",
+        "                pass\n",
+        KEPT,
+        "test_a_root_that_is_killed and finish",
+    ),
+    "a mechanism on trial is not in it": Check(
+        "system/specification.py",
+        "_packed(_with_mechanisms(address, spec, before))",
+        "_packed(spec)",
+        KEPT,
+        "test_mechanisms_and_specifications",
     ),
     "the home keeps the new state though its process has not heard of it": Check(
         "system/transaction/rework.py",

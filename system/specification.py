@@ -1,0 +1,184 @@
+"""The specification in force, kept in the store: a root that is started again has the tree that transactions have made.
+
+The program says what it starts below the root, and each such spec has a note here as soon as a transaction has made
+another one of it: of which the change was made, and what has become of it. The next root that starts that very spec
+starts the changed one. If the program has changed, its word is newer. Mechanisms have notes of their own
+(`protection.py`), for they are on trial at first; the specs here are as if those were still to be attached.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+from collections.abc import Awaitable, Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+
+from ..actors.errors import HoldfastError, SpecError
+from ..actors.events import Event
+from ..actors.process.wire.start_codec import pack_data, unpack_data
+from ..supervision.change import everything
+from ..supervision.respec import rebuilt
+from ..supervision.spec import ChildSpec
+from ..supervision.supervisor import Supervisor
+
+if TYPE_CHECKING:
+    from ..checkpoint.home.homes import Homes
+
+KEPT = "specification "
+"""How the notes begin; the address of a child of the root follows."""
+
+
+class SpecificationSuperseded(Event, frozen=True, eq=False):
+    """The program starts another spec here than the one that transactions had changed: what they made of it is void."""
+
+
+class SpecificationNotKept(Event, frozen=True, eq=False):
+    """A transaction has changed a spec that cannot be stored: the next root begins as the program says."""
+
+    why: str
+
+
+class Specifications:
+    """What transactions have made of the children of the root, for this root and the next one."""
+
+    def __init__(self, homes: Homes, *, is_kept: bool) -> None:
+        self._homes, self._is_kept = homes, is_kept
+        self._kept = {key.removeprefix(KEPT): value for key, value in homes.notes(KEPT).items()}
+        self._loaded: dict[str, tuple[bytes | None, bytes]] = {
+            address: msgspec.msgpack.decode(value, type=tuple[bytes | None, bytes])
+            for address, value in self._kept.items()
+        }
+        self._declared: dict[str, ChildSpec] = {}  # as the program says
+        self._seen: dict[str, ChildSpec] = {}  # the specs of which it is known what is to be kept
+        self._added: set[str] = set()  # children of the root that no program has started
+        self.brought: set[str] = set()
+        """Those of them that were brought back; a program that starts one itself means another one."""
+
+    def in_force(self, address: str, declared: ChildSpec, *, fresh: bool) -> ChildSpec:
+        """What is to be started where the program starts `declared`.
+
+        Raises:
+            SpecError: what transactions have made of it cannot be had any more.
+        """
+        self._declared[address] = declared
+        self._added.discard(address)
+        digest, data = self._loaded.pop(address, (None, b""))
+        if not data or fresh or digest != _digest(_packed(declared)[0]):
+            if data and not fresh:
+                self._homes.node.emit(SpecificationSuperseded(address))
+            self._keep(address, None)
+            return declared
+        return self._revived(address, data)
+
+    def started(self, address: str) -> None:
+        """It is there: what is said of it from now on is a change."""
+        spec = self._there().get(address)
+        if spec is not None:
+            self._seen[address] = spec
+
+    def _there(self) -> dict[str, ChildSpec]:
+        root = self._homes.node.root
+        supervisor = root.actor if root is not None else None
+        if root is None or not isinstance(supervisor, Supervisor):
+            return {}
+        return {f"{root.path}/{name}": one.spec for name, one in supervisor._listed().items()}
+
+    def _revived(self, address: str, data: bytes) -> ChildSpec:
+        try:
+            spec: ChildSpec = unpack_data(data)
+        except HoldfastError as error:
+            why = f"what transactions have made of it cannot be had any more: {error}"
+            raise SpecError(address, f"{why}; start it with fresh=True to begin anew") from error
+        return spec
+
+    async def start_added(self, start: Callable[[ChildSpec], Awaitable[Any]]) -> None:
+        """Start those that transactions have added below the root, as soon as all are there to whom they are bound."""
+        node = self._homes.node
+        for address, (digest, data) in list(self._loaded.items()):
+            if digest is not None or address not in self._loaded:
+                continue
+            spec = self._revived(address, data)
+            below = f"{address}/"
+            led = [path for one in everything((spec,)) for path in one.bindings.values()]
+            if all(path.startswith(below) or node.find(path) is not None for path in led):
+                del self._loaded[address]
+                self._added.add(address)
+                self.brought.add(address)
+                try:
+                    await start(spec)
+                except HoldfastError:
+                    continue  # Its supervisor has told so; the others are started all the same.
+                self.started(address)
+
+    def changed(self, added: set[str], removed: set[str], before: Mapping[str, Any]) -> None:
+        """A transaction is in force: keep what it has made of the children of the root.
+
+        Args:
+            added: the children of the root that it has added or moved there.
+            removed: those that it is about to stop.
+            before: which mechanisms the store says, or will say, that addresses have besides what is kept here.
+        """
+        if not self._is_kept:
+            return
+        self._added |= added
+        there = self._there()
+        for address in {*self._added, *self._declared}:
+            spec = there.get(address) if address not in removed else None
+            if spec is None:
+                self._added.discard(address)
+                self._keep(address, None)
+            elif spec is not self._seen.get(address):
+                self._seen[address] = spec
+                self._note(address, spec, before)
+
+    def _note(self, address: str, spec: ChildSpec, before: Mapping[str, Any]) -> None:
+        declared = None if address in self._added else self._declared[address]
+        was, why = _packed(declared)
+        now, problem = _packed(_with_mechanisms(address, spec, before))
+        if why or problem:
+            self._keep(address, None)
+            self._homes.node.emit(SpecificationNotKept(address, why or problem))
+        elif now is None or was == now:
+            self._keep(address, None)
+        else:
+            self._keep(address, msgspec.msgpack.encode((_digest(was), now)))
+
+    def _keep(self, address: str, value: bytes | None) -> None:
+        if self._kept.get(address) == value:
+            return
+        self._homes.note(KEPT + address, value)
+        if value is None:
+            del self._kept[address]
+        else:
+            self._kept[address] = value
+
+
+def _packed(spec: ChildSpec | None) -> tuple[bytes | None, str]:
+    """A spec as bytes, or why it cannot be stored."""
+    try:
+        return (None if spec is None else pack_data(spec, f"child {spec.id!r}")), ""
+    except HoldfastError as error:
+        return None, str(error)
+
+
+def _digest(packed: bytes | None) -> bytes | None:
+    return None if packed is None else hashlib.sha256(packed).digest()
+
+
+def _with_mechanisms(address: str, spec: ChildSpec, mechanisms: Mapping[str, Any]) -> ChildSpec:
+    """The spec with these mechanisms at these addresses, at and below its own."""
+    for path, mechanism in mechanisms.items():
+        put = functools.partial(_protected, mechanism)
+        if path == address:
+            spec = put(spec)
+        elif path.startswith(f"{address}/"):
+            names = path.removeprefix(f"{address}/").split("/")
+            spec = dataclasses.replace(spec, start=rebuilt(spec.start, names, put))
+    return spec
+
+
+def _protected(mechanism: Any, spec: ChildSpec) -> ChildSpec:
+    return dataclasses.replace(spec, mechanism=mechanism)

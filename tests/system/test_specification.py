@@ -1,0 +1,289 @@
+"""What transactions have made of the tree is there when the root is started again, whole or not at all."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import sys
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.mechanisms.tr import TR
+from holdfast.system.specification import SpecificationNotKept, SpecificationSuperseded
+from tests.system.test_transaction_commit import Die, plus
+from tests.system.trees import Add, Client, Counter, Double, Stumble, Where, counter, ref
+
+IN_TIME = 20.0
+RECORDED = hf.hybrid(interval=900.0)
+
+
+def left(**options: Any) -> hf.ChildSpec:
+    children = [counter("a"), counter("b"), counter("c"), counter("r", recovery=RECORDED)]
+    return hf.supervisor("left", intensity=9, children=children, **options)
+
+
+def right() -> hf.ChildSpec:
+    client = hf.child("client", hf.start(Client), bindings={"peer": "/app/left/a"})
+    return hf.supervisor("right", children=[counter("d"), client, counter("s", 500, recovery=RECORDED)])
+
+
+@asynccontextmanager
+async def program(store: Path, *, fresh: bool = False, first: Any = None) -> AsyncIterator[hf.ActorSystem]:
+    """The program whose root ends and is started again."""
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", durability="os", log=False) as system:
+        await system.start(first or left(), fresh=fresh)
+        await system.start(right(), fresh=fresh)
+        yield system
+
+
+def shape(system: hf.ActorSystem) -> dict[str, Any]:
+    """The specification, as it is lived."""
+    found: dict[str, Any] = {}
+    root = system.node.root
+    assert root is not None
+    waiting = [root]
+    while waiting:
+        cell = waiting.pop(0)
+        actor: Any = cell.actor
+        if isinstance(actor, hf.Supervisor):
+            children = [(name, one.state, one.spec.start.kind) for name, one in actor._children.items()]
+            if cell is root:
+                children.sort(key=lambda one: one[0])  # Their order is that in which the program starts them.
+            found[cell.path] = (actor._flags if cell is not root else None, children)
+            waiting += (cell.children or {}).values()
+        else:
+            bindings = {} if cell.more is None else {port: to.path for port, to in cell.more.bindings.items()}
+            found[cell.path] = (type(actor), cell.host.__class__, bindings)
+    return found
+
+
+def much(change: hf.Change) -> None:
+    change.add("/app/left", hf.supervisor("sub", children=[counter("x")]))
+    change.move("/app/left/a", "/app/left/sub")
+    change.move("/app/left/b", "/app/right")
+    change.remove("/app/left/c")
+    change.add("/app/left", hf.child("user", hf.start(Client), bindings={"peer": "/app/left/sub/x"}))
+    change.reorder("/app/right", ["b", "s"])
+    change.strategy("/app/right", "rest_for_one")
+    change.intensity("/app/left", 77, 7.0)
+    change.replace_code("/app/right/s", Double)
+    change.replace_state("/app/right/s", lambda state: plus(1000, state))
+    change.stop("/app/right/d")
+    change.add("/app", hf.supervisor("top", children=[counter("y", recovery=RECORDED)]))
+
+
+def move(change: hf.Change) -> None:
+    change.move("/app/left/a", "/app/right")
+    change.reorder("/app/right", ["a"])  # It has to be there before the client that is bound to it.
+
+
+CHANGES: dict[str, Callable[[hf.Change], object]] = {
+    "add": lambda change: change.add("/app/left", counter("x")),
+    "remove": lambda change: change.remove("/app/left/b"),
+    "move": lambda change: move(change),
+    "reorder": lambda change: change.reorder("/app/left", ["c", "r"]),
+    "flags": lambda change: change.intensity("/app/left", 77, 7.0),
+    "stop": lambda change: change.stop("/app/left/b"),
+    "code": lambda change: change.replace_code("/app/left/r", Double),
+    "process": lambda change: change.isolation("/app/left/r", "process"),
+    "at the top": lambda change: change.add("/app", counter("x")),
+    "to the top": lambda change: change.move("/app/left/a", "/app"),
+    "much": much,
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+async def test_the_next_root_has_what_is_in_force(tmp_path: Path, name: str) -> None:
+    async with program(tmp_path / "store") as system:
+        async with system.transaction(timeout=IN_TIME) as change:
+            CHANGES[name](change)
+        now = shape(system)
+    for _ in range(2):
+        async with program(tmp_path / "store") as system:
+            assert shape(system) == now
+    async with program(tmp_path / "other") as system:
+        assert shape(system) != now
+
+
+async def test_a_transaction_on_top_of_another_one_is_kept_too(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system:
+        before = shape(system)
+        async with system.transaction(timeout=IN_TIME) as change:
+            much(change)
+    async with program(tmp_path / "store") as system:
+        assert await ref(system, "/app/right/s").ask(Add(1)) == 1502
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/top")
+            change.move("/app/left/sub/a", "/app")
+        now = shape(system)
+    async with program(tmp_path / "store") as system:
+        assert shape(system) == now
+        assert await ref(system, "/app/right/client").ask(Where()) == "/app/a"
+    async with program(tmp_path / "store", fresh=True) as system:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/a")
+        assert shape(system) == before
+    async with program(tmp_path / "store") as system:
+        assert shape(system) == before
+
+
+async def test_what_is_taken_back_leaves_no_trace(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system:
+        before = shape(system)
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app/left", counter("x"))
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/left/x")
+        with pytest.raises(hf.TransactionFailed):  # noqa: PT012
+            async with system.transaction(timeout=IN_TIME) as change:
+                much(change)
+                change.step(Stumble())
+        assert system.specifications._kept == {}
+    async with program(tmp_path / "store") as system:
+        assert shape(system) == before
+
+
+async def test_a_program_that_says_something_else_is_newer(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system, system.transaction(timeout=IN_TIME) as change:
+        change.add("/app/left", counter("x"))
+        change.strategy("/app/right", "one_for_all")
+        change.add("/app", counter("top"))
+    async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / 'store'}", log=False) as system:
+        with system.events() as stream:
+            await system.start(left(strategy="rest_for_one"))
+            assert [event.address for event in stream.take() if isinstance(event, SpecificationSuperseded)] == [
+                "/app/left"
+            ]
+            await system.start(right())
+            top = await system.start(counter("top", 100))  # It was there already, as the transaction said.
+            assert await top.ask(Add(1)) == 101
+        assert system.node.find("/app/left/x") is None
+        actor: Any = ref(system, "/app/right")._cell.actor
+        assert actor._flags.strategy == "one_for_all"
+    async with program(tmp_path / "store", first=left(strategy="rest_for_one")) as system:
+        assert system.node.find("/app/left/x") is None
+
+
+async def test_in_one_life_of_the_root_the_program_is_taken_at_its_word(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app/left", counter("x"))
+        await system.stop(ref(system, "/app/left"))
+        await system.start(left())
+        assert system.node.find("/app/left/x") is None
+
+
+async def test_what_cannot_be_stored_is_told_and_the_next_root_begins_as_the_program_says(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app/left", counter("x"))
+        with system.events() as stream:
+            async with system.transaction(timeout=IN_TIME) as change:
+                odd: Any = lambda: 5  # noqa: E731
+                change.add("/app/left", hf.child("y", hf.start(Counter, odd)))
+            (told,) = [event for event in stream.take() if isinstance(event, SpecificationNotKept)]
+        assert told.address == "/app/left"
+        assert told.why
+    async with program(tmp_path / "store") as system:
+        assert system.node.find("/app/left/x") is None
+        assert system.node.find("/app/left/y") is None
+
+
+async def test_who_is_bound_to_the_program_comes_back_behind_it(tmp_path: Path) -> None:
+    user = hf.child("user", hf.start(Client), bindings={"peer": "/app/right/d"})
+    async with program(tmp_path / "store") as system, system.transaction(timeout=IN_TIME) as change:
+        change.add("/app", user)
+    async with program(tmp_path / "store") as system:
+        assert await ref(system, "/app/user").ask(Where()) == "/app/right/d"
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_mechanisms_and_specifications_are_kept_side_by_side(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system:
+        async with system.transaction(timeout=60) as change:
+            change.attach("/app/left/r", PBR())
+            change.add("/app/left", counter("x", recovery=RECORDED, mechanism=TR()))
+        async with system.transaction(timeout=60) as change:
+            change.reorder("/app/left", ["x", "r"])
+            change.detach("/app/left/x")
+        for event in await change.settled():
+            assert event.is_kept
+        assert await ref(system, "/app/left/r").ask(Add(5)) == 5
+        notes = system.mechanism_notes.declared()
+        assert notes["/app/left/r"] is None
+    for _ in range(2):
+        async with program(tmp_path / "store") as system:
+            specs = {one.spec.id: one.spec for one in ref(system, "/app/left")._cell.actor._children.values()}  # type: ignore[union-attr]
+            assert list(specs) == ["x", "r", "a", "b", "c"]
+            assert specs["x"].mechanism is None
+            assert await ref(system, "/app/left/r").ask(Add(0)) == 5
+
+
+# -- the root is killed -----------------------------------------------------------------------------------------------
+
+
+async def killed(store: str, when: str) -> None:
+    """The root is killed by a step in the middle of a transaction."""
+    async with program(Path(store)) as system:
+        await ref(system, "/app/right/s").ask(Add(100))
+        async with system.transaction(timeout=IN_TIME) as change:
+            if when == "finish":
+                change.step(Die(when))
+            change.replace_state("/app/left/r", taken)
+            change.replace_state("/app/right/s", given)
+            change.replace_code("/app/right/s", Double)
+            change.step(Die(when))
+            move(change)
+            change.add("/app/left", counter("x"))
+            change.remove("/app/left/b")
+
+
+def taken(state: dict[str, Any]) -> dict[str, Any]:
+    return plus(-100, state)
+
+
+def given(state: dict[str, Any]) -> dict[str, Any]:
+    return plus(100, state)
+
+
+PROGRAM = """
+import asyncio, sys
+from tests.system.test_specification import killed
+
+if __name__ == "__main__":
+    asyncio.run(killed(*sys.argv[1:]))
+"""
+
+
+@pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
+async def test_a_root_that_is_killed_comes_back_as_the_old_specification_or_the_new_one(
+    tmp_path: Path, when: str
+) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    here = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, str(tmp_path / "program.py"), str(tmp_path / "store"), when, env=environment
+    )
+    assert await asyncio.wait_for(process.wait(), 60) == -signal.SIGKILL
+    async with program(tmp_path / "store") as system:
+        children = [
+            [info.id for info in await ref(system, at).ask(hf.WhichChildren())] for at in ("/app/left", "/app/right")
+        ]
+        amounts = await ref(system, "/app/left/r").ask(Add(0)), await ref(system, "/app/right/s").ask(Add(0))
+        kind = type(ref(system, "/app/right/s")._cell.actor)
+    if when == "finish":
+        assert children == [["c", "r", "x"], ["a", "d", "client", "s"]]
+        assert amounts == (-100, 700)
+        assert kind is Double
+    else:
+        assert children == [["a", "b", "c", "r"], ["d", "client", "s"]]
+        assert amounts == (0, 600)
+        assert kind is Counter
