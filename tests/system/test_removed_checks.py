@@ -31,7 +31,7 @@ CHECKS = {
         "_packed(_with_mechanisms(address, spec, before))",
         "_packed(spec)",
         KEPT,
-        "test_mechanisms_and_specifications",
+        "test_a_mechanism_that_was_on_trial",
     ),
     "the home keeps the new state though its process has not heard of it": Check(
         "system/transaction/rework.py",
@@ -88,13 +88,6 @@ CHECKS = {
         "            pass\n",
         COMMIT,
         "test_who_was_bound_to_a_life_that_is_over",
-    ),
-    "an actor with a new address is let go of": Check(
-        "system/transaction/draft.py",
-        "            self.cell = node.successor(self.cell) or self.cell\n",
-        "            return node.successor(self.cell)\n",
-        COMMIT,
-        "test_who_has_a_new_address_since and plain",
     ),
     "a tree that could not be started again is refused": Check(
         "system/transaction/draft.py",

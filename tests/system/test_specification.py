@@ -255,24 +255,46 @@ def given(state: dict[str, Any]) -> dict[str, Any]:
 
 PROGRAM = """
 import asyncio, sys
-from tests.system.test_specification import killed
+from tests.system.test_specification import killed, on_trial
 
 if __name__ == "__main__":
-    asyncio.run(killed(*sys.argv[1:]))
+    asyncio.run({"killed": killed, "on_trial": on_trial}[sys.argv[1]](*sys.argv[2:]))
 """
+
+
+async def on_trial(store: str) -> None:
+    """The root is killed before it is known whether a mechanism stays."""
+    async with program(Path(store)) as system:
+        async with system.transaction(timeout=60) as change:
+            change.attach("/app/left/r", PBR())
+            change.add("/app/left", counter("x"))
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+async def until_killed(tmp_path: Path, *arguments: str) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    here = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
+    process = await asyncio.create_subprocess_exec(
+        sys.executable, str(tmp_path / "program.py"), *arguments, env=environment
+    )
+    assert await asyncio.wait_for(process.wait(), 60) == -signal.SIGKILL
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_a_mechanism_that_was_on_trial_is_not_there_and_all_else_is(tmp_path: Path) -> None:
+    await until_killed(tmp_path, "on_trial", str(tmp_path / "store"))
+    async with program(tmp_path / "store") as system:
+        left: Any = ref(system, "/app/left")._cell.actor
+        assert list(left._children) == ["a", "b", "c", "r", "x"]
+        assert left._children["r"].spec.mechanism is None
 
 
 @pytest.mark.parametrize("when", ["prepare", "commit", "finish"])
 async def test_a_root_that_is_killed_comes_back_as_the_old_specification_or_the_new_one(
     tmp_path: Path, when: str
 ) -> None:
-    (tmp_path / "program.py").write_text(PROGRAM)
-    here = str(Path(__file__).parents[2])
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
-    process = await asyncio.create_subprocess_exec(
-        sys.executable, str(tmp_path / "program.py"), str(tmp_path / "store"), when, env=environment
-    )
-    assert await asyncio.wait_for(process.wait(), 60) == -signal.SIGKILL
+    await until_killed(tmp_path, "killed", str(tmp_path / "store"), when)
     async with program(tmp_path / "store") as system:
         children = [
             [info.id for info in await ref(system, at).ask(hf.WhichChildren())] for at in ("/app/left", "/app/right")
