@@ -30,6 +30,8 @@ campaign: $(VENV)/.dev
 	    tests/ftm/test_campaign_faults.py tests/ftm/test_campaign.py tests/ftm/test_soak.py tests/ftm/test_removed_checks.py
 	HOLDFAST_MATRIX=500 HOLDFAST_BAD_CHANGES=1 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
 	    tests/migration tests/ftm/test_bad_changes.py
+	HOLDFAST_TRANSACTIONS=1000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=0 \
+	    tests/system/test_transactions_under_fire.py
 	HOLDFAST_SIGNALS=100 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 tests/system/test_signals.py
 	HOLDFAST_SYSCALLS=500 HOLDFAST_FUZZ=5000 $(BIN)/python -m pytest -q -n 2 -s -o faulthandler_timeout=900 \
 	    tests/faults tests/actors/process/hostile/test_fuzz.py

@@ -189,6 +189,7 @@ from holdfast.supervision.tree import supervisor
 from holdfast.system.portal import ThreadPortal
 from holdfast.system.run import run
 from holdfast.system.script import UntrustedFile
+from holdfast.system.specification import SpecificationNotKept, SpecificationSuperseded
 from holdfast.system.system import ActorSystem
 from holdfast.system.transaction.change import Change
 from holdfast.system.transaction.errors import TransactionFailed, TransactionRefused
@@ -411,6 +412,8 @@ __all__ = [
     "SnapshotFailed",
     "SnapshotTaken",
     "SpecError",
+    "SpecificationNotKept",
+    "SpecificationSuperseded",
     "StaleEpoch",
     "Start",
     "StartChild",

@@ -63,18 +63,24 @@ class Specifications:
         Raises:
             SpecError: what transactions have made of it cannot be had any more.
         """
-        self._declared[address] = declared
-        self._added.discard(address)
-        digest, data = self._loaded.pop(address, (None, b""))
-        if not data or fresh or digest != _digest(_packed(declared)[0]):
-            if data and not fresh:
-                self._homes.node.emit(SpecificationSuperseded(address))
-            self._keep(address, None)
+        digest, data = self._loaded.get(address, (None, b""))
+        if digest is None or fresh or digest != _digest(_packed(declared)[0]):
             return declared
         return self._revived(address, data)
 
-    def started(self, address: str) -> None:
-        """It is there: what is said of it from now on is a change."""
+    def started(self, address: str, declared: ChildSpec, wanted: ChildSpec, *, fresh: bool) -> None:
+        """What the program wanted is there: what is said of it from now on is a change."""
+        is_newer = address in self._loaded and wanted is declared
+        self._loaded.pop(address, None)
+        self._added.discard(address)
+        self._declared[address] = declared
+        if wanted is declared:
+            self._keep(address, None)
+        if is_newer and not fresh:
+            self._homes.node.emit(SpecificationSuperseded(address))
+        self._see(address)
+
+    def _see(self, address: str) -> None:
         spec = self._there().get(address)
         if spec is not None:
             self._seen[address] = spec
@@ -111,7 +117,7 @@ class Specifications:
                     await start(spec)
                 except HoldfastError:
                     continue  # Its supervisor has told so; the others are started all the same.
-                self.started(address)
+                self._see(address)
 
     def changed(self, added: set[str], removed: set[str], before: Mapping[str, Any]) -> None:
         """A transaction is in force: keep what it has made of the children of the root.

@@ -340,7 +340,7 @@ class ActorSystem(Recorded, Controls):
             await root.ask(RemoveChild(spec.id), LONG)
         wanted: ChildSpec = known.in_force(address, spec, fresh=fresh)
         ref = cast("ActorRef[A]", await root.ask(StartChild(wanted, fresh=fresh), LONG))
-        known.started(address)
+        known.started(address, spec, wanted, fresh=fresh)
         await known.start_added(lambda one: root.ask(StartChild(one), LONG))
         return ref
 
