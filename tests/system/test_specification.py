@@ -172,9 +172,8 @@ async def test_a_program_that_says_something_else_is_newer(tmp_path: Path) -> No
 
 
 async def test_a_start_that_fails_forgets_nothing(tmp_path: Path) -> None:
-    async with program(tmp_path / "store") as system:
-        async with system.transaction(timeout=IN_TIME) as change:
-            change.add("/app/right", counter("x"))
+    async with program(tmp_path / "store") as system, system.transaction(timeout=IN_TIME) as change:
+        change.add("/app/right", counter("x"))
     async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / 'store'}", log=False) as system:
         with pytest.raises(hf.StartFailed, match="/app/left/a"):
             await system.start(right())  # Its client is bound to somebody who is not there yet.
