@@ -8,6 +8,7 @@ starts the changed one. If the program has changed, its word is newer. Mechanism
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
 import functools
 import hashlib
@@ -18,6 +19,7 @@ import msgspec
 
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.events import Event
+from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
 from ..supervision.change import everything
 from ..supervision.respec import rebuilt
@@ -29,6 +31,8 @@ if TYPE_CHECKING:
 
 KEPT = "specification "
 """How the notes begin; the address of a child of the root follows."""
+TOGETHER = 50
+"""So many specs are packed before others have their turn."""
 
 
 class SpecificationSuperseded(Event, frozen=True, eq=False):
@@ -53,6 +57,7 @@ class Specifications:
         }
         self._declared: dict[str, ChildSpec] = {}  # as the program says
         self._seen: dict[str, ChildSpec] = {}  # the specs of which it is known what is to be kept
+        self._packer = Packer()
         self._added: set[str] = set()  # children of the root that no program has started
         self.brought: set[str] = set()
         """Those of them that were brought back; a program that starts one itself means another one."""
@@ -64,7 +69,7 @@ class Specifications:
             SpecError: what transactions have made of it cannot be had any more.
         """
         digest, data = self._loaded.get(address, (None, b""))
-        if digest is None or fresh or digest != _digest(_packed(declared)[0]):
+        if digest is None or fresh or digest != _digest(self._packed(declared)[0]):
             return declared
         return self._revived(address, data)
 
@@ -94,11 +99,10 @@ class Specifications:
 
     def _revived(self, address: str, data: bytes) -> ChildSpec:
         try:
-            spec: ChildSpec = unpack_data(data)
+            return unpack(data)
         except HoldfastError as error:
             why = f"what transactions have made of it cannot be had any more: {error}"
             raise SpecError(address, f"{why}; start it with fresh=True to begin anew") from error
-        return spec
 
     async def start_added(self, start: Callable[[ChildSpec], Awaitable[Any]]) -> None:
         """Start those that transactions have added below the root, as soon as all are there to whom they are bound."""
@@ -118,6 +122,25 @@ class Specifications:
                 except HoldfastError:
                     continue  # Its supervisor has told so; the others are started all the same.
                 self._see(address)
+
+    async def prepare(self) -> None:
+        """Make ready what takes long with many children, so that the commit does not."""
+        if not self._is_kept:
+            return
+        there = self._there()
+        for address, declared in self._declared.items():
+            waiting, count = [declared], 0
+            if address in there:
+                waiting.append(there[address])
+            while waiting:
+                spec = waiting.pop()
+                below = _children(spec)
+                waiting.extend(below)
+                count += 1
+                if count % TOGETHER == 0:
+                    await asyncio.sleep(0)
+                if not below:
+                    self._packed(spec)
 
     def changed(self, added: set[str], removed: set[str], before: Mapping[str, Any]) -> None:
         """A transaction is in force: keep what it has made of the children of the root.
@@ -139,11 +162,12 @@ class Specifications:
             elif spec is not self._seen.get(address):
                 self._seen[address] = spec
                 self._note(address, spec, before)
+        self._packer.forget()
 
     def _note(self, address: str, spec: ChildSpec, before: Mapping[str, Any]) -> None:
         declared = None if address in self._added else self._declared[address]
-        was, why = _packed(declared)
-        now, problem = _packed(_with_mechanisms(address, spec, before))
+        was, why = self._packed(declared)
+        now, problem = self._packed(_with_mechanisms(address, spec, before))
         if why or problem:
             self._keep(address, None)
             self._homes.node.emit(SpecificationNotKept(address, why or problem))
@@ -151,6 +175,13 @@ class Specifications:
             self._keep(address, None)
         else:
             self._keep(address, msgspec.msgpack.encode((_digest(was), now)))
+
+    def _packed(self, spec: ChildSpec | None) -> tuple[bytes | None, str]:
+        """A spec as bytes, or why it cannot be stored."""
+        try:
+            return (None if spec is None else self._packer.pack(spec)), ""
+        except HoldfastError as error:
+            return None, str(error)
 
     def _keep(self, address: str, value: bytes | None) -> None:
         if self._kept.get(address) == value:
@@ -162,12 +193,55 @@ class Specifications:
             self._kept[address] = value
 
 
-def _packed(spec: ChildSpec | None) -> tuple[bytes | None, str]:
-    """A spec as bytes, or why it cannot be stored."""
-    try:
-        return (None if spec is None else pack_data(spec, f"child {spec.id!r}")), ""
-    except HoldfastError as error:
-        return None, str(error)
+class Packer:
+    """Specs as bytes. That of a child is packed once, as long as it stays what it is: a tree changes in few places."""
+
+    def __init__(self) -> None:
+        self._made: dict[int, tuple[ChildSpec, Any]] = {}  # by the identity of the spec
+        self._used: dict[int, tuple[ChildSpec, Any]] = {}
+
+    def pack(self, spec: ChildSpec) -> bytes:
+        """A spec as bytes. Raises HoldfastError: it cannot be stored."""
+        return msgspec.msgpack.encode(self.part(spec))
+
+    def part(self, spec: ChildSpec) -> Any:
+        """The same as data: its own bytes, and the parts of those below it."""
+        known = self._made.get(id(spec))
+        if known is None:
+            below = _children(spec)
+            own = _with_children(spec, ()) if below else spec
+            known = (spec, (pack_data(own, f"child {spec.id!r}"), [self.part(one) for one in below]))
+        self._used[id(spec)] = known
+        return known[1]
+
+    def forget(self) -> None:
+        """What was not asked for since the last time is not kept any longer."""
+        self._made, self._used = self._used, {}
+
+
+def unpack(data: bytes) -> ChildSpec:
+    """The spec again. Raises HoldfastError: a class cannot be found, or these are no such bytes."""
+    return _unpacked(msgspec.msgpack.decode(data))
+
+
+def _unpacked(part: Any) -> ChildSpec:
+    own, below = part
+    spec: ChildSpec = unpack_data(own)
+    if below:
+        spec = _with_children(spec, tuple(map(_unpacked, below)))
+    return spec
+
+
+def _children(spec: ChildSpec) -> tuple[ChildSpec, ...]:
+    """The children that stand in a supervisor's recipe one by one."""
+    args = spec.start.args
+    below = args[1] if spec.is_supervisor and len(args) == 2 and isinstance(args[1], tuple) else ()
+    return below if all(isinstance(one, ChildSpec) for one in below) else ()
+
+
+def _with_children(spec: ChildSpec, below: tuple[ChildSpec, ...]) -> ChildSpec:
+    start = spec.start
+    return dataclasses.replace(spec, start=Start(start.kind, (start.args[0], below), start.kwargs))
 
 
 def _digest(packed: bytes | None) -> bytes | None:

@@ -124,6 +124,7 @@ class Transaction:
         waiting = ""
         try:
             async with asyncio.timeout_at(deadline):
+                await system.specifications.prepare()
                 for operation in operations:
                     failed = operation.text
                     begun.append(operation)  # Before it is prepared: it may be cancelled in the middle.

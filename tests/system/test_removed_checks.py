@@ -28,8 +28,8 @@ CHECKS = {
     ),
     "a mechanism on trial is not in it": Check(
         "system/specification.py",
-        "_packed(_with_mechanisms(address, spec, before))",
-        "_packed(spec)",
+        "self._packed(_with_mechanisms(address, spec, before))",
+        "self._packed(spec)",
         KEPT,
         "test_a_mechanism_that_was_on_trial",
     ),
