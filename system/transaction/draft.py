@@ -270,10 +270,14 @@ class Draft:
         self.by_cell[cell] = place
         place.kind = cell_kind(cell) or place.kind
         actor = place.actor
-        place.flags = actor._flags if actor is not None else recipe_flags(cell)
+        if place.is_supervisor or place.kind is None:  # Else nobody says anything of children.
+            place.flags = actor._flags if actor is not None else recipe_flags(cell)
+            recipe = {spec.id for spec in recipe_specs(cell) or ()}
+        else:
+            recipe = set[str]()
         below = dict(cell.children or {})
         known: list[Child] = list(actor._children.values()) if actor is not None else []
-        planned = {spec.id for spec in recipe_specs(cell) or ()} | (actor._planned if actor is not None else set())
+        planned = recipe | (actor._planned if actor is not None else set[str]())
         for one in known:
             child = below.pop(one.spec.id, None)
             place.children[one.spec.id] = self._survey(child, one.spec.id, place, one.spec)
