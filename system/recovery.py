@@ -38,7 +38,9 @@ class RecoveryTree:
         children = tuple(child(name, start(kind, self._homes)) for name, kind in PARTS)
         recipe = Start(Supervisor, (Flags(intensity=10, period=1.0), children))
         self._born = node.loop.time()
-        self._spawn(recipe).ended().add_done_callback(lambda _: self._ended())
+        cell = self._spawn(recipe)
+        node.own.add(cell)
+        cell.ended().add_done_callback(lambda _: self._ended(cell))
 
     def _spawn(self, recipe: Start[Supervisor]) -> Cell:
         for name in NAMES[:-1]:
@@ -48,8 +50,9 @@ class RecoveryTree:
                 continue
         return self._node.spawn(recipe, NAMES[-1])
 
-    def _ended(self) -> None:
+    def _ended(self, cell: Cell) -> None:
         """Its parts were restarted too often, or somebody has stopped it."""
+        self._node.own.discard(cell)
         loop = self._node.loop
         if loop.time() - self._born > LONGEST_DELAY:
             self._delay = FIRST_DELAY

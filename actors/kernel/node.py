@@ -73,6 +73,7 @@ class Node(RunLoop):
         self.overdue: Overdue | None = None  # in an actor process: who ends it when it is blocked
         self.here: Host = LOCAL  # lives in this very process
         self.vacated: dict[str, Cell] = {}  # addresses that actors have left, as long as nobody else lives there
+        self.own: set[Cell] = set()  # parts of the system itself, which the program does not change
         self.awaited: dict[str, list[Callable[[], None]]] = {}  # what is done when somebody comes to live at a path
         self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
         self.keeper: Keeper = NothingKept()

@@ -304,6 +304,8 @@ class Draft:
         for at in place.upwards():
             if at.is_leaving:
                 raise wrong(place.path, f"{at.path} is removed by this very transaction")
+            if at.cell in self.node.own:
+                raise wrong(place.path, "it is a part of the system itself, which no transaction changes")
         if not parts:
             self._check_no_part(place.path, place.parent)
         return place

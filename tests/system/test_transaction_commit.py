@@ -529,6 +529,24 @@ async def test_a_tree_that_could_not_be_started_again_is_refused(system: hf.Acto
     assert await ref(system, "/app/top/user").ask(Where()) == "/app/top/first"
 
 
+OWN: list[Callable[[hf.Change], object]] = [
+    lambda change: change.add("/app/recovery", counter("x")),
+    lambda change: change.move("/app/left/a", "/app/recovery"),
+    lambda change: change.remove("/app/recovery"),
+    lambda change: change.replace_code("/app/recovery/controller", Double),
+]
+
+
+@pytest.mark.parametrize("step", OWN)
+async def test_what_belongs_to_the_system_itself_is_not_changed(
+    system: hf.ActorSystem, step: Callable[[hf.Change], object]
+) -> None:
+    await system.start(counter("recorded", recovery=hf.hybrid(interval=60.0)))
+    with pytest.raises(hf.TransactionRefused, match="a part of the system itself"):
+        async with system.transaction() as change:
+            step(change)
+
+
 # -- stopping ---------------------------------------------------------------------------------------------------------
 
 

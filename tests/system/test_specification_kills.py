@@ -1,0 +1,148 @@
+"""Random transactions while the root is killed and started again: the tree is as before the last one or as after it.
+
+HOLDFAST_ROOTS=N kills so many roots in a row, on one store; HOLDFAST_SEED=N draws others.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import random
+import signal
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import holdfast as hf
+from holdfast.system.transaction.arrangement import Arrangement
+from holdfast.system.transaction.draft import Draft
+from tests.system.trees import Add, Client, Counter, Double, counter, ref
+
+KILLS = int(os.environ.get("HOLDFAST_ROOTS", "6"))
+SEED = int(os.environ.get("HOLDFAST_SEED", "1"))
+LONGEST = 0.4
+"""Seconds that a root lives at most once it changes its tree."""
+TOPS = ("/app/left", "/app/right")
+
+
+@asynccontextmanager
+async def program(store: str) -> AsyncIterator[hf.ActorSystem]:
+    async with hf.ActorSystem("app", store=f"sqlite:{store}", durability="os", log=False) as system:
+        recorded = hf.hybrid(interval=900.0)
+        client = hf.child("client", hf.start(Client), bindings={"peer": "/app/left/a"})
+        below = hf.supervisor("sub", intensity=9, children=[counter("x"), counter("y")])
+        await system.start(hf.supervisor("left", children=[counter("a"), counter("r", recovery=recorded), below]))
+        await system.start(hf.supervisor("right", children=[counter("b"), client, counter("s", recovery=recorded)]))
+        yield system
+
+
+def lines(system: hf.ActorSystem) -> list[str]:
+    """The tree in words: who is where, in which order, of which class, by which flags and bound to whom."""
+    return Draft(system.node, Arrangement()).lines()
+
+
+def draw(dice: random.Random, change: hf.Change, tree: list[str], number: int) -> None:
+    """One random step."""
+    paths = [line.partition(":")[0] for line in tree]
+    supervisors = [
+        path for path, line in zip(paths, tree, strict=True) if ": Supervisor" in line and path.startswith(TOPS)
+    ]
+    others = [path for path in paths if path.startswith(tuple(f"{top}/" for top in TOPS))]
+    above, one = dice.choice(supervisors), dice.choice(others)
+    names = [path.rpartition("/")[2] for path in others if path.rpartition("/")[0] == above]
+    match dice.randrange(9):
+        case 0:
+            change.add(above, counter(f"n{number}", recovery=dice.choice([None, hf.hybrid(interval=900.0)])))
+        case 1:
+            change.add(above, hf.supervisor(f"t{number}", children=[counter("z")]))
+        case 2:
+            change.remove(one)
+        case 3:
+            change.move(one, above)
+        case 4:
+            dice.shuffle(names)
+            change.reorder(above, names)
+        case 5:
+            change.strategy(above, dice.choice(["one_for_one", "one_for_all", "rest_for_one"]))
+        case 6:
+            change.intensity(above, dice.randrange(5, 99), float(dice.randrange(1, 9)))
+        case 7:
+            change.replace_code(one, dice.choice([Counter, Double]))
+        case _:
+            change.replace_state(dice.choice(["/app/left/r", "/app/right/s"]), one_more)
+
+
+def one_more(state: dict[str, Any]) -> dict[str, Any]:
+    return {**state, "count": state["count"] + 1}
+
+
+async def changing(store: str, log: str, seed: int) -> None:
+    """Change the tree for ever, and say before each change what comes of it, and behind it that it is in force."""
+    dice = random.Random(seed)
+    async with program(store) as system:
+        number = seed * 1000
+        with open(log, "w", encoding="utf-8", buffering=1) as told:
+            told.write(f"0\t{'|'.join(lines(system))}\n")
+            while True:
+                number += 1
+                steps = [dice.randrange(2**32) for _ in range(dice.randrange(1, 4))]
+                tree = lines(system)
+
+                def collect(change: hf.Change, steps: list[int] = steps, tree: list[str] = tree) -> None:
+                    for at, one in enumerate(steps):
+                        draw(random.Random(one), change, tree, number * 10 + at)  # noqa: B023
+
+                dry = system.transaction(dry_run=True)
+                try:
+                    async with dry as change:
+                        collect(change)
+                except hf.TransactionRefused:
+                    continue
+                assert dry._draft is not None
+                told.write(f"{number}\t{'|'.join(dry._draft.lines())}\n")
+                async with system.transaction(timeout=10.0) as change:
+                    collect(change)
+                told.write(f"{number}\n")
+
+
+PROGRAM = """
+import asyncio, sys
+from tests.system.test_specification_kills import changing
+
+if __name__ == "__main__":
+    asyncio.run(changing(sys.argv[1], sys.argv[2], int(sys.argv[3])))
+"""
+
+
+async def test_the_tree_is_as_before_or_as_after_the_last_transaction_whenever_the_root_is_killed(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "program.py").write_text(PROGRAM)
+    here = str(Path(__file__).parents[2])
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))}
+    dice, store, log = random.Random(SEED), str(tmp_path / "store"), tmp_path / "log"
+    carried_out = 0
+    for kill in range(KILLS):
+        seed = SEED * 100_000 + kill
+        arguments = (str(tmp_path / "program.py"), store, str(log), str(seed))
+        process = await asyncio.create_subprocess_exec(sys.executable, *arguments, env=environment)
+        async with asyncio.timeout(60):
+            while not (log.exists() and log.read_text()):
+                await asyncio.sleep(0.005)
+        await asyncio.sleep(dice.uniform(0.0, LONGEST))
+        process.send_signal(signal.SIGKILL)
+        assert await process.wait() == -signal.SIGKILL, f"seed {seed}: it has ended by itself"
+        told = [line.split("\t") for line in log.read_text().split("\n")[:-1]]
+        log.unlink()
+        is_over = len(told[-1]) == 1 or told[-1][0] == "0"
+        trees = [one[1].split("|") for one in told if len(one) == 2]
+        expected = trees[-1:] if is_over else trees[-2:]
+        carried_out += sum(len(one) == 1 for one in told)
+        async with program(store) as system:
+            assert lines(system) in expected, f"seed {seed}"
+            for path in ("/app/left/r", "/app/right/s"):
+                if system.node.find(path) is not None:
+                    await ref(system, path).ask(Add(0))
+    assert carried_out
