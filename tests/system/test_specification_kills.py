@@ -40,7 +40,12 @@ async def program(store: str) -> AsyncIterator[hf.ActorSystem]:
 
 def lines(system: hf.ActorSystem) -> list[str]:
     """The tree in words: who is where, in which order, of which class, by which flags and bound to whom."""
-    return Draft(system.node, Arrangement()).lines()
+    return ours(Draft(system.node, Arrangement()).lines())
+
+
+def ours(tree: list[str]) -> list[str]:
+    """Without what the system itself has, which comes with the first recorded actor."""
+    return [line for line in tree if line.startswith(TOPS)]
 
 
 def draw(dice: random.Random, change: hf.Change, tree: list[str], number: int) -> None:
@@ -49,7 +54,7 @@ def draw(dice: random.Random, change: hf.Change, tree: list[str], number: int) -
     supervisors = [
         path for path, line in zip(paths, tree, strict=True) if ": Supervisor" in line and path.startswith(TOPS)
     ]
-    others = [path for path in paths if path.startswith(tuple(f"{top}/" for top in TOPS))]
+    others = [path for path in paths if path not in TOPS]
     above, one = dice.choice(supervisors), dice.choice(others)
     names = [path.rpartition("/")[2] for path in others if path.rpartition("/")[0] == above]
     match dice.randrange(9):
@@ -101,7 +106,7 @@ async def changing(store: str, log: str, seed: int) -> None:
                 except hf.TransactionRefused:
                     continue
                 assert dry._draft is not None
-                told.write(f"{number}\t{'|'.join(dry._draft.lines())}\n")
+                told.write(f"{number}\t{'|'.join(ours(dry._draft.lines()))}\n")
                 async with system.transaction(timeout=10.0) as change:
                     collect(change)
                 told.write(f"{number}\n")
