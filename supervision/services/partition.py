@@ -133,7 +133,7 @@ class PartitionSupervisor(Supervisor):
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 
     @on(RemoveChild)
-    def _remove_child(self, message: RemoveChild) -> Any:
+    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
         """They are no single ones."""
         self._child(message.id)
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")

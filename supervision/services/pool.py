@@ -189,7 +189,7 @@ class PoolSupervisor(Supervisor):
         raise NotSupported("the children of a pool are its workers: use ResizePool")
 
     @on(RemoveChild)
-    def _remove_child(self, message: RemoveChild) -> Any:
+    def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
         """They are no single ones."""
         self._child(message.id)
         raise NotSupported("the children of a pool are its workers: use ResizePool")

@@ -6,7 +6,7 @@ import asyncio
 import os
 import signal
 import sys
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ def right() -> hf.ChildSpec:
 
 
 @asynccontextmanager
-async def program(store: Path, *, fresh: bool = False, first: Any = None) -> AsyncIterator[hf.ActorSystem]:
+async def program(store: Path, *, fresh: bool = False, first: Any = None) -> AsyncGenerator[hf.ActorSystem]:
     """The program whose root ends and is started again."""
     async with hf.ActorSystem("app", store=f"sqlite:{store}", durability="os", log=False) as system:
         await system.start(first or left(), fresh=fresh)

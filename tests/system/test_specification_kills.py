@@ -10,7 +10,7 @@ import os
 import random
 import signal
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ TOPS = ("/app/left", "/app/right")
 
 
 @asynccontextmanager
-async def program(store: str) -> AsyncIterator[hf.ActorSystem]:
+async def program(store: str) -> AsyncGenerator[hf.ActorSystem]:
     async with hf.ActorSystem("app", store=f"sqlite:{store}", durability="os", log=False) as system:
         recorded = hf.hybrid(interval=900.0)
         client = hf.child("client", hf.start(Client), bindings={"peer": "/app/left/a"})

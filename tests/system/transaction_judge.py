@@ -6,7 +6,6 @@ import asyncio
 import dataclasses
 import os
 from collections.abc import Callable
-from typing import cast
 
 import holdfast as hf
 from holdfast.supervision.supervisor import Supervisor
@@ -209,7 +208,7 @@ class Judge:
             found.append(f"place: {path} does not live in a {node.isolation}")
         if state == "suspended":
             return found
-        kind, count = cast("tuple[str, int]", await ref.ask(Look(), LOOK_TIMEOUT))
+        kind, count = await ref.ask(Look(), LOOK_TIMEOUT)
         if kind != node.kind:
             found.append(f"class: {path} is a {kind}, not a {node.kind}")
         self._counted(node, tab, count, tab.states, adds=0)
@@ -219,7 +218,7 @@ class Judge:
         elif any(who is not None and spec.nodes[who].is_suspended for who in bound):
             return found  # It would not answer.
         else:
-            count = cast(int, await ref.ask(Through(), LOOK_TIMEOUT))
+            count = await ref.ask(Through(), LOOK_TIMEOUT)
             reached = None if count < 0 else count // PER_ACTOR
         if reached not in bound:
             found.append(f"binding: {path} reaches {reached}, not {node.peer}")
@@ -251,5 +250,5 @@ class Judge:
             if status.bindings.get("peer") != (None if node.peer is None else spec.path(node.peer)):
                 node.peer = node.spec_peer  # It cannot be seen otherwise who is meant if that one is suspended.
             if not node.is_suspended and not node.is_recorded:
-                _, count = cast("tuple[str, int]", await ref.ask(Look()))
+                _, count = await ref.ask(Look())
                 node.states = count % PER_ACTOR // PER_STATE

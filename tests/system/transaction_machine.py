@@ -151,7 +151,7 @@ class Machine:
             return  # It is being restarted, or has just been added.
         asked = self.judge.ask(who, self.spec)
         try:
-            value = cast(int, await ref.ask(Add(1), ASK_TIMEOUT))
+            value = await ref.ask(Add(1), ASK_TIMEOUT)
         except hf.HoldfastError as error:
             self.judge.failed(asked, error, self.spec)
         else:
