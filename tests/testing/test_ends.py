@@ -225,7 +225,10 @@ def test_a_thread_that_was_woken_is_at_work_before_it_runs() -> None:
             assert threads.at_work() or runs == number + 1
     finally:
         is_over = True
-        lock.release()
+        while thread.is_alive():
+            if lock.locked():  # Nobody but the thread locks it.
+                lock.release()
+            time.sleep(0.0001)
         thread.join()
 
 
