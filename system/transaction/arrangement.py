@@ -256,14 +256,14 @@ def _edited(place: Place, flags: Flags, specs: Specs, taken: dict[Place, Child])
     left = place.before - place.children.keys()
     after: list[ChildSpec] = []
     for name, child in place.children.items():
-        spec = known.pop(name, None)
+        spec, is_new = known.pop(name, None), child.is_planned or child in taken
         if child.is_planned:
             spec = planned_spec(child, in_force=True)
         elif child in taken:
             spec = taken[child].spec
         elif spec is not None and child.is_switched and child.spec is not None:
             spec = dataclasses.replace(spec, autostart=child.spec.autostart)
-        if spec is not None and not child.is_leaving and spec.restart != "temporary":
+        if spec is not None and not child.is_leaving and not (is_new and spec.restart == "temporary"):
             after.append(spec)
     after += [spec for name, spec in known.items() if name not in left]
     return dataclasses.replace(flags, **place.wanted), tuple(after)

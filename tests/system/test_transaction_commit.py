@@ -358,6 +358,23 @@ async def test_what_is_committed_is_in_force_though_a_supervisor_was_restarted_i
             assert "/app/left/b" in after["tree"]
 
 
+async def test_a_supervisor_starts_the_temporary_children_of_its_plan_again(system: hf.ActorSystem) -> None:
+    """As without a transaction; one that is added or moved there is gone with the life of its supervisor."""
+    plan = [counter("first", restart="temporary"), counter("second", restart="temporary")]
+    top = await system.start(hf.supervisor("top", intensity=9, children=plan))
+    async with system.transaction(timeout=IN_TIME) as change:
+        change.add(top, counter("third", restart="temporary"))
+        change.add(top, counter("fourth"))
+        change.move("/app/top/second", "/app/left")
+        change.reorder(top, ["fourth"])
+    for path in ("/app/top", "/app/left"):
+        await crashed(system, path)
+    names = [
+        [info.id for info in await ref(system, path).ask(hf.WhichChildren())] for path in ("/app/top", "/app/left")
+    ]
+    assert names == [["fourth", "first"], ["a", "b", "c"]]
+
+
 async def test_several_steps_about_one_child_are_all_in_force(system: hf.ActorSystem) -> None:
     """No step writes over what another says of the same spec."""
     async with system.transaction(timeout=IN_TIME) as change:
