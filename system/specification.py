@@ -40,7 +40,7 @@ class SpecificationSuperseded(Event, frozen=True, eq=False):
 
 
 class SpecificationNotKept(Event, frozen=True, eq=False):
-    """A transaction has changed a spec that cannot be stored: the next root begins as the program says."""
+    """What transactions have made of a spec cannot be stored, or not be had any more: the next root goes without it."""
 
     why: str
 
@@ -110,7 +110,12 @@ class Specifications:
         for address, (digest, data) in list(self._loaded.items()):
             if digest is not None or address not in self._loaded:
                 continue
-            spec = self._revived(address, data)
+            try:
+                spec = self._revived(address, data)
+            except SpecError as error:
+                del self._loaded[address]  # It stays in the store: its class may come back.
+                node.emit(SpecificationNotKept(address, str(error)))
+                continue
             below = f"{address}/"
             led = [path for one in everything((spec,)) for path in one.bindings.values()]
             if all(path.startswith(below) or node.find(path) is not None for path in led):

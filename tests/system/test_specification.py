@@ -171,6 +171,24 @@ async def test_a_program_that_says_something_else_is_newer(tmp_path: Path) -> No
         assert system.node.find("/app/left/x") is None
 
 
+async def test_a_class_that_is_gone_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with program(tmp_path / "store") as system, system.transaction(timeout=IN_TIME) as change:
+        change.add("/app", counter("top"))
+        change.add("/app/left", hf.child("x", hf.start(Client)))
+    monkeypatch.delattr("tests.system.trees.Client")
+    with pytest.raises(hf.SpecError, match=r"cannot be had any more: .*Client.* fresh=True"):
+        async with program(tmp_path / "store"):
+            pass
+    monkeypatch.undo()
+    monkeypatch.delattr("tests.system.trees.Counter")
+    async with hf.ActorSystem("app", store=f"sqlite:{tmp_path / 'store'}", log=False) as system:
+        assert system.node.find("/app/top") is None
+    monkeypatch.undo()
+    async with program(tmp_path / "store") as system:
+        assert await ref(system, "/app/top").ask(Add(1)) == 1
+        assert system.node.find("/app/left/x") is not None
+
+
 async def test_a_start_that_fails_forgets_nothing(tmp_path: Path) -> None:
     async with program(tmp_path / "store") as system, system.transaction(timeout=IN_TIME) as change:
         change.add("/app/right", counter("x"))
