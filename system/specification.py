@@ -28,6 +28,7 @@ from ..supervision.supervisor import Supervisor
 
 if TYPE_CHECKING:
     from ..checkpoint.home.homes import Homes
+    from .transaction.draft import Place
 
 KEPT = "specification "
 """How the notes begin; the address of a child of the root follows."""
@@ -106,7 +107,11 @@ class Specifications:
 
     async def start_added(self, start: Callable[[ChildSpec], Awaitable[Any]]) -> None:
         """Start those that transactions have added below the root, as soon as all are there to whom they are bound."""
-        node = self._homes.node
+        while await self._start_some(start):
+            continue
+
+    async def _start_some(self, start: Callable[[ChildSpec], Awaitable[Any]]) -> bool:
+        node, has_started = self._homes.node, False
         for address, (digest, data) in list(self._loaded.items()):
             if digest is not None or address not in self._loaded:
                 continue
@@ -127,6 +132,38 @@ class Specifications:
                 except HoldfastError:
                     continue  # Its supervisor has told so; the others are started all the same.
                 self._see(address)
+                has_started = True
+        return has_started
+
+    def check(self, root: Place) -> None:
+        """Whether the next root could start the tree as it would be.
+
+        Raises:
+            SpecError: somebody would be bound by its spec to one whom the next root starts later.
+        """
+        if not self._is_kept:
+            return
+        tops = [one for one in root.children.values() if not one.is_leaving]
+        added = [one for one in tops if one.is_planned or one.has_moved or one.path in self._added]
+        declared = [one for one in tops if one not in added and one.path in self._declared]
+        led = [one for top in (*declared, *added) for one in _led_outside(top) if one[2] in (*declared, *added)]
+        order: list[Place] = []
+        waiting = list(added)
+        for top in (None, *declared):  # As `system.start` and `start_added` will do it.
+            if top is not None:
+                order.append(top)
+            while (
+                come := next(
+                    (one for one in waiting if all(to in order for owner, _, to in led if _top(owner) is one)), None
+                )
+            ) is not None:
+                order.append(come)
+                waiting.remove(come)
+        for owner, port, to in led:
+            top = _top(owner)
+            if top in order and (to not in order or order.index(to) > order.index(top)):
+                why = f"the next root would start it before the one to which its spec binds {port!r}"
+                raise SpecError(owner.path, f"{why}, which is below {to.path}")
 
     async def prepare(self) -> None:
         """Make ready what takes long with many children, so that the commit does not."""
@@ -196,6 +233,26 @@ class Specifications:
             del self._kept[address]
         else:
             self._kept[address] = value
+
+
+def _led_outside(top: Place) -> list[tuple[Place, str, Place]]:
+    """The bindings in specs that lead from a child of the root, or from below it, to another: owner, port, that one."""
+    found: list[tuple[Place, str, Place]] = []
+    for place in top.walk():
+        if place.spec is None or place.is_leaving or (place is not top and not place.comes_back_with(top)):
+            continue
+        for port in place.spec.bindings:
+            target = (place.bindings if place.is_planned else place.spec_bindings).get(port)
+            if target is not None and _top(target) is not top:
+                found.append((place, port, _top(target)))
+    return found
+
+
+def _top(place: Place) -> Place:
+    """The child of the root that it is, or is below."""
+    while place.parent is not None and place.parent.parent is not None:
+        place = place.parent
+    return place
 
 
 class Packer:

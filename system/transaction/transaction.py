@@ -109,6 +109,7 @@ class Transaction:
             refuse_self(operation)
         try:
             draft.check()
+            system.specifications.check(draft.root)
         except HoldfastError as error:
             raise TransactionRefused("the tree as it would be", said(error)) from error
         change._difference = difference(before, draft.lines())

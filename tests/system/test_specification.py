@@ -171,6 +171,35 @@ async def test_a_program_that_says_something_else_is_newer(tmp_path: Path) -> No
         assert system.node.find("/app/left/x") is None
 
 
+@pytest.mark.parametrize("what", ["move", "add", "rise"])
+async def test_a_tree_that_the_next_root_could_not_start_is_refused(tmp_path: Path, what: str) -> None:
+    """`left` is started first: nobody in it may be bound by its spec to somebody in `right`, or above that."""
+    async with program(tmp_path / "store") as system:
+        before = shape(system)
+        with pytest.raises(hf.TransactionRefused, match="the next root would start it before"):  # noqa: PT012
+            async with system.transaction(timeout=IN_TIME) as change:
+                user = hf.child("user", hf.start(Client), bindings={"peer": "/app/right/d"})
+                match what:
+                    case "move":
+                        change.move("/app/left/a", "/app/right")
+                        change.reorder("/app/right", ["a"])
+                        change.move("/app/right/client", "/app/left")
+                    case "add":
+                        change.add("/app/left", user)
+                    case _:
+                        change.add("/app", user)  # It waits for `right` ...
+                        other = hf.child("other", hf.start(Client), bindings={"peer": "/app/user"})
+                        change.add("/app/left", other)  # ... and `left` would wait for it.
+        assert shape(system) == before
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app/right", hf.child("late", hf.start(Client), bindings={"peer": "/app/left/b"}))
+            change.add("/app", hf.child("one", hf.start(Client), bindings={"peer": "/app/right/d"}))
+            change.add("/app", hf.child("two", hf.start(Client), bindings={"peer": "/app/one"}))
+        now = shape(system)
+    async with program(tmp_path / "store") as system:
+        assert shape(system) == now
+
+
 async def test_a_class_that_is_gone_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async with program(tmp_path / "store") as system, system.transaction(timeout=IN_TIME) as change:
         change.add("/app", counter("top"))
