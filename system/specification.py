@@ -22,6 +22,7 @@ from ..actors.events import Event
 from ..actors.kernel.actor import Start
 from ..actors.process.wire.start_codec import pack_data, unpack_data
 from ..supervision.change import everything
+from ..supervision.children import Child
 from ..supervision.respec import rebuilt
 from ..supervision.spec import ChildSpec
 from ..supervision.supervisor import Supervisor
@@ -87,16 +88,18 @@ class Specifications:
         self._see(address)
 
     def _see(self, address: str) -> None:
-        spec = self._there().get(address)
-        if spec is not None:
-            self._seen[address] = spec
+        one = self._children().get(address.rpartition("/")[2])
+        if one is not None:
+            self._seen[address] = one.spec
+
+    def _children(self) -> dict[str, Child]:
+        root = self._homes.node.root
+        supervisor = root.actor if root is not None else None
+        return supervisor._listed() if isinstance(supervisor, Supervisor) else {}
 
     def _there(self) -> dict[str, ChildSpec]:
         root = self._homes.node.root
-        supervisor = root.actor if root is not None else None
-        if root is None or not isinstance(supervisor, Supervisor):
-            return {}
-        return {f"{root.path}/{name}": one.spec for name, one in supervisor._listed().items()}
+        return {f"{root.path}/{name}": one.spec for name, one in self._children().items()} if root is not None else {}
 
     def _revived(self, address: str, data: bytes) -> ChildSpec:
         try:
