@@ -10,9 +10,9 @@ import asyncio
 import os
 import sys
 import threading
-import time
 import traceback
 from collections.abc import Callable
+from time import monotonic
 
 LATE = 2.0
 """Seconds by which the loop may come late to a time limit."""
@@ -43,7 +43,7 @@ class Overdue:
 
     def begin(self, what: str, seconds: float) -> Callable[[], None]:
         """Something has to be over in so many seconds; the caller says when it is, by calling what is returned."""
-        due = Due(what, time.monotonic() + seconds)
+        due = Due(what, monotonic() + seconds)
         due.timer = self._loop.call_later(seconds, self._came, due)
         with self._changed:
             self._due.add(due)
@@ -65,7 +65,7 @@ class Overdue:
     def _came(self, due: Due) -> None:
         """The loop has come to the limit: whoever keeps it has, too. What follows may block it as well."""
         with self._changed:
-            due.at = time.monotonic() + LATE
+            due.at = monotonic() + LATE
         due.timer = self._loop.call_later(LATE / 2, self._came, due)
 
     def _look(self) -> None:
@@ -73,17 +73,17 @@ class Overdue:
         with self._changed:
             while self._due:
                 first = min(self._due, key=lambda due: due.at)
-                left = first.at - time.monotonic()
+                left = first.at - monotonic()
                 if left > 0:
                     late = 0
                     self._changed.wait(left)
                 elif late == LOOKS:
                     self._end(first)
                 else:
-                    begin = time.monotonic()
+                    begin = monotonic()
                     self._changed.wait(LATE / LOOKS)
                     # Were we late ourselves, it was the machine, or somebody who had stopped the whole process.
-                    late = late + 1 if time.monotonic() - begin < LATE else 0
+                    late = late + 1 if monotonic() - begin < LATE else 0
             self._is_watched = False
 
     def _end(self, due: Due) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import sys
 import threading
-import time
 import types
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 from .errors import SpecError, type_name
@@ -73,10 +73,10 @@ class LoopWatch:
 
     def _arm(self, lag: float) -> None:
         loop = self._node.loop
-        self._timer = loop.call_later(lag, self._came, time.monotonic() + lag, lag)
+        self._timer = loop.call_later(lag, self._came, monotonic() + lag, lag)
 
     def _came(self, due: float, lag: float) -> None:
-        late = time.monotonic() - due
+        late = monotonic() - due
         if late > lag:
             self._node.emit(LoopLagged(self._node.name, late))
         self._arm(lag)
@@ -91,7 +91,7 @@ class LoopWatch:
         is_told = False
         while not self._over.wait(limit / LOOKS):
             found = _running(sys._current_frames().get(self._loop_thread))
-            now, let_go, self._let_go = time.monotonic(), self._let_go, found is None
+            now, let_go, self._let_go = monotonic(), self._let_go, found is None
             if found is not None:
                 self._node.loop.call_soon_threadsafe(self._lets_go)
             if found is None or let_go or found[0] is not seen:
@@ -105,7 +105,7 @@ class LoopWatch:
 
     def _tell(self, address: str, message: str, since: float) -> None:
         """Comes to run when the turn lets the loop go: then it is known how long it took."""
-        self._node.emit(TurnSlow(address, message, time.monotonic() - since))
+        self._node.emit(TurnSlow(address, message, monotonic() - since))
 
 
 def _running(frame: types.FrameType | None) -> tuple[types.FrameType, str, str] | None:

@@ -13,6 +13,8 @@ import socket
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
+from .ordered import Ordered
+
 AT_ONCE: Final = 32
 """Connections that are accepted before others have the loop."""
 PAUSE: Final = 1.0
@@ -92,7 +94,7 @@ class Listener:
         self._loop = asyncio.get_running_loop()
         self._pause: asyncio.TimerHandle | None = None
         self._is_watched = False
-        self.connecting: set[asyncio.Task[None]] = set()
+        self.connecting = Ordered[asyncio.Task[None]]()
         """Connections that are not served yet."""
 
     def start(self) -> None:

@@ -6,6 +6,7 @@ somebody lives at the other address again.
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 from ..actors.kernel import links
@@ -72,9 +73,12 @@ class Ties:
         for verb, path in untied:
             other = node.find(path)
             if other is None or other.is_dead:
-                node.awaited.setdefault(path, []).append(lambda verb=verb, path=path: self._tie(verb, path))  # type: ignore[misc]
+                node.awaited.setdefault(path, []).append(functools.partial(self._tie_soon, verb, path))
             else:
                 self._tie(verb, path)
+
+    def _tie_soon(self, verb: str, path: str) -> None:
+        self._home.node.loop.call_soon(self._tie, verb, path)  # Whoever comes there is not started yet.
 
     def _tie(self, verb: str, path: str) -> None:
         home = self._home

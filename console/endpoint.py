@@ -17,6 +17,7 @@ import msgspec
 
 from ..actors.errors import HoldfastError
 from ..actors.kernel.actor import Actor
+from ..actors.ordered import Ordered
 from ..actors.streams import Listener
 from ..actors.values import encode_value
 from ..system.script import check_folders
@@ -215,7 +216,7 @@ class Endpoint:
 
     async def close(self) -> None:
         """End all connections; what they have asked for and is not done is undone."""
-        connecting: set[asyncio.Task[None]] = set()
+        connecting = Ordered[asyncio.Task[None]]()
         if self._listener is not None:
             self._listener.stop()
             connecting = self._listener.connecting

@@ -19,6 +19,7 @@ from ..actors.kernel.ref import current
 from ..actors.migration.here import ToHere
 from ..actors.migration.move import Entering, Gate, Move
 from ..actors.migration.worker import ToWorker
+from ..actors.ordered import Ordered
 from ..actors.process.process_host import ProcessHost
 from ..actors.process.resource_limits import Limits
 from ..actors.process.worker_pool import Workers
@@ -43,7 +44,7 @@ class Moves:
     def __init__(self, node: Node, workers: Workers) -> None:
         self._node, self._workers = node, workers
         self._turns: weakref.WeakKeyDictionary[Cell, asyncio.Lock] = weakref.WeakKeyDictionary()
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._tasks = Ordered[asyncio.Task[None]]()
         self._under_way: dict[Cell, Move] = {}  # of mechanisms
 
     async def move(

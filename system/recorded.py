@@ -122,7 +122,7 @@ class Recorded:
     async def _in_start_order(self, paths: Sequence[str], timeout: float) -> list[str]:
         """As their supervisors would start them: a binding wants its target to be there."""
         places: dict[str, int] = {}
-        for above in {above for path in paths for above in _ancestors(path)}:
+        for above in dict.fromkeys(above for path in paths for above in _ancestors(path)):
             supervisor = ActorRef[Supervisor](self.homes.node.cell_at(above))
             children = await supervisor.ask(WhichChildren(), timeout)
             places.update((child.path, place) for place, child in enumerate(children))

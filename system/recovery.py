@@ -21,6 +21,10 @@ FIRST_DELAY, LONGEST_DELAY = 0.05, 5.0
 """Seconds until it is started again when its parts were restarted too often; doubled each time."""
 
 
+class RecoverySupervisor(Supervisor):
+    """The supervisor of the recovery parts: no transaction changes it, or what is below it."""
+
+
 class RecoveryTree:
     """Keeps the recovery parts alive. They are no children of the program: however often they end, it goes on."""
 
@@ -36,13 +40,12 @@ class RecoveryTree:
         if node.root is None or node.root.state is not RUNNING:
             return
         children = tuple(child(name, start(kind, self._homes)) for name, kind in PARTS)
-        recipe = Start(Supervisor, (Flags(intensity=10, period=1.0), children))
+        recipe = Start(RecoverySupervisor, (Flags(intensity=10, period=1.0), children))
         self._born = node.loop.time()
         cell = self._spawn(recipe)
-        node.own.add(cell)
         cell.ended().add_done_callback(lambda _: self._ended(cell))
 
-    def _spawn(self, recipe: Start[Supervisor]) -> Cell:
+    def _spawn(self, recipe: Start[RecoverySupervisor]) -> Cell:
         for name in NAMES[:-1]:
             try:
                 return self._node.spawn(recipe, name)
@@ -52,7 +55,6 @@ class RecoveryTree:
 
     def _ended(self, cell: Cell) -> None:
         """Its parts were restarted too often, or somebody has stopped it."""
-        self._node.own.discard(cell)
         loop = self._node.loop
         if loop.time() - self._born > LONGEST_DELAY:
             self._delay = FIRST_DELAY

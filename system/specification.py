@@ -199,7 +199,7 @@ class Specifications:
             return
         self._added |= added
         there = self._there()
-        for address in {*self._added, *self._declared}:
+        for address in sorted({*self._added, *self._declared}):
             spec = there.get(address) if address not in removed else None
             if spec is None:
                 self._added.discard(address)
@@ -245,7 +245,7 @@ def _led_outside(top: Place) -> list[tuple[Place, str, Place]]:
         if place.spec is None or place.is_leaving or (place is not top and not place.comes_back_with(top)):
             continue
         for port in place.spec.bindings:
-            target = (place.bindings if place.is_planned else place.spec_bindings).get(port)
+            target = (place.bindings if place.is_planned else place.was.bound).get(port)
             if target is not None and _top(target) is not top:
                 found.append((place, port, _top(target)))
     return found
@@ -271,7 +271,7 @@ class Packer:
 
     def part(self, spec: ChildSpec) -> Any:
         """The same as data: its own bytes, and the parts of those below it."""
-        known = self._made.get(id(spec))
+        known = self._used.get(id(spec)) or self._made.get(id(spec))
         if known is None:
             below = _children(spec)
             own = _with_children(spec, ()) if below else spec

@@ -160,7 +160,7 @@ class ActorSystem(Recorded, Controls):
             raise
         self._homes.recoveries.hooks = self._recovery_hooks
         self._recovery = RecoveryTree(node, self._homes)
-        self._workers = Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
+        self._workers = self._make_pool(node)
         if file is not None:
             self._homes.file, node.complete = file, file.complete
             self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
@@ -241,6 +241,10 @@ class ActorSystem(Recorded, Controls):
             node.events.close()
             if self._sink is not None:
                 self._sink.close()
+
+    def _make_pool(self, node: Node) -> Workers:
+        """The processes of this system."""
+        return Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
 
     def _host_for(self, spec: ChildSpec) -> Host:
         """Where a child's lives are lived."""

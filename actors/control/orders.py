@@ -156,8 +156,9 @@ def has_become(cell: Cell, old: type[Actor], start: Start[Any]) -> bytes | None:
     cell.table = new._table
     if cell.more is not None and cell.more.tap is not None:
         cell.more.tap.attach()
-    for topic in set(old._topics) - set(new._topics):
-        cell.node.topics.unsubscribe(topic, cell)
+    for topic in old._topics:
+        if topic not in new._topics:
+            cell.node.topics.unsubscribe(topic, cell)
     for topic in new._topics:
         cell.node.topics.subscribe(topic, cell)
     cell.node.respec(cell, start)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import ActorStopped, UnknownMessage, type_name
 from ..exit_reasons import SHUTDOWN, ExitReason
+from ..ordered import Ordered
 from . import mailbox
 from .envelope import AnyTable, Ask, Item, Table
 from .message import Message, Order, require_message
@@ -143,9 +144,9 @@ class More:
     links: dict[Cell, None]
     monitors: list[Any]  # who watches us (links.Monitor)
     names: list[str]
-    tasks: set[asyncio.Task[Any]]
-    timers: set[Any]
-    topics: set[str]
+    tasks: Ordered[asyncio.Task[Any]]
+    timers: Ordered[Any]
+    topics: Ordered[str]
     watching: dict[Any, None]  # whom we watch (links.Monitor)
 
     def __init__(self) -> None:
@@ -183,9 +184,9 @@ _COLLECTIONS: dict[str, Callable[[], Any]] = {
     "links": dict,
     "monitors": list,
     "names": list,
-    "tasks": set,
-    "timers": set,
-    "topics": set,
+    "tasks": Ordered,
+    "timers": Ordered,
+    "topics": Ordered,
     "watching": dict,
 }
 

@@ -38,6 +38,10 @@ class StashError(HoldfastError, text="{why}"):
     why: str
 
 
+class Borrowed(list["Ask"]):
+    """The promises of a life that has begun beside its address and is not the one there yet."""
+
+
 class ActorContext:
     """An actor's view of the runtime. It belongs to one life: after that life's end it refuses to send."""
 
@@ -200,7 +204,16 @@ class ActorContext:
 
     def promised(self) -> tuple[Ask, ...]:
         """The asks for which there are reply handles; those that are over may be among them."""
-        return tuple(self._promised or ())
+        return () if type(self._promised) is Borrowed else tuple(self._promised or ())
+
+    def borrow_promises(self) -> None:
+        """What the actor promises is another life's until `keep_promises`: if this one ends before, nothing fails."""
+        self._promised = Borrowed()
+
+    def keep_promises(self) -> None:
+        """The life is the one that answers."""
+        if type(self._promised) is Borrowed:
+            self._promised = list(self._promised)
 
     def hand_on_promises(self) -> None:
         """The actor lives elsewhere now, and answers from there."""

@@ -35,12 +35,14 @@ class Deadlines:
         if queue.timer is None:
             queue.arm()
 
-    def close(self) -> None:
-        """Forget all timers."""
+    def close(self) -> list[Ask]:
+        """Forget all timers. Returns the asks that have no outcome yet."""
+        left = [ask for queue in self._queues.values() for ask in queue.asks if not ask.future.done()]
         for queue in self._queues.values():
             if queue.timer is not None:
                 queue.timer.cancel()
         self._queues.clear()
+        return left
 
 
 class _Queue:

@@ -17,6 +17,7 @@ from collections.abc import Callable, Generator
 from typing import TYPE_CHECKING, Any
 
 from ..errors import WrongThread
+from ..ordered import Ordered
 from . import lifecycle, mailbox
 from .envelope import LEAVE, Item
 from .message import Refusal
@@ -53,7 +54,7 @@ class RunLoop:
         self.entered: Runner | None = None
         self._struck: Runner | None = None  # entered too, but cancelled in the step that runs now: only that turn's
         self._idle: list[Runner] = []
-        self._runners: set[Runner] = set()
+        self._runners = Ordered[Runner]()
         self._idlers: list[asyncio.Future[None]] = []
 
     def make_ready(self, cell: Cell) -> None:

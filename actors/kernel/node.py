@@ -72,9 +72,7 @@ class Node(RunLoop):
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
         self.overdue: Overdue | None = None  # in an actor process: who ends it when it is blocked
         self.here: Host = LOCAL  # lives in this very process
-        self.vacated: dict[str, Cell] = {}  # addresses that actors have left, as long as nobody else lives there
-        self.own: set[Cell] = set()  # parts of the system itself, which the program does not change
-        self.awaited: dict[str, list[Callable[[], None]]] = {}  # what is done when somebody comes to live at a path
+        self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody else has a path
         self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
         self.keeper: Keeper = NothingKept()
         self.complete: Callable[[Any, str], Any] = lambda spec, path: spec  # what else is known of a child spec
@@ -152,11 +150,9 @@ class Node(RunLoop):
             elif name in parent.children:
                 raise NameTaken(f"{parent.path}/{name}")
             parent.children[name] = cell
-        if self.vacated:
-            self.vacated.pop(cell.path, None)
         if self.awaited:
             for come in self.awaited.pop(cell.path, ()):
-                self.loop.call_soon(come)  # It is not started yet.
+                come()
         return cell
 
     def spawn(

@@ -18,8 +18,8 @@ import inspect
 import math
 import queue
 import threading
-import time
 from collections.abc import Callable
+from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from ..errors import HoldfastError
@@ -50,9 +50,9 @@ def wait_on_loop(
     What is handed over while a loop takes its last steps is neither refused nor ever done: so the wait is for the loop,
     too, and ends when that has been closed, or after `seconds`.
     """
-    end = time.monotonic() + seconds
+    end = monotonic() + seconds
     while True:
-        is_last = loop.is_closed() or time.monotonic() > end  # Asked first: what was done until then has come.
+        is_last = loop.is_closed() or monotonic() > end  # Asked first: what was done until then has come.
         concurrent.futures.wait((outcome,), 0.0 if is_last else LOOK_AGAIN)
         if outcome.done() or is_last:
             return outcome.done()

@@ -95,12 +95,12 @@ class FromHere(Leaving):
         if transit is None:
             return
         more = cell.extra()
-        for topic in set(more.topics) - self._topics:
+        for topic in [topic for topic in more.topics if topic not in self._topics]:
             cell.node.topics.unsubscribe(topic, cell)
-        for peer in set(more.links) - self._links:
+        for peer in [peer for peer in more.links if peer not in self._links]:
             peer.extra().links.pop(cell, None)
             del more.links[peer]
-        for watch in set(more.watching) - self._watches:
+        for watch in [watch for watch in more.watching if watch not in self._watches]:
             watch.cancel()
         self.take_back(transit)
         transit.over(cell, transit.old)

@@ -59,6 +59,11 @@ def lift(value: Any, found: Callable[[Any], Any]) -> Any:
     return found(value)
 
 
+def unanswerable(count: int) -> Stays:
+    """So many promised replies could not be given any more."""
+    return Stays(f"{count} asks wait for replies, and their reply handles are not in its state")
+
+
 class StatePacker:
     """Packs the state of an actor, and knows which asks it can still answer from there."""
 
@@ -82,7 +87,7 @@ class StatePacker:
             packed = encode_value([True, self._named(where, state)], where=where)
         lost = sum(not ask.is_done and id(ask) not in self._owed for ask in actor.ctx.promised())
         if lost:
-            raise Stays(f"{lost} asks wait for replies, and their reply handles are not in its state")
+            raise unanswerable(lost)
         return packed
 
     def _named(self, where: str, state: Any) -> Any:
@@ -145,6 +150,7 @@ def unpack(
     cell = actor.ctx.cell
     codec = cell.node.codec
     cell.extra().trap_exits = rest["trap_exits"]
+    actor.ctx.borrow_promises()
     timers: list[Timer] = []
     for name, body, left, interval, queued in rest["timers"]:
         message = codec.decode(cell.table.kind_named(name), body)

@@ -20,6 +20,7 @@ from ..kernel.context import Piped
 from ..kernel.envelope import LEAVE, Ask, Envelope, Item
 from ..kernel.lifecycle import LOCAL, Kill
 from ..kernel.timers import Tick
+from ..ordered import Ordered
 from ..process.wire.peer import RelayedAsk
 from .luggage import Owe, Stays
 
@@ -193,6 +194,7 @@ def settle(twin: Cell, cell: Cell) -> None:
     assert ctx is not None
     cell.actor, cell.ctx, cell.context, cell.table = twin.actor, ctx, twin.context, twin.table
     ctx.cell = cell
+    ctx.keep_promises()
     mine, its = cell.extra(), twin.extra()
     mine.timers, mine.tasks, mine.stash = its.timers, its.tasks, its.stash
     mine.trap_exits = its.trap_exits
@@ -245,8 +247,8 @@ def part(cell: Cell) -> Cell:
     old.actor, old.ctx, old.context = cell.actor, ctx, cell.context
     ctx.cell = old
     its = old.extra()
-    its.timers, more.timers = more.timers, set()
-    its.tasks, more.tasks = more.tasks, set()
+    its.timers, more.timers = more.timers, Ordered()
+    its.tasks, more.tasks = more.tasks, Ordered()
     its.bindings = more.bindings
     for timer in list(its.timers):
         timer.belongs_to(old)

@@ -165,6 +165,8 @@ class GuestMove:
         if self._admit is not None:
             cell.admit, self._admit = self._admit, None
         more = cell.extra()
+        if cell.ctx is not None:
+            cell.ctx.keep_promises()
         if self._stash:
             more.stash, self._stash = deque(self._stash), []
         if suspended:

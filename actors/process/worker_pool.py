@@ -64,6 +64,7 @@ class Worker(Peer):
         self._lost = False
         self._is_orphaned = False
         self._buried = False
+        self._is_reserved = False  # for an actor that is being moved here, and lives elsewhere so far
         self._grave: asyncio.Future[None] = self.node.loop.create_future()
         self.noticed_at = 0.0  # when the first sign of its end came, on the monotonic clock
         self._oom_before = oom_kills()
@@ -99,6 +100,7 @@ class Worker(Peer):
     def adopt(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
         """This process is now that of the actor at `cell`."""
         self.reserve(cell, limits, died)
+        self._is_reserved = False
         self._workers.by_cell[cell] = self
         if self.node.watched:
             self.node.emit(ProcessStarted(cell.path, self.pid))
@@ -160,6 +162,7 @@ class Worker(Peer):
     def reserve(self, cell: Cell, limits: Limits | None, died: Callable[[Cell, ExitReason], None]) -> None:
         """The actor at `cell` may be moved into this process, which counts as its own only when it is adopted."""
         self.cell, self._died, self.home = cell, died, cell.path
+        self._is_reserved = True
         if limits is not None:
             self._watch = Watch(self, limits)
 
@@ -350,7 +353,10 @@ class Worker(Peer):
             self._died(cell, reason)
             if self._workers.by_cell.get(cell) is self:
                 del self._workers.by_cell[cell]
-        self.fail_pending(AskFailed(cell.path if cell is not None else "", str(reason)))
+        if self._is_reserved:
+            self.take_pending()  # They were never its own: the life that has promised to answer them goes on.
+        else:
+            self.fail_pending(AskFailed(cell.path if cell is not None else "", str(reason)))
         self.page.release()
         self.forked.close()
         self._workers.buried(self)

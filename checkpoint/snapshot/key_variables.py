@@ -50,13 +50,23 @@ def variables(actor: Actor) -> list[str]:
     return [name for name, _ in attributes(actor._state_root()) if not name.startswith("_") and name != "ctx"]
 
 
-def save_state(actor: Actor) -> bytes:
+def as_it_is(value: Any) -> Any:
+    """The same value."""
+    return value
+
+
+def save_state(actor: Actor, told: Callable[[Any], Any] = as_it_is) -> bytes:
     """The actor's state as bytes: `get_state()` if the class has it, else its key variables.
+
+    Args:
+        actor: whose state.
+        told: gives what is to be saved for a value.
 
     Raises:
         UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there.
     """
     state, where = state_of(actor), actor.ctx.path
+    state = state._replace(value=told(state.value))
     try:
         return encode_value(tuple(state), where=where)
     except UnsavableValue:
@@ -72,20 +82,26 @@ def _parts(actor: Actor, state: State) -> list[tuple[str, object]]:
     return [(f"{where}.{name}", value) for name, value in state.value.items()]
 
 
-def restore_state(actor: Actor, data: bytes, variables: tuple[list[str], list[str]] = ([], [])) -> None:
+def restore_state(
+    actor: Actor,
+    data: bytes,
+    variables: tuple[list[str], list[str]] = ([], []),
+    meant: Callable[[Any], Any] = as_it_is,
+) -> None:
     """Put a saved state back; one of an older schema is handed to the class's `migrate` first.
 
     Args:
         actor: constructed, and nothing more.
         data: the state.
         variables: those that the class had that has saved it, and that it has now, after `__init__` alone.
+        meant: gives what is meant by a saved value.
 
     Raises:
         DamagedValue, StateMismatch: the data is damaged, or of another class or schema version.
     """
     saved = read_image(data) if is_image(data) else decode_value(data)
     refuse_renamed(actor, saved, *variables)
-    put_back(actor, saved)
+    put_back(actor, meant(saved))
 
 
 def refuse_renamed(actor: Actor, saved: Any, before: list[str], now: list[str]) -> None:

@@ -12,14 +12,14 @@ import os
 import re
 import struct
 import zlib
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Generator, Sequence
 from hashlib import blake2b
 from typing import Final
 
 from ..compression import PLAIN, compressor, decompress
 from ..journal import DamagedStore, StoreFailed
 from ..snapshot.shared_blocks import PAGE, Segment, memory_file
-from .snapshot_files import refuse_shared, write_durably
+from .snapshot_files import no_link, refuse_shared, write_durably
 from .store_parts import Parts
 
 _NAME: Final = re.compile(r"[0-9a-f]+\.pack")
@@ -70,7 +70,7 @@ class Packs:
         wanted = set(places)
         file = memory_file(number)
         try:
-            with open(os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as pack:
+            with open(name, "rb", opener=no_link) as pack:
                 refuse_shared(name, os.fstat(pack.fileno()))
                 if pack.read(len(_MAGIC)) != _MAGIC:
                     raise ValueError("it is no pack")
@@ -102,21 +102,37 @@ class Packs:
         return {int(name[: -len(".pack")], 16) for name in found if _NAME.fullmatch(name)}
 
     def remove(self, address: str, numbers: Collection[int]) -> None:
-        """Remove packs that no snapshot needs."""
-        for number in numbers:
-            with contextlib.suppress(FileNotFoundError):
-                os.unlink(self._file(address, number))
+        """Remove packs that no snapshot needs.
+
+        Raises:
+            StoreFailed: some of them are left.
+        """
+        with self._refusing():
+            for number in numbers:
+                with contextlib.suppress(FileNotFoundError):
+                    os.unlink(self._file(address, number))
 
     def erase(self, address: str) -> None:
-        """Remove all packs of an address, and what was left half made."""
+        """Remove all packs of an address, and what was left half made.
+
+        Raises:
+            StoreFailed: some of them are left.
+        """
         folder = self._folder(address)
-        with contextlib.suppress(FileNotFoundError):
+        with self._refusing(), contextlib.suppress(FileNotFoundError):
             for name in os.listdir(folder):
                 if _NAME.fullmatch(name.removesuffix(".tmp")):
                     with contextlib.suppress(FileNotFoundError):
                         os.unlink(os.path.join(folder, name))
             if not os.listdir(folder):  # Else somebody has put something there that is not ours.
                 os.rmdir(folder)
+
+    @contextlib.contextmanager
+    def _refusing(self) -> Generator[None, None, None]:
+        try:
+            yield
+        except OSError as error:
+            raise StoreFailed(self.path, f"{error}; blocks of snapshots are left behind") from error
 
     def _folder(self, address: str) -> str:
         return os.path.join(self.folder, blake2b(address.encode(errors="surrogatepass"), digest_size=12).hexdigest())

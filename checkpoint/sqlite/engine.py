@@ -161,7 +161,9 @@ class SqliteJournal:
         try:
             with self._store.transaction(len(data or b""), note=True) as db:
                 chain = self._store.chain(address)
-                row = (chain.id, turn, self.epoch, pack_positions(drop), file, digest, data)
+                last = self._store.last  # A position that is yet to come is none that the address has.
+                drops = pack_positions([position for position in drop if position <= last])
+                row = (chain.id, turn, self.epoch, drops, file, digest, data)
                 number = db.execute("INSERT INTO snapshots VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)", row).lastrowid
                 chain.kept.append(number or 0)
                 chain.floor = chain.last

@@ -10,6 +10,7 @@ import sqlite3
 import time
 from collections.abc import Generator
 from pathlib import Path
+from time import monotonic
 from typing import Final, NamedTuple
 
 from ..journal import DamagedStore, StoreInUse
@@ -47,7 +48,7 @@ class Claim:
             StoreInUse: a living process has the store open, and it may not or cannot be killed.
             DamagedStore: the file is not ours, or is broken. ForeignStore: what lies beside it is of another store.
         """
-        deadline = time.monotonic() + _KILL_SECONDS
+        deadline = monotonic() + _KILL_SECONDS
         while True:
             try:
                 refuse_foreign(self._db, self.path)
@@ -59,7 +60,7 @@ class Claim:
                 if self._write_in(seen):
                     return
             except sqlite3.OperationalError as error:
-                if result_code(error) != sqlite3.SQLITE_BUSY or time.monotonic() > deadline:
+                if result_code(error) != sqlite3.SQLITE_BUSY or monotonic() > deadline:
                     raise
                 # A process that was stopped inside a transaction, or while it opened or closed the store.
                 holder = lock_holder(self.path)

@@ -92,7 +92,7 @@ def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
     with contextlib.suppress(FileNotFoundError):
         os.unlink(temporary)  # Whoever had begun it was killed.
     try:
-        with open(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
+        with open(temporary, "xb", opener=_for_us) as file:
             file.writelines(parts)
             file.flush()
             os.fsync(file.fileno())
@@ -105,9 +105,19 @@ def write_durably(path: str, parts: Sequence[bytes | memoryview]) -> None:
         raise
 
 
+def _for_us(path: str, flags: int) -> int:
+    """An opener (the descriptor is closed if `open` fails): nobody else may read the file."""
+    return os.open(path, flags, 0o600)
+
+
+def no_link(path: str, flags: int) -> int:
+    """An opener that follows no link."""
+    return os.open(path, flags | os.O_NOFOLLOW)
+
+
 def read_own(path: str) -> bytes:
     """Read a file that the store has written, and no other: no link is followed."""
-    with open(os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC), "rb") as file:
+    with open(path, "rb", opener=no_link) as file:
         refuse_shared(path, os.fstat(file.fileno()))
         return file.read()
 

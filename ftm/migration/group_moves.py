@@ -25,14 +25,13 @@ from ...actors.overflow import Overflow
 from ...checkpoint.home.capacity import HomeBound
 from ...checkpoint.home.recorded_moves import Detached, refuse_unsaved
 from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK, Live
-from ...checkpoint.snapshot.key_variables import restore_state, save_state
 from ...checkpoint.snapshot.snapshot_record import meta_now
 from ..bricks.replica_orders import EXPORTED_WITHIN, Export
 from ..group.group import Group, Look
 from ..group.group_host import GroupHost
 from ..group.steering import AGAIN_AFTER
 from ..group.trial import rehearsed
-from .unrecorded_luggage import refuse
+from .unrecorded_luggage import refuse, restore_owing, save_owing
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
@@ -78,9 +77,12 @@ class ToGroup(Entering):
         if not self._joined.done():
             self._joined.set_result(None)
 
+    def owe(self, ask: Ask) -> int:
+        return 0 if self._recorded is None else super().owe(ask)  # It is numbered when it is packed.
+
     def packed(self, actor: Actor) -> None:
         if self._recorded is None:
-            self.move.luggage.data = save_state(actor)
+            self.move.luggage.data, self.move.luggage.owed = save_owing(actor)
 
     async def begin(self) -> None:
         move, host, group, switch = self.move, self._host, self._group, self._switch
@@ -130,6 +132,7 @@ class ToGroup(Entering):
         """What waits for an actor that had no home waits there."""
         cell, more, luggage, switch = self.cell, self.cell.extra(), self.move.luggage, self._switch
         bound, topics, waiting = luggage.bound, list(more.topics), luggage.waiting
+        switch.later.update(luggage.owed)
         if bound is not None:
             waiting, bound.waiting = list(bound.waiting), deque()
         for index, (name, body, left, interval, queued) in enumerate(luggage.rest["timers"]):
@@ -295,15 +298,13 @@ class FromGroup(FromRecordedGroup):
         self._stash: list[int] = []
 
     async def collect(self, epoch: int, end: float) -> None:
-        group, luggage, promised = self._group, self.move.luggage, self._switch.later
-        if promised:  # Nothing is handled any more: they will not become fewer.
-            raise CannotMove(self.cell.path, f"{len(promised)} asks wait for replies that only its handles can give")
+        group, luggage, owed = self._group, self.move.luggage, self._switch.later
         primary = group.primary
         if primary is not None:
             ask = group.protocol(primary).ask(Export(epoch, EXPORTED_WITHIN), EXPORTED_WITHIN)
             exported = await self.move.within(ask, end - now(), lambda: "its state did not come")
             data = luggage.data = exported.data
-            luggage.restore = lambda actor: restore_state(actor, data)
+            luggage.restore = lambda actor: restore_owing(actor, data, owed)
             self._stash, luggage.traps = list(exported.stash), exported.traps
 
     def detach(self) -> None:
@@ -331,7 +332,9 @@ class FromGroup(FromRecordedGroup):
             luggage.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
         luggage.waiting = [ask for ask, _, _, _ in getattr(homed, "waiting", ())]
         luggage.timers = [list(timer) for timer in switch.timers.saved().values()]
+        luggage.owed = dict(switch.later)
         switch.open.clear()
+        switch.later.clear()
         switch.timers.replace({})
         self._homed = homed
         self.host.homes.released(cell.path)

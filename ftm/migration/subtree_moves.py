@@ -38,7 +38,7 @@ from ..group.transient_homes import UNKEPT
 from ..model.mechanism import compose
 from .group_moves import settle_in
 from .subtree_groups import SubtreeGroup
-from .unrecorded_luggage import pack, refuse, unpack
+from .unrecorded_luggage import pack, pack_owed, refuse, unpack, unpack_owed
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Admit
@@ -206,6 +206,7 @@ class FromSubtree(Leaving):
             chosen = Bounded(capacity, cast("Overflow", overflow))
             more.bound = Bound(capacity, chosen.overflow)
         luggage.queue = unpack(self._worker, cell, told["queue"])
+        luggage.owed = unpack_owed(self._worker, cell, told["owed"])
         luggage.waiting, self._held = self._held, []
         kind = self._spec.start.kind
         wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen, MADE_OF)
@@ -331,7 +332,9 @@ class ToSubtree(IntoSubtree):
         self._up: asyncio.Future[None] = move.node.loop.create_future()
         self.place.arriving = self._said
         move.hear(self.worker, self._heard)
-        move.say_now(self.worker, "come", state=luggage.data, traps=luggage.traps)
+        assert self._group.switch is not None
+        owed = [number for number, ask in self._group.switch.later.items() if not ask.is_done]
+        move.say_now(self.worker, "come", state=luggage.data, traps=luggage.traps, owed=owed)
         await move.within(self._up, move.timeout, lambda: "its new life was not up")
 
     def _said(self, record: ToHome) -> None:
@@ -366,6 +369,7 @@ class ToSubtree(IntoSubtree):
         told = {
             "stash": pack(worker, cell, luggage.stash),
             "queue": pack(worker, cell, [*luggage.queue, *luggage.waiting]),
+            "owed": pack_owed(worker, luggage.owed),
             "timers": luggage.timers,
             "is_suspended": luggage.suspended,
             "links": [peer.path for peer in more.links],

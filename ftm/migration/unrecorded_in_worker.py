@@ -20,13 +20,12 @@ from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.timers import Timer
 from ...actors.kernel.topics import Topics
 from ...actors.migration.here import Arrival
-from ...actors.migration.luggage import Stays, check_sendable, pack_rest
+from ...actors.migration.luggage import check_sendable, pack_rest
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
 from ...actors.process.wire.connection import BadFrame
-from ...checkpoint.snapshot.key_variables import restore_state, save_state
 from .protected_stand_ins import InnerGroupHost, respec
-from .unrecorded_luggage import pack, refuse, unpack
+from .unrecorded_luggage import EarlyAsk, pack, pack_owed, refuse, restore_owing, save_owing, unpack
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
@@ -42,6 +41,7 @@ class PlainChild:
         self._cell: Cell | None = None  # where a life is at rest, or comes back to
         self._arrival: Arrival | None = None  # beside it: the life that comes back
         self._held: list[Any] | None = None  # what has been sent to it here meanwhile
+        self._owed: dict[int, Any] = {}  # the asks that it has promised to answer
 
     def obey(self, step: str, told: dict[str, Any]) -> None:
         match step:
@@ -85,7 +85,8 @@ class PlainChild:
         cell = actor.ctx.cell
         check_sendable(cell)
         rest, stash = pack_rest(actor), pack(self._guest, cell, cell.extra().stash or ())
-        self._say("taken", at=now(), state=save_state(actor), rest=rest, stash=stash)
+        state, self._owed = save_owing(actor)
+        self._say("taken", at=now(), state=state, rest=rest, stash=stash)
 
     def _go_on(self) -> None:
         take, self._take, cell = self._take, None, self._cell
@@ -107,7 +108,8 @@ class PlainChild:
         items, commands = sorted_out(cell)
         queue = pack(guest, cell, (*items, *waiting))
         self._hand_ties_over(cell)
-        self._say("left", queue=queue, bound=None if bound is None else [bound.capacity, bound.overflow])
+        room = None if bound is None else [bound.capacity, bound.overflow]
+        self._say("left", queue=queue, bound=room, owed=pack_owed(guest, self._owed))
         respec(cell, told["layers"])
         guest.recovery.begins(cell.path)
         host = InnerGroupHost(guest, cell.spec, guest.recovery.port_of)
@@ -144,8 +146,10 @@ class PlainChild:
         arrival = Arrival(cell)
         self._cell, self._arrival = cell, arrival
 
+        self._owed = {number: EarlyAsk.early(self._guest) for number in told["owed"]}
+
         def restore(actor: Actor) -> None:
-            restore_state(actor, told["state"])
+            restore_owing(actor, told["state"], self._owed)
 
         try:
             up = arrival.begin(start, restore, trap_exits=told["traps"])
@@ -203,6 +207,8 @@ class PlainChild:
         bound = None if host.bound is None else Bound(host.bound.capacity, host.bound.overflow)
         queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])
         commands = arrival.take_over(queue, stash, bound, suspended=bool(told["is_suspended"]))
+        for number, key, _ in told["owed"]:
+            self._owed[number].is_ours(key)
         for name, body, left, interval in told["timers"] if not has_ended else ():
             message = cell.node.codec.decode(cell.table.kind_named(name), body)
             Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
@@ -232,4 +238,4 @@ class PlainChild:
 
 
 def _owe(ask: Any) -> int:
-    raise Stays("an ask waits for its reply, which it could not give from another place")
+    return 0  # It is numbered when the state is saved.

@@ -5,18 +5,125 @@ Whoever waits for a reply is answered over the connection, wherever the asked ac
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import functools
+from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.codec import Parcel
-from ...actors.kernel.envelope import Ask, Envelope, Item
+from ...actors.kernel.envelope import Ask, Envelope, Item, ReplyHandle
 from ...actors.kernel.message import message_name
-from ...actors.migration.luggage import pack_items, unpack_items
+from ...actors.migration.luggage import lift, pack_items, unanswerable, unpack_items
 from ...actors.process.wire.peer import Peer, RelayedAsk
+from ...actors.values import UnsavableValue
+from ...checkpoint.life.recorded_context import RecordedReplyHandle
+from ...checkpoint.snapshot.key_variables import restore_state, save_state
 
 if TYPE_CHECKING:
+    from ...actors.kernel.actor import Actor
     from ...actors.kernel.cell import Cell
+
+FIRST_OWED = -2
+"""The number of the first reply that was promised before there was a home, which counts its inputs from 1 up."""
+
+
+def save_owing(actor: Actor) -> tuple[bytes, dict[int, Ask]]:
+    """The state of an actor without a home, as one that has a home saves it, and the asks it has promised to answer.
+
+    Raises:
+        UnsavableValue, StateMismatch: as `save_state`. Stays: the handle of a promised reply is not in the state.
+    """
+    owed: dict[int, Ask] = {}
+
+    def told(value: Any) -> Any:
+        if type(value) is not ReplyHandle:
+            return value
+        ask = value.ask
+        if ask is None or ask.is_done:
+            return RecordedReplyHandle[Any](-1)
+        number = next((number for number, one in owed.items() if one is ask), FIRST_OWED - len(owed))
+        owed[number] = ask
+        return RecordedReplyHandle[Any](number)
+
+    try:
+        data = save_state(actor)
+    except UnsavableValue:
+        data = save_state(actor, lambda state: lift(state, told))
+    if lost := sum(not ask.is_done and ask not in owed.values() for ask in actor.ctx.promised()):
+        raise unanswerable(lost)
+    return data, owed
+
+
+def restore_owing(actor: Actor, data: bytes, owed: Mapping[int, Ask]) -> None:
+    """Give a life without a home the state that one with a home has saved, and the asks that it is to answer.
+
+    Raises:
+        DamagedValue, StateMismatch: as `restore_state`. Stays: the handle of a promised reply is not in the state.
+    """
+    found: set[int] = set()
+
+    def meant(value: Any) -> Any:
+        if type(value) is not RecordedReplyHandle:
+            return value
+        ask = owed.get(value.id)
+        if ask is None:
+            return ReplyHandle[Any](None)
+        found.add(value.id)
+        return actor.ctx.promise(ask)
+
+    actor.ctx.borrow_promises()
+    restore_state(actor, data, meant=lambda saved: lift(saved, meant))
+    if lost := sum(not ask.is_done for number, ask in owed.items() if number not in found):
+        raise unanswerable(lost)
+
+
+class EarlyAsk(RelayedAsk, eq=False):
+    """An ask of the other side that this one may have to answer. What is said before that is known waits."""
+
+    said: Any = None
+
+    @classmethod
+    def early(cls, peer: Peer) -> EarlyAsk:
+        """An ask whose number is not known yet."""
+        return cls(None, None, (), 0.0, 0.0, None, None, True, peer)
+
+    def is_ours(self, number: int) -> None:
+        """It is to be answered from here, by this number."""
+        self.id, said, self.said = number, self.said, None
+        if said is not None:
+            self.is_over = False
+            said()
+
+    def answer(self, reply: object) -> None:
+        if self.id:
+            super().answer(reply)
+        else:
+            self._keep(functools.partial(RelayedAsk.answer, self, reply))
+
+    def fail_raw(self, kind: str, name: str, body: bytes) -> None:
+        if self.id:
+            super().fail_raw(kind, name, body)
+        else:
+            self._keep(functools.partial(RelayedAsk.fail_raw, self, kind, name, body))
+
+    def _keep(self, said: Callable[[], None]) -> None:
+        if not self.is_over:
+            self.is_over, self.said = True, said
+
+
+def pack_owed(peer: Peer, owed: Mapping[int, Ask]) -> list[list[Any]]:
+    """The asks that the other side shall answer from now on: number in the state, number of the ask, seconds left."""
+    now = peer.node.loop.time()
+    return [[number, peer.expect(ask), ask.deadline - now] for number, ask in owed.items() if not ask.is_done]
+
+
+def unpack_owed(peer: Peer, cell: Cell, packed: Iterable[list[Any]]) -> dict[int, Ask]:
+    """The same, where they are to be answered."""
+    now = peer.node.loop.time()
+    return {
+        number: RelayedAsk(None, None, (), left, now + left, None, cell, True, peer, key)
+        for number, key, left in packed
+    }
 
 
 def pack_ask(peer: Peer, ask: Ask, name: str, body: bytes) -> list[Any]:

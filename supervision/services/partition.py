@@ -134,7 +134,7 @@ class PartitionSupervisor(Supervisor):
 
     @on(RemoveChild)
     def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
-        """They are no single ones."""
+        """Its members are all alike: none of them is removed alone."""
         self._child(message.id)
         raise NotSupported("the children of a partition supervisor are its partitions: use ResizePartitions")
 

@@ -190,7 +190,7 @@ class PoolSupervisor(Supervisor):
 
     @on(RemoveChild)
     def _remove_child(self, message: RemoveChild) -> ReplyHandle[Any]:
-        """They are no single ones."""
+        """Its members are all alike: none of them is removed alone."""
         self._child(message.id)
         raise NotSupported("the children of a pool are its workers: use ResizePool")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 from ...actors.kernel.cell import GONE, Cell
@@ -13,7 +14,8 @@ class Moved:
 
     def __init__(self, node: Node, outside: Callable[[str], Cell | None]) -> None:
         self._node, self._outside = node, outside
-        self._cells = node.vacated
+        self._cells: dict[str, Cell] = {}
+        self._watched: set[str] = set()
 
     def leave(self, path: str, cell: Cell) -> None:
         """The actor at `path` has another address now, and all who move with it have theirs."""
@@ -23,6 +25,13 @@ class Moved:
         self._cells.pop(cell.path, None)
         if self._at(path) is None:
             self._cells[path] = cell
+            if path not in self._watched:
+                self._watched.add(path)
+                self._node.awaited.setdefault(path, []).append(functools.partial(self._forget, path))
+
+    def _forget(self, path: str) -> None:
+        self._watched.discard(path)
+        self._cells.pop(path, None)
 
     def find(self, path: str) -> Cell | None:
         """What the node asks when nobody lives at `path` now."""

@@ -72,7 +72,7 @@ class Arrangement:
                 return why
             for name, child in place.children.items():
                 is_taken = child_of(cell, name) is not None or name in (cell.children or {})
-                if child.has_moved and is_taken and name not in place.before:
+                if child.has_moved and is_taken and name not in place.was.children:
                     raise wrong(place.path, f"it has a child {name!r} already")
         return self._names_ready(system.node)
 
@@ -88,7 +88,7 @@ class Arrangement:
         return ""
 
     def commit(self, system: ActorSystem) -> None:
-        """Put it in force."""
+        """Have the tree and the names be as the steps say, at once."""
         self._arrange(system)
         node, after = system.node, {name: place for name, (_, _, place) in self._names.items()}
         for name, place in after.items():
@@ -194,8 +194,8 @@ def _below(place: Place) -> Place:
 
 def _left(place: Place) -> Place:
     """Whose child it was before the transaction."""
-    assert place.was_below is not None
-    return place.was_below
+    assert place.was.below is not None
+    return place.was.below
 
 
 def _arrange(place: Place, supervisor: Supervisor, taken: dict[Place, Child]) -> None:
@@ -253,7 +253,7 @@ def _respecify(place: Place, supervisor: Supervisor) -> None:
 def _edited(place: Place, flags: Flags, specs: Specs, taken: dict[Place, Child]) -> tuple[Flags, Specs]:
     """A supervisor's recipe as it is from now on."""
     known = {spec.id: spec for spec in specs}
-    left = place.before - place.children.keys()
+    left = place.was.children - place.children.keys()
     after: list[ChildSpec] = []
     for name, child in place.children.items():
         spec, is_new = known.pop(name, None), child.is_planned or child in taken

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import ActorRestarting, NoSuchActor
@@ -19,6 +20,7 @@ from ...supervision.services.partition import PartitionSupervisor
 from ...supervision.spec import ChildSpec, Flags
 from ...supervision.supervisor import Supervisor
 from ..protection import part_of
+from ..recovery import RecoverySupervisor
 from .lasting import recipe_flags, recipe_specs
 from .operation import wrong
 
@@ -34,16 +36,28 @@ Target = ActorRef[Any] | str
 """What an operation is about: a ref, or the address at that point of the transaction."""
 
 
+@dataclass(slots=True)
+class Before:
+    """What a place was before the transaction."""
+
+    below: Place | None
+    """Its supervisor."""
+    children: frozenset[str] = frozenset()
+    """The names of those that were below it."""
+    brought_back: bool = False
+    """Whether its supervisor starts it when that is restarted itself: its recipe says so."""
+    bound: dict[str, Place] = field(default_factory=dict[str, "Place"])
+    """To whom its spec binds its ports."""
+
+
 class Place:
     """One address in the draft. `cell` is None while nobody has lived there: it is to be added."""
 
     __slots__ = (
-        "before",
         "bindings",
         "candidate",
         "cell",
         "children",
-        "comes_back",
         "flags",
         "is_leaving",
         "is_moved",
@@ -58,9 +72,8 @@ class Place:
         "relocation",
         "rework",
         "spec",
-        "spec_bindings",
         "wanted",
-        "was_below",
+        "was",
     )
 
     def __init__(self, name: str, parent: Place | None, cell: Cell | None, spec: ChildSpec | None) -> None:
@@ -74,12 +87,9 @@ class Place:
         self.is_stopped = cell is None or cell.is_dead  # a child whose spec stays, and which does not run
         self.is_suspended = cell is not None and cell.more is not None and cell.more.suspended
         self.bindings: dict[str, Place] = {}
-        self.spec_bindings: dict[str, Place] = {}  # as its next life in a new address has them, if it is there already
         self.names: list[str] = []
-        self.was_below = parent  # before the transaction
-        self.before: frozenset[str] = frozenset()  # the names of those that are below it before the transaction
+        self.was = Before(parent)
         self.is_switched = False  # its spec says otherwise whether it is started with the others
-        self.comes_back = False  # with its supervisor, whose recipe says so
         self.candidate = 0  # as which it is started, if it is added
         self.wanted: dict[str, Any] = {}  # flags that change
         self.rework: Rework | None = None  # what is changed in the actor itself
@@ -93,7 +103,7 @@ class Place:
     @property
     def has_moved(self) -> bool:
         """Whether it is below another supervisor than before."""
-        return not self.is_planned and self.parent is not self.was_below
+        return not self.is_planned and self.parent is not self.was.below
 
     @property
     def is_moved_to(self) -> bool:
@@ -112,7 +122,7 @@ class Place:
             if not place.is_planned or place in seen:
                 continue
             above = place.parent
-            if above is not None and not above.is_planned and place.name in above.before:
+            if above is not None and not above.is_planned and place.name in above.was.children:
                 return True
             seen.add(place)
             waiting += [
@@ -171,7 +181,7 @@ class Place:
         while one is not supervisor and one.parent is not None:
             is_new = one.is_planned or one.has_moved
             is_kept = one.spec is not None and one.spec.restart != "temporary" and not one.parent.is_dynamic
-            if not (is_kept if is_new else one.comes_back):
+            if not (is_kept if is_new else one.was.brought_back):
                 return False
             one = one.parent
         return True
@@ -254,7 +264,7 @@ class Draft:
             for port, path in place.spec.bindings.items() if place.spec is not None else ():
                 lives = node.find(path)
                 if lives is not None and lives in self.by_cell:
-                    place.spec_bindings[port] = self.by_cell[lives]
+                    place.was.bound[port] = self.by_cell[lives]
         self.named: dict[str, Place] = {}
         """Who has which name before the transaction."""
         for name, cell in node.names.items():
@@ -281,11 +291,11 @@ class Draft:
         for one in known:
             child = below.pop(one.spec.id, None)
             place.children[one.spec.id] = self._survey(child, one.spec.id, place, one.spec)
-            place.children[one.spec.id].comes_back = one.spec.id in planned and not place.is_dynamic
+            place.children[one.spec.id].was.brought_back = one.spec.id in planned and not place.is_dynamic
         for child in below.values():
             own = child.spec if isinstance(child.spec, ChildSpec) else None
             place.children[child.name] = self._survey(child, child.name, place, own)
-        place.before = frozenset(place.children)
+        place.was.children = frozenset(place.children)
         return place
 
     def find(self, target: Target, *, parts: bool = False) -> Place:
@@ -304,7 +314,7 @@ class Draft:
         for at in place.upwards():
             if at.is_leaving:
                 raise wrong(place.path, f"{at.path} is removed by this very transaction")
-            if at.cell in self.node.own:
+            if at.kind is RecoverySupervisor:
                 raise wrong(place.path, "it is a part of the system itself, which no transaction changes")
         if not parts:
             self._check_no_part(place.path, place.parent)
@@ -362,7 +372,7 @@ class Draft:
                 below = [info.id for info in await ref.ask(WhichChildren())]
                 told = {name: known.get(name) or Place(name, place, None, None) for name in below}
                 place.children = {**told, **{name: one for name, one in known.items() if name not in told}}
-                place.before = frozenset(place.children)
+                place.was.children = frozenset(place.children)
         return place
 
     def check(self) -> None:
@@ -389,7 +399,7 @@ class Draft:
         for place in self.staying():
             seen.add(place)
             for port in place.spec.bindings if place.spec is not None else ():
-                target = (place.bindings if place.is_planned else place.spec_bindings).get(port)
+                target = (place.bindings if place.is_planned else place.was.bound).get(port)
                 if target is not None and target not in seen:
                     both = next((above for above in target.upwards() if above in set(place.upwards())), self.root)
                     if both is not self.root and place.comes_back_with(both):

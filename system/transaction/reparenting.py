@@ -73,8 +73,8 @@ class Move(Operation):
         assert place is not None
         if not (self._leads and place.has_moved):
             return ""
-        assert place.was_below is not None
-        old = place.was_below.living(system.node)
+        assert place.was.below is not None
+        old = place.was.below.living(system.node)
         if why := busy(old):
             return why
         one = child_of(old, place.name)

@@ -73,8 +73,8 @@ class StopChild(OnChild):
     def ready(self, system: ActorSystem) -> str:
         place = self._place
         assert place is not None
-        assert place.was_below is not None
-        if child_of(place.was_below.living(system.node), self._name) is None:
+        assert place.was.below is not None
+        if child_of(place.was.below.living(system.node), self._name) is None:
             raise NoSuchActor(self.target)
         return ""
 
@@ -120,8 +120,8 @@ class StartAgain(OnChild):
     def _supervisor(self, system: ActorSystem) -> Cell:
         """Who has it until the transaction is in force: there it is started, and goes from there if it is moved."""
         assert self._place is not None
-        assert self._place.was_below is not None
-        return self._place.was_below.living(system.node)
+        assert self._place.was.below is not None
+        return self._place.was.below.living(system.node)
 
     async def prepare(self, system: ActorSystem) -> None:
         supervisor = self._supervisor(system)

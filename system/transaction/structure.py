@@ -63,7 +63,7 @@ class Newcomer:
         return None if above.is_planned or place.comes_last or self._is_over else above
 
     async def prepare(self, system: ActorSystem) -> None:
-        """Have it started."""
+        """Have the supervisor start it, unless that has done so in this very life."""
         above, place = self._above, self.place
         if above is None:
             return

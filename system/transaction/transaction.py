@@ -167,16 +167,20 @@ class Transaction:
                 for text, commit in [
                     (self._arrangement.step, self._arrangement.commit),
                     *((one.text, one.commit) for one in self._change.operations),
+                    ("the specification in the store", self._note),
                 ]:
                     try:
                         commit(self._system)
                     except Exception as error:  # It had said that it is ready: the others are in force all the same.
                         self._problems.append(f"{text}: {said(error)}")
-                assert self._draft is not None
-                mechanisms = {**self._draft.mechanisms(), **self._system.mechanism_notes.declared()}
-                self._system.specifications.changed(*self._draft.below_root(), mechanisms)
         except HoldfastError as error:
             self._problems.append(f"it is not in the store, which has failed: {said(error)}")
+
+    def _note(self, system: ActorSystem) -> None:
+        """What the children of the root are from now on, for the next root."""
+        assert self._draft is not None
+        mechanisms = {**self._draft.mechanisms(), **system.mechanism_notes.declared()}
+        system.specifications.changed(*self._draft.below_root(), mechanisms)
 
     async def _release(self, begun: list[Operation]) -> tuple[tuple[str, ...], tuple[str, ...]]:
         """Let go of what was prepared, last one first; a cancellation waits until that is over."""

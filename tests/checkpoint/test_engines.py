@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import holdfast as hf
 from holdfast.checkpoint.journal import Journal, MemoryJournal
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.stores import open_journal
+from holdfast.testing.schedules.disk import SimulatedDisk, SimulatedJournal
 from holdfast.testing.stores import conformance
 from tests.checkpoint.one_file import OneFile
 from tests.checkpoint.players import Doer, Note, Seen
@@ -50,6 +52,36 @@ def copied(journal: Journal, folder: Path) -> Path:
 
 class TestOneFile(conformance(lambda path: OneFile(path / "my.store"), crash=copied)):  # type: ignore[misc]
     """One of a user's own."""
+
+
+DISKS: list[SimulatedDisk] = []
+"""A folder has a file that says which one is in it."""
+
+
+def placed(folder: Path, disk: SimulatedDisk) -> None:
+    (folder / "disk").write_text(str(len(DISKS)), encoding="ascii")
+    DISKS.append(disk)
+
+
+def disk_in(folder: Path) -> SimulatedDisk:
+    return DISKS[int((folder / "disk").read_text(encoding="ascii"))]
+
+
+def simulated(folder: Path) -> Journal:
+    if not (folder / "disk").exists():
+        placed(folder, SimulatedDisk())
+    return disk_in(folder).open()
+
+
+def left(journal: SimulatedJournal, folder: Path) -> Path:
+    copy = folder.with_name(str(int(folder.name) + 1))
+    copy.mkdir()
+    placed(copy, deepcopy(disk_in(folder)))
+    return copy
+
+
+class TestSimulated(conformance(simulated, crash=left)):  # type: ignore[misc]
+    """The store of a simulated run."""
 
 
 @pytest.mark.parametrize("kind", [SqliteJournal, OneFile])

@@ -32,11 +32,6 @@ class Foreign(OneFile):
     def break_at(self, name: str | None) -> None:
         vars(self)["_broken"] = name
 
-    def _write(self) -> None:
-        broken, self._broken = self._broken, None
-        super()._write()
-        self._broken = broken
-
 
 async def test_a_snapshot_that_an_engine_does_not_take_is_tried_again(tmp_path: Path) -> None:
     engine = Foreign(tmp_path / "my.store")

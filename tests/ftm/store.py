@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
+
 import holdfast as hf
+from holdfast.testing import Model, Operation
 
 
 class Write(hf.Message[None]):
@@ -40,3 +43,23 @@ class Store(hf.Actor):
             return False
         self.values[message.key] = message.new
         return True
+
+
+def step(value: int | None, message: Write | Look | Cas) -> tuple[int | None, object]:
+    """What the value of one key does, sequentially."""
+    match message:
+        case Write(value=new):
+            return new, None
+        case Look():
+            return value, value
+        case Cas(old=old, new=new):
+            return (new, True) if value == old else (value, False)
+
+
+def key(operation: Operation) -> Hashable:
+    """Keys have nothing to do with each other."""
+    found: Hashable = operation.message.key
+    return found
+
+
+MODEL = Model(None, step, key=key)

@@ -9,7 +9,8 @@ from collections import Counter as Tally
 from typing import Any
 
 import holdfast as hf
-from tests.ftm import accounts, linearizable, store
+from holdfast.testing import History, linearizable
+from tests.ftm import accounts, store
 
 CLIENTS = 4
 
@@ -143,7 +144,7 @@ class Storing(Workload):
     read = "Look"
 
     async def start(self, system: hf.ActorSystem, mechanism: Any) -> hf.ActorRef[Any]:
-        self.history = linearizable.History()
+        self.history = History()
         self.ref = await system.start(hf.child("kv", hf.start(store.Store), mechanism=mechanism))
         return self.ref
 
@@ -151,16 +152,12 @@ class Storing(Workload):
         key, rng = f"k{self.rng.randrange(8)}", self.rng
         kind = rng.choice(("write", "read", "cas"))
         old, new = rng.choice((None, number - 1, number - 3)), number
-        args: tuple[Any, ...] = {"write": (new,), "read": (), "cas": (old, new)}[kind]
         message: Any = {"write": store.Write(key, new), "read": store.Look(key), "cas": store.Cas(key, old, new)}[kind]
-        at = self.history.begin(f"c{client}.{number}", kind, *args, key=key)
-        reply = await self.ref.ask(message, timeout=self.timeout)
-        self.history.end(at, reply)
-        return reply
+        return await self.history.ask(self.ref, message, self.timeout, client=f"c{client}")
 
     async def bad(self) -> Bad:
-        found = await asyncio.to_thread(linearizable.check, self.history, linearizable.key_value())
-        return Bad() if isinstance(found, linearizable.Linearizable) else Bad(wrong=[self.sent - 1])
+        found = await asyncio.to_thread(linearizable, self.history, store.MODEL)
+        return Bad() if found else Bad(wrong=[self.sent - 1])
 
 
 WORKLOADS: dict[str, type[Workload]] = {"counter": Counting, "bank": Banking, "store": Storing}

@@ -22,13 +22,12 @@ from tests.migration.travellers import KINDS, Luggage, Stream, Traveller, path, 
 
 TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")
 TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
-# Each note: the actors it is about, whether it is about promised replies alone, what the refusal says.
-NOTES: dict[str, tuple[set[str], bool, str]] = {
-    "¹": ({"plain"}, True, "replies? that only its handles|an ask waits for its reply"),
-    "²": ({"recorded", "checkpoint_only"}, False, "its journal is kept by its address"),
-    "³": (set(KINDS), False, "its process knows it by its address|no supervisor looks after it|is kept by its address"),
-    "⁴": (set(KINDS), False, "its supervisor lives in another process"),
-    "⁵": (set(KINDS), False, "it is protected by a mechanism|it has PBR already"),
+# Each note: the actors it is about, what the refusal says.
+NOTES: dict[str, tuple[set[str], str]] = {
+    "¹": ({"recorded", "checkpoint_only"}, "its journal is kept by its address"),
+    "²": (set(KINDS), "its process knows it by its address|no supervisor looks after it|is kept by its address"),
+    "³": (set(KINDS), "its supervisor lives in another process"),
+    "⁴": (set(KINDS), "it is protected by a mechanism|it has PBR already"),
 }
 
 
@@ -46,18 +45,16 @@ def cells() -> list[Any]:
     ]
 
 
-def refusal(kind: str, note: str, *, owes: bool) -> str:
+def refusal(kind: str, note: str) -> str:
     """What the refusal of this cell says; "" if there is none."""
-    if not note:
-        return ""
-    kinds, only_owing, why = NOTES[note]
-    return why if kind in kinds and (owes or not only_owing) else ""
+    kinds, why = NOTES.get(note, (set[str](), ""))
+    return why if kind in kinds else ""
 
 
 def test_the_notes_become_fewer() -> None:
     used = {cell.values[3] for cell in cells()} - {""}
     assert used == set(NOTES)
-    assert len(NOTES) <= 5
+    assert len(NOTES) <= 4
 
 
 @pytest.fixture
@@ -67,13 +64,17 @@ async def system() -> Any:
         yield running
 
 
-async def travel(system: hf.ActorSystem, place: str, kind: str, step: str, note: str, *, owes: bool) -> None:
+@pytest.mark.parametrize(("place", "kind", "step", "note"), cells())
+async def test_an_actor_is_taken_there_with_all_it_has(
+    system: hf.ActorSystem, place: str, kind: str, step: str, note: str
+) -> None:
+    """Under a stream of asks and tells, with a stash, a timer, a link, a bounded mailbox and a reply that it owes."""
     await system.start(tree(place, kind))
     ref = system.ref(path(place), Traveller)
-    luggage, stream = Luggage(system, ref, owes=owes), Stream(ref)
+    luggage, stream = Luggage(system, ref), Stream(ref)
     await luggage.pack()
     await stream.reached(20)
-    why = refusal(kind, note, owes=owes)
+    why = refusal(kind, note)
     if why:
         with pytest.raises((hf.CannotMove, hf.TransactionRefused, hf.TransactionFailed), match=why):
             await take(system, ref, step)
@@ -83,28 +84,6 @@ async def travel(system: hf.ActorSystem, place: str, kind: str, step: str, note:
     await stream.stop()
     seen = await luggage.unpack()
     stream.judge(seen["added"])
-
-
-@pytest.mark.parametrize(("place", "kind", "step", "note"), cells())
-async def test_an_actor_is_taken_there_with_all_it_has(
-    system: hf.ActorSystem, place: str, kind: str, step: str, note: str
-) -> None:
-    """Under a stream of asks and tells, with a stash, a timer, a link, a bounded mailbox and a reply that it owes."""
-    await travel(system, place, kind, step, note, owes=True)
-
-
-OWING = [
-    cell
-    for cell in cells()
-    if cell.values[3] and NOTES[cell.values[3]][1] and cell.values[1] in NOTES[cell.values[3]][0]
-]
-
-
-@pytest.mark.parametrize(("place", "kind", "step", "note"), OWING)
-async def test_it_is_taken_there_if_it_owes_no_reply(
-    system: hf.ActorSystem, place: str, kind: str, step: str, note: str
-) -> None:
-    await travel(system, place, kind, step, note, owes=False)
 
 
 class Walk:
@@ -125,7 +104,7 @@ class Walk:
         options = [
             step
             for place, kind, step, note in (cell.values for cell in cells())
-            if (place, kind) == (self.place, self._kind) and step != "move" and not refusal(kind, note, owes=False)
+            if (place, kind) == (self.place, self._kind) and step != "move" and not refusal(kind, note)
         ]
         step = self._draw.choice(options)
         fault = self._draw.choice(("none", "given up", "killed"))
@@ -187,7 +166,7 @@ async def test_random_walks_lose_double_and_reorder_nothing(system: hf.ActorSyst
     kind, place = draw.choice(list(KINDS)), draw.choice(["a task", "a process", "a process, below its supervisor"])
     await system.start(tree(place, kind))
     walk = Walk(system, kind, place, draw, faults)
-    luggage, stream = Luggage(system, walk.ref, owes=kind != "plain"), Stream(walk.ref)
+    luggage, stream = Luggage(system, walk.ref), Stream(walk.ref)
     print(f"seed {seed}: {kind}, from {place}")
     await luggage.pack()
     try:

@@ -7,6 +7,7 @@ import itertools
 from typing import Any
 
 import holdfast as hf
+from holdfast.testing import History, Model, linearizable
 
 
 class Add(hf.Message[int]):
@@ -175,25 +176,26 @@ class Stream:
     """Asks one after another, and tells, until it is stopped; then judges what the traveller has seen.
 
     The traveller's own list is the one order of events: each sender's additions stand in it once and in the order in
-    which they were sent, and each answer is the sum of all that stands before it. So the history is linearizable.
+    which they were sent, and the history must be linearizable in just this order.
     """
 
     def __init__(self, ref: hf.ActorRef[Any]) -> None:
         self._ref, self._stopping = ref, False
-        self._answers: list[int] = []
-        self.told = 0
+        self._history = History()
+        self._answered = self.told = 0
         self._task = asyncio.create_task(self._send())
 
     async def _send(self) -> None:
         while not self._stopping:
-            self._ref.tell(Add(TOLD + self.told))
+            self._history.tell(self._ref, Add(TOLD + self.told))
             self.told += 1
-            self._answers.append(await self._ref.ask(Add(len(self._answers) + 1), timeout=120.0))
+            await self._history.ask(self._ref, Add(self._answered + 1), 120.0)
+            self._answered += 1
 
     async def reached(self, more: int) -> None:
         """Wait for so many answers more."""
-        wanted = len(self._answers) + more
-        while len(self._answers) < wanted:
+        wanted = self._answered + more
+        while self._answered < wanted:
             if self._task.done():
                 self._task.result()
             await asyncio.sleep(0)
@@ -205,10 +207,24 @@ class Stream:
     def judge(self, added: list[int]) -> None:
         """Each addition once, in the order of its sender; each answer the sum of what stands before it."""
         asked = [n for n in added if 0 < n < TOLD]
-        assert asked == list(range(1, len(self._answers) + 1))
+        assert asked == list(range(1, self._answered + 1))
         assert [n for n in added if n >= TOLD] == list(range(TOLD, TOLD + self.told))
-        sums = dict(zip(added, itertools.accumulate(added), strict=True))
-        assert [sums[n] for n in asked] == self._answers
+        self._history.end(self._history.begin("the judge", Seen()), sum(added))
+        linearizable(self._history, in_order_of(added)).verify()
+
+
+def in_order_of(added: list[int]) -> Model[int]:
+    """A traveller that adds just this, in this order. The state is how many of them it has added."""
+    sums = [0, *itertools.accumulate(added)]
+
+    def step(count: int, message: Add | Seen) -> tuple[int, int | None]:
+        if isinstance(message, Seen):
+            return count, sums[count]
+        if added[count : count + 1] != [message.n]:
+            return count, None  # It was not its turn.
+        return count + 1, sums[count + 1]
+
+    return Model(0, step)
 
 
 TOLD = 1_000_000
@@ -217,23 +233,21 @@ TOLD = 1_000_000
 class Luggage:
     """What the traveller has on it: something stashed, a promised reply, a timer, a link."""
 
-    def __init__(self, system: hf.ActorSystem, ref: hf.ActorRef[Any], *, owes: bool) -> None:
-        self._system, self._ref, self._owes = system, ref, owes
+    def __init__(self, system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+        self._system, self._ref = system, ref
 
     async def pack(self) -> None:
         self._neighbour = await self._system.start(hf.child("neighbour", hf.start(Neighbour)))
         assert await self._ref.ask(Tie(self._neighbour))
         self._ref.tell(Keep(STASHED))
-        if self._owes:
-            self._reply = self._ref.ask(Later(), timeout=120.0)
+        self._reply = self._ref.ask(Later(), timeout=120.0)
         assert await self._ref.ask(Remind(0.3))
 
     async def unpack(self) -> dict[str, Any]:
         """Use all of it; what the traveller has seen in the end."""
         ref = self._ref
-        if self._owes:
-            assert await ref.ask(Give(9))
-            assert await self._reply == 9
+        assert await ref.ask(Give(9))
+        assert await self._reply == 9
         assert await ref.ask(Open())
         assert await self._neighbour.ask(Open())
         seen: dict[str, Any] = {}

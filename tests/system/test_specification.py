@@ -284,6 +284,31 @@ async def test_mechanisms_and_specifications_are_kept_side_by_side(tmp_path: Pat
             assert await ref(system, "/app/left/r").ask(Add(0)) == 5
 
 
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_what_cannot_be_noted_stops_neither_the_transaction_nor_the_store(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with program(tmp_path / "store") as system:
+        with monkeypatch.context() as broken, system.events() as events:
+
+            def fail() -> Any:
+                raise hf.MechanismRefused("/app/left/r", "there is none of that name")
+
+            broken.setattr(system.mechanism_notes, "declared", fail)
+            async with system.transaction(timeout=IN_TIME) as change:
+                change.remove("/app/left/c")
+                change.replace_state("/app/left/r", taken)
+            (event,) = (one for one in events.take() if isinstance(one, hf.TransactionCommitted))
+        assert len(event.problems) == 1
+        assert "there is none of that name" in event.problems[0]
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove("/app/left/b")
+        assert await ref(system, "/app/left/r").ask(Add(1)) == -99
+    async with program(tmp_path / "store") as system:
+        assert sorted(ref(system, "/app/left")._cell.children or {}) == ["a", "r"]
+        assert await ref(system, "/app/left/r").ask(Add(0)) == -99
+
+
 # -- the root is killed -----------------------------------------------------------------------------------------------
 
 

@@ -699,6 +699,18 @@ async def test_a_start_that_waited_in_the_queue_of_a_restarted_supervisor_is_tak
     assert await ref(system, "/app/right/e").ask(Add(1)) == 1
 
 
+async def test_who_was_stopped_by_a_message_and_came_back_with_its_supervisor_is_not_stopped_again(
+    system: hf.ActorSystem,
+) -> None:
+    with pytest.raises(hf.TransactionFailed, match="there was a stone") as failed:
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.start("/app/right", "e")
+            change.step(Stumble(lambda running: crashed(running, "/app/right")))
+            change.step(Stumble())
+    assert failed.value.kept == ()
+    assert await ref(system, "/app/right/e").ask(Add(1)) == 1
+
+
 async def test_a_binding_in_a_process_is_changed_by_the_commit_alone(
     system: hf.ActorSystem, one: hf.ActorRef[Any]
 ) -> None:
