@@ -14,16 +14,26 @@ if TYPE_CHECKING:
     from .clock import NothingToWaitFor, VirtualClockLoop, advance, virtual
     from .faults import POINTS, Faults, Point, Strike, Strikes
     from .guarded import GuardedSystem, UnexpectedEnd
+    from .histories.checker import ImpureModel, Linearization, NotLinearizable, TooHard, Violation, linearizable
+    from .histories.history import UNKNOWN, History, Model, Operation
+    from .machines.machine import ActorMachine
     from .probes import Down, Exit, Probe, Received, Unexpected, probe
     from .simulation import Simulation, simulate
 
 _HOME = {
+    "ActorMachine": "machines.machine",
     "Down": "probes",
     "Exit": "probes",
     "Faults": "faults",
     "GuardedSystem": "guarded",
+    "History": "histories.history",
+    "ImpureModel": "histories.checker",
+    "Linearization": "histories.checker",
+    "Model": "histories.history",
     "NotIdle": "barrier",
+    "NotLinearizable": "histories.checker",
     "NothingToWaitFor": "clock",
+    "Operation": "histories.history",
     "POINTS": "faults",
     "Point": "faults",
     "Probe": "probes",
@@ -31,23 +41,34 @@ _HOME = {
     "Simulation": "simulation",
     "Strike": "faults",
     "Strikes": "faults",
+    "TooHard": "histories.checker",
+    "UNKNOWN": "histories.history",
     "Unexpected": "probes",
     "UnexpectedEnd": "guarded",
+    "Violation": "histories.checker",
     "VirtualClockLoop": "clock",
     "advance": "clock",
     "idle": "barrier",
+    "linearizable": "histories.checker",
     "probe": "probes",
     "simulate": "simulation",
     "virtual": "clock",
 }
 
 __all__ = [
+    "ActorMachine",
     "Down",
     "Exit",
     "Faults",
     "GuardedSystem",
+    "History",
+    "ImpureModel",
+    "Linearization",
+    "Model",
     "NotIdle",
+    "NotLinearizable",
     "NothingToWaitFor",
+    "Operation",
     "POINTS",
     "Point",
     "Probe",
@@ -55,11 +76,15 @@ __all__ = [
     "Simulation",
     "Strike",
     "Strikes",
+    "TooHard",
+    "UNKNOWN",
     "Unexpected",
     "UnexpectedEnd",
+    "Violation",
     "VirtualClockLoop",
     "advance",
     "idle",
+    "linearizable",
     "probe",
     "simulate",
     "virtual",

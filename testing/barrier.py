@@ -25,6 +25,7 @@ from ..checkpoint.home.outputs import switch_of
 from ..checkpoint.home.switch import Switch
 from ..checkpoint.protocol import STASHED
 from .clock import VirtualClockLoop
+from .schedules.processes import SimulatedWorkers
 
 if TYPE_CHECKING:
     from ..actors.kernel.cell import Cell
@@ -109,9 +110,10 @@ async def idle(system: ActorSystem, *, timeout: float = TIMEOUT) -> None:
 
 async def quiet(node: Node | None = None) -> None:
     """Wait until no task of this loop could go on, and no actor of the node is ready."""
-    calm = 0
+    calm, loop = 0, asyncio.get_running_loop()
+    rest = loop.rest if isinstance(loop, VirtualClockLoop) else None
     while calm < QUIET:
-        await asyncio.sleep(0)
+        await (asyncio.sleep(0) if rest is None else rest())
         calm = 0 if _busy(node) else calm + 1
 
 
@@ -152,12 +154,21 @@ def movers(handles: Iterable[asyncio.Handle]) -> list[str]:
 
 def _could_go_on(task: asyncio.Task[Any]) -> bool:
     """Whether a task waits for nothing, or for something that is there."""
-    waiter = getattr(task, "_fut_waiter", None)  # What asyncio's own debug output shows as `wait_for`.
+    waiter = waiter_of(task)
     return waiter is None or waiter.done()
+
+
+def waiter_of(task: asyncio.Task[Any]) -> asyncio.Future[Any] | None:
+    """What a task waits for, which asyncio's own debug output shows as `wait_for`; None: it could go on."""
+    waiter: asyncio.Future[Any] | None = getattr(task, "_fut_waiter", None)
+    return waiter
 
 
 async def _hear(system: ActorSystem) -> bool:
     """One round trip through each actor process. Returns whether anything moved, or may have."""
+    pool = system._workers
+    if isinstance(pool, SimulatedWorkers):  # Their turns are in this loop, and what is on its way is known.
+        return await pool.arrived() or bool(_busy(system.node))
     moved = bool(_waiting(system))
     for worker in list(system._workers.by_cell.values()):
         moved |= await _ping(worker)
@@ -206,8 +217,10 @@ class FrameCounter:
 
 
 def _waiting(system: ActorSystem) -> list[str]:
-    """Actors in processes that have not handled what they were sent."""
+    """Actors in real processes that have not handled what they were sent."""
     found: list[str] = []
+    if isinstance(system._workers, SimulatedWorkers):
+        return found
     for cell in system._workers.by_cell:
         outlet = cell.more.outlet if cell.more is not None else None
         switch = switch_of(cell)

@@ -11,10 +11,10 @@ import contextlib
 import math
 import os
 import selectors
-import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Executor
+from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple
 
 from ..actors.errors import HoldfastError
@@ -93,22 +93,29 @@ class _JumpingSelector(selectors.DefaultSelector):
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         ready = super().select(0)
         if ready or (timeout is not None and timeout <= 0):
-            self.ticks += 1
-            if self.ticks > self._most_ticks:
-                self.ticks = 0
-                self._loop.stands_still(f"{self._most_ticks} ticks of the loop at virtual time {self.now:g} s")
+            self._tick()
+            return ready
+        ready = self._select_after_threads()
+        if not ready and self._loop.at_rest():
+            self._tick()
             return ready
         self.ticks = 0
-        return self._select_after_threads() or self._jump()
+        return ready or self._jump()
+
+    def _tick(self) -> None:
+        self.ticks += 1
+        if self.ticks > self._most_ticks:
+            self.ticks = 0
+            self._loop.stands_still(f"{self._most_ticks} ticks of the loop at virtual time {self.now:g} s")
 
     def _select_after_threads(self) -> list[tuple[selectors.SelectorKey, int]]:
         """What is ready once no thread is at work, or as soon as one of them wakes the loop."""
-        began = time.monotonic()
-        while names := self._threads.at_work() or ["an executor"] * bool(self.jobs):
+        began = monotonic()
+        while names := self._threads.at_work() or ["an executor"] * (self.jobs > self._loop.held_back()):
             ready = super().select(LOOK_AGAIN)
             if ready:
                 return ready
-            if time.monotonic() - began > LONGEST_WORK:
+            if monotonic() - began > LONGEST_WORK:
                 raise ThreadAtWork(tuple(names), LONGEST_WORK)
         return super().select(0)  # What the last of them did came before this.
 
@@ -135,7 +142,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     `time()` begins at `start` and moves only to the times of timers, exactly: `asyncio.sleep(3600)` returns at once,
     3600 s later. Everything on the loop's clock follows (`call_later`, `asyncio.timeout`, deadlines, back-off, restart
-    windows); `time.monotonic()` and `time.time()` do not.
+    windows); `monotonic()` and `time.time()` do not.
 
     - Work in threads takes no virtual time: the loop really waits for it before it jumps, however the thread was
       started (`run_in_executor`, pools, anyio, `threading`), and raises `ThreadAtWork` when one does not come to
@@ -176,6 +183,18 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         """As every loop; each run may take so many ticks and jumps."""
         self._virtual.ticks = self._virtual.jumps = 0
         super().run_forever()
+
+    async def rest(self) -> None:
+        """Let everything that is due have a turn."""
+        await asyncio.sleep(0)
+
+    def held_back(self) -> int:
+        """How many callbacks of other threads are held back until nothing else can happen."""
+        return 0
+
+    def at_rest(self) -> bool:
+        """Nothing can happen any more without more time. Returns whether something can now."""
+        return False
 
     @contextlib.contextmanager
     def hears_of_standstill(self, expire: Callable[[str], None]) -> Generator[None]:

@@ -6,6 +6,7 @@ the context is open. Production code has no hooks for it and pays nothing.
 
 from __future__ import annotations
 
+import math
 import random
 from collections.abc import Callable
 from types import TracebackType
@@ -14,6 +15,7 @@ from typing import Any, Literal, NamedTuple, get_args
 from ..actors.errors import HoldfastError, SpecError
 from ..actors.kernel.ref import ActorRef
 from ..system.system import ActorSystem
+from .schedules.choices import DELAY, FAULT, LEVELS, Choices
 
 Kind = Literal["crash", "hang", "delay", "drop", "duplicate", "reorder", "corrupt", "fail"]
 KINDS: tuple[str, ...] = get_args(Kind)
@@ -127,11 +129,12 @@ class Strikes:
         path: str,
         point: Point,
         odds: dict[Kind, float],
-        seconds: float,
+        seconds: float | tuple[float, float],
         after: int,
         times: int | None,
     ) -> None:
-        self.at, self.path, self.seconds, self.seed = point.name, path, seconds, faults.seed
+        self.at, self.path, self.seed = point.name, path, faults.seed
+        self.least, self.longest = seconds if isinstance(seconds, tuple) else (seconds, seconds)
         self.chances = 0
         self.is_over = False
         self.struck: list[Strike] = []
@@ -147,14 +150,29 @@ class Strikes:
         drawn = self.draw.random()  # At each chance, so that the next ones do not depend on what this one does.
         if self.chances <= self._after or (self._times is not None and len(self.struck) >= self._times):
             return None
-        for kind, odds in self._odds.items():
-            if drawn < odds:
-                strike = Strike(self.at, self.path, kind, self.chances, repr(what)[:200])
-                self.struck.append(strike)
-                self._faults.strikes.append(strike)
-                return kind
-            drawn -= odds
-        return None
+        index, kinds = 0, list(self._odds)
+        for number, kind in enumerate(kinds, 1):
+            if drawn < self._odds[kind]:
+                index = number
+                break
+            drawn -= self._odds[kind]
+        if self._faults.choices is not None:
+            index = self._faults.choices.draw(FAULT, len(kinds) + 1, index)
+        if not index:
+            return None
+        strike = Strike(self.at, self.path, kinds[index - 1], self.chances, repr(what)[:200])
+        self.struck.append(strike)
+        self._faults.strikes.append(strike)
+        return strike.kind
+
+    def delay(self) -> float:
+        """How long the delay that strikes now is, in seconds."""
+        if self.least == self.longest:
+            return self.least
+        level = self.draw.randrange(LEVELS)
+        if self._faults.choices is not None:
+            level = self._faults.choices.draw(DELAY, LEVELS, level)
+        return self.least + (self.longest - self.least) * level / (LEVELS - 1)
 
     def crash(self) -> InjectedCrash:
         """The exception of a crash that strikes now."""
@@ -192,12 +210,16 @@ class Strikes:
 class Faults:
     """Faults from one seed: the same seed strikes the same chances.
 
+    Args:
+        seed: what they are drawn from.
+        choices: of a simulated run: keeps what was drawn, and repeats it.
+
     Attributes:
         strikes: everything that struck so far, oldest first.
     """
 
-    def __init__(self, seed: int) -> None:
-        self.seed = seed
+    def __init__(self, seed: int, choices: Choices | None = None) -> None:
+        self.seed, self.choices = seed, choices
         self.strikes: list[Strike] = []
         self.installed: list[Strikes] = []
 
@@ -206,7 +228,7 @@ class Faults:
         target: ActorRef[Any] | ActorSystem,
         *,
         at: str,
-        seconds: float = 1.0,
+        seconds: float | tuple[float, float] = 1.0,
         after: int = 0,
         times: int | None = None,
         **odds: float,
@@ -216,7 +238,8 @@ class Faults:
         Args:
             target: the actor; for "process start" the system.
             at: a name in POINTS.
-            seconds: how long a delay is, on the loop's clock.
+            seconds: how long a delay is, on the loop's clock; (least, longest): each is drawn. What is reordered comes
+                after the next message, or so much later if there is none.
             after: this many chances are let pass first.
             times: at most so many strikes; None: no limit.
             odds: by kind of fault (crash, hang, delay, drop, duplicate, reorder, corrupt, fail), the probability with
@@ -231,6 +254,8 @@ class Faults:
         if point is None:
             raise SpecError("faults", f"at must be one of {', '.join(POINTS)}, not {at!r}")
         strikes = Strikes(self, _path(target), point, _checked(point, odds), seconds, after, times)
+        if not 0 <= strikes.least <= strikes.longest < math.inf:
+            raise SpecError("faults", f"seconds must be >= 0, or (least, longest), not {seconds!r}")
         INSTALL[at](strikes, target)
         self.installed.append(strikes)
         return strikes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Collection, Mapping
 from typing import Any
 
 from ..actors.errors import HoldfastError
@@ -10,11 +11,15 @@ from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAba
 from ..actors.exit_reasons import Exited, Hung, OutOfMemory, Signal
 from ..actors.kernel.cell import Host
 from ..actors.kernel.envelope import message_in
+from ..actors.kernel.node import Node
+from ..actors.process.worker_pool import Workers
 from ..supervision.spec import ChildSpec
 from ..system.system import ActorSystem
 from .clock import RealTimeNeeded, VirtualClockLoop
-from .leaks import Leaks
-from .sends import SendChecks
+from .guard.leaks import Leaks
+from .guard.sends import SendChecks
+from .schedules.control import ControlledLoop
+from .schedules.processes import SimulatedWorkers
 
 CRASHES = (ActorCrashed, HookFailed, LifeAbandoned)
 DEATHS = (Signal, Exited, OutOfMemory, Hung)
@@ -73,6 +78,7 @@ class GuardedSystem(ActorSystem):
         self._expected_crashes, self._expected_letters = Expected(), Expected()
         self._checks: SendChecks | None = None
         self._ends = False
+        self.are_exceptions_expected = False
 
     async def __aenter__(self) -> GuardedSystem:
         await super().__aenter__()
@@ -80,13 +86,20 @@ class GuardedSystem(ActorSystem):
         self._checks = SendChecks(self.node)
         return self
 
+    def _make_pool(self, node: Node) -> Workers:
+        loop = asyncio.get_running_loop()
+        return SimulatedWorkers(node, loop) if isinstance(loop, ControlledLoop) else super()._make_pool(node)
+
     def _host_for(self, spec: ChildSpec) -> Host:
-        if spec.isolation == "process" and isinstance(self.node.loop, VirtualClockLoop):
+        loop = self.node.loop
+        if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not isinstance(loop, ControlledLoop):
             raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")
         return super()._host_for(spec)
 
     async def shutdown(self) -> None:
         # What is still queued when the test is over was never waited for: its end is no news.
+        if not self._ends and self._checks is not None:
+            self._checks.last_look()
         self._ends = True
         try:
             await super().shutdown()
@@ -110,6 +123,42 @@ class GuardedSystem(ActorSystem):
         if self._checks is not None:
             self._checks.is_expected = True
 
+    def succeed(self, before: GuardedSystem) -> None:
+        """Go on for a system whose root was killed: what the test expects holds on, and what it has seen counts on."""
+        before._ends = True
+        before.look_away()
+        self.crashes, before.crashes = before.crashes, []
+        self.letters, before.letters = before.letters, []
+        self._expected_crashes, before._expected_crashes = before._expected_crashes, Expected()
+        self._expected_letters, before._expected_letters = before._expected_letters, Expected()
+        self.are_exceptions_expected = before.are_exceptions_expected
+        if self._checks is not None and before._checks is not None:
+            self._checks.expect_as(before._checks)
+
+    def expect_replies(self) -> None:
+        """Do not complain of replies that share an object with the state of the actor that gave them."""
+        if self._checks is not None:
+            self._checks.are_replies_expected = True
+
+    def expect_types(self) -> None:
+        """Let messages be sent whose fields have other types than they declare, from now on."""
+        if self._checks is not None:
+            self._checks.are_types_expected = True
+
+    def expect_exceptions(self) -> None:
+        """Do not complain of exceptions in tasks, futures and callbacks of this test that nobody has seen."""
+        self.are_exceptions_expected = True
+
+    @property
+    def asks(self) -> Mapping[asyncio.Future[Any], tuple[str, object]]:
+        """What was asked, and of whom, by the futures that somebody still holds."""
+        return {} if self._checks is None else self._checks.asks
+
+    def look_away(self) -> None:
+        """Do not look at messages from now on: that takes most of the time of a run with many."""
+        if self._checks is not None:
+            self._checks.close()
+
     def _note(self, event: Event) -> None:
         if isinstance(event, CRASHES) or (isinstance(event, ProcessDied) and isinstance(event.reason, DEATHS)):
             self.crashes.append(event)
@@ -121,7 +170,7 @@ class GuardedSystem(ActorSystem):
         found = [
             self._expected_crashes.problem("crashes", self.crashes),
             self._expected_letters.problem("dead letters", self.letters),
-            self._checks.problem() if self._checks is not None else None,
+            *(self._checks.problems() if self._checks is not None else ()),
         ]
         return [problem for problem in found if problem is not None]
 
@@ -155,11 +204,22 @@ def _brief(item: Any) -> str:
 
 
 class Guard:
-    """The systems of one test, and what must not be left when they have ended."""
+    """The systems of one test, and what must not be left when they have ended.
 
-    def __init__(self, *, leaks: bool = True) -> None:
-        self._leaks = Leaks() if leaks else None
+    Args:
+        allowed: kinds of leaks (`LEAKS`) that are not told.
+        exceptions: whether exceptions that nobody has seen are told.
+    """
+
+    def __init__(self, *, allowed: Collection[str] = (), exceptions: bool = True) -> None:
+        self._leaks = Leaks(allowed)
+        self._exceptions = exceptions
         self._systems: list[GuardedSystem] = []
+
+    @property
+    def first(self) -> GuardedSystem | None:
+        """The system that was started first, if there is one."""
+        return self._systems[0] if self._systems else None
 
     async def start(self, system: GuardedSystem) -> GuardedSystem:
         """Start a system; `close` ends it."""
@@ -174,15 +234,27 @@ class Guard:
             UnexpectedEnd: naming every leak, dead letter and crash that was not expected.
         """
         problems: list[str] = []
-        for system in reversed(self._systems):
-            try:
-                await system.__aexit__(None, None, None)
-            except asyncio.CancelledError:
-                raise
-            except HoldfastError as error:  # The tree failed; the others still have to end.
-                problems.append(f"system {system.name!r}: {error}")
-            problems += system.problems()
-        if self._leaks is not None:
-            problems += [*await self._leaks.told(), *self._leaks.outside()]
+        try:
+            unseen = self._unseen()
+            for system in reversed(self._systems):
+                try:
+                    await system.__aexit__(None, None, None)
+                except asyncio.CancelledError:
+                    raise
+                except HoldfastError as error:  # The tree failed; the others still have to end.
+                    problems.append(f"system {system.name!r}: {error}")
+                problems += system.problems()
+            self._leaks.forget(self._asks())  # What the end has refused was never waited for.
+            problems += [*unseen, *await self._leaks.told(), *self._leaks.outside()]
+        finally:
+            self._leaks.close()
         if problems:
             raise UnexpectedEnd(tuple(problems))
+
+    def _unseen(self) -> list[str]:
+        """Before the systems end: what is asked and queued then was never waited for."""
+        found = self._leaks.unseen(self._asks())
+        return found if self._exceptions and not any(one.are_exceptions_expected for one in self._systems) else []
+
+    def _asks(self) -> dict[asyncio.Future[Any], tuple[str, object]]:
+        return {future: asked for system in self._systems for future, asked in system.asks.items()}

@@ -63,7 +63,7 @@ class Late:
     """What faults hold back: it comes when its time is over, or when they end."""
 
     def __init__(self, strikes: Strikes) -> None:
-        self._seconds = strikes.seconds
+        self._strikes = strikes
         self._waiting: dict[asyncio.TimerHandle, Callable[[], None]] = {}
         strikes.at_end(self.come)
 
@@ -74,7 +74,7 @@ class Late:
             del self._waiting[handle]
             go()
 
-        handle = loop.call_later(self._seconds, come)
+        handle = loop.call_later(self._strikes.delay(), come)
         self._waiting[handle] = go
 
     def come(self) -> None:
@@ -90,7 +90,7 @@ class Admission:
 
     def __init__(self, strikes: Strikes, original: Any) -> None:
         self._strikes, self._original = strikes, original
-        self._held: deque[tuple[Cell, Any]] = deque()  # by a reordering: they come after the next message
+        self._held: deque[tuple[Cell, Any]] = deque()  # by a reordering: they come after the next message, or late
         self._late = Late(strikes)
         strikes.at_end(self._come)
 
@@ -106,6 +106,7 @@ class Admission:
                 return
             case "reorder":
                 self._held.append((cell, item))
+                self._late.hold(cell.node.loop, self._come)  # No other may come.
                 return
             case "corrupt":
                 item = self._corrupt(item)
@@ -249,7 +250,7 @@ class TurnFaults(TurnWatcher):
                 self._hung.append(hung)
                 return hung
             case "delay":
-                return asyncio.sleep(self._strikes.seconds)
+                return asyncio.sleep(self._strikes.delay())
             case _:
                 return None
 
@@ -324,7 +325,7 @@ class FrameFaults:
         counts = isinstance(frame, CARRIERS) and worker is not self._struck_down
         kind = self._strikes.next(frame) if counts else None
         if kind == "delay" and self._handle is None:
-            self._handle = self._cell.node.loop.call_later(self._strikes.seconds, self.let_go)
+            self._handle = self._cell.node.loop.call_later(self._strikes.delay(), self.let_go)
         if self._handle is not None:
             if getattr(frame, "body", None) is not None and self._strikes.at == "frame in":
                 frame.body = msgspec.Raw(bytes(frame.body))  # It lies in a buffer that is used again.
@@ -434,7 +435,7 @@ def process(strikes: Strikes, target: Target) -> None:
             case "fail":
                 raise ProcessUnavailable(f"injected fault at 'process start' (seed {strikes.seed})")
             case "delay":
-                await asyncio.sleep(strikes.seconds)
+                await asyncio.sleep(strikes.delay())
             case "crash":
                 worker = await take(again=again)
                 worker.forked.kill(signal.SIGKILL)

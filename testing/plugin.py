@@ -38,9 +38,10 @@ def _missing() -> None:
     pytest.fail("the fixtures of holdfast need pytest-asyncio: pip install 'holdfast[testing]'", pytrace=False)
 
 
-EXPECTABLE = ("dead_letters", "crashes", "leaks", "sends")
+EXPECTABLE = ("dead_letters", "crashes", "leaks", "sends", "replies", "types", "exceptions")
 LOOP_SCOPES = ("function", "class", "module", "package", "session")
 LOOPS = ("uvloop", "asyncio")
+PROFILES = ("ci", "nightly")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -58,12 +59,29 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default=[],
     )
 
+    group = parser.getgroup("holdfast", "simulated tests of actors (@simulate)")
+    group.addoption("--holdfast-seed", type=int, default=None, help="run only this seed")
+    group.addoption("--holdfast-seeds", type=int, default=None, help="run so many seeds, whatever a test says")
+    group.addoption("--holdfast-replay", metavar="FILE", default=None, help="run only the schedule in this file")
+    group.addoption(
+        "--holdfast-real",
+        action="store_true",
+        default=None,
+        help="run simulated tests on a real loop, in real time, with real processes",
+    )
+    group.addoption(
+        "--holdfast-profile",
+        choices=PROFILES,
+        default="ci",
+        help="ci: as many seeds as a test says; nightly: 25 times as many",
+    )
+
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
         "markers",
-        "holdfast(dead_letters=, crashes=, leaks=, sends=, **options): what this test of actors expects (True), or how "
-        "often (a number); other options go to ActorSystem",
+        "holdfast(dead_letters=, crashes=, leaks=, sends=, replies=, types=, exceptions=, **options): what this test "
+        "of actors expects (True), or how often (a number); other options go to ActorSystem",
     )
     _choose("holdfast_expect", config.getini("holdfast_expect"), EXPECTABLE)
     loops: list[str] = config.getini("holdfast_loops")
@@ -126,16 +144,14 @@ def pytest_pyfunc_call(pyfuncitem: pytest.Function) -> Generator[None, Any, Any]
 
 async def guard_of_the_test(request: pytest.FixtureRequest) -> AsyncIterator[Guard]:
     """The systems of one test, and the look at what they leave, in the loop of the test."""
-    from .guarded import Guard
+    from .guarded import Guard, GuardedSystem
 
-    guard = Guard(leaks=not _wanted(request.node).leaks)
+    wanted = _wanted(request.node)
+    guard = Guard(allowed=wanted.leaks, exceptions=not wanted.exceptions)
+    if "actor_system" in request.node.fixturenames:  # Started here, it needs no fixture of its own: these take time.
+        wanted.tell(await guard.start(GuardedSystem(**wanted.options)))
     yield guard
     await guard.close()
-
-
-async def system_of_the_test(actor_systems: ActorSystems) -> GuardedSystem:
-    """A system in the loop of the test."""
-    return await actor_systems()
 
 
 # A fixture of pytest-asyncio runs in the loop of one scope, and a test says by its marker which one it runs in.
@@ -143,13 +159,10 @@ for _scope in LOOP_SCOPES:
     globals()[f"holdfast_guard_{_scope}"] = async_fixture(
         guard_of_the_test, name=f"holdfast_guard_{_scope}", loop_scope=_scope
     )
-    globals()[f"holdfast_system_{_scope}"] = async_fixture(
-        system_of_the_test, name=f"holdfast_system_{_scope}", loop_scope=_scope
-    )
 
 
-def _in_loop_of_test(request: pytest.FixtureRequest, fixture: str) -> Any:
-    """The value of the fixture that runs in the same loop as the test.
+def _guard_in_loop_of_test(request: pytest.FixtureRequest) -> Guard:
+    """The guard that runs in the same loop as the test.
 
     Raises:
         pytest.fail.Exception: the test does not run in a loop of pytest-asyncio.
@@ -166,25 +179,19 @@ def _in_loop_of_test(request: pytest.FixtureRequest, fixture: str) -> Any:
         scope = marker.kwargs.get("loop_scope") or marker.kwargs.get("scope")
     if scope is None and request.config.pluginmanager.has_plugin("asyncio"):
         scope = request.config.getini("asyncio_default_test_loop_scope")
-    return request.getfixturevalue(f"{fixture}_{scope or 'function'}")
-
-
-@pytest.fixture
-def actor_guard(request: pytest.FixtureRequest) -> Guard:
-    """The systems of one test, and the look at what they leave."""
-    guard: Guard = _in_loop_of_test(request, "holdfast_guard")
+    guard: Guard = request.getfixturevalue(f"holdfast_guard_{scope or 'function'}")
     return guard
 
 
 @pytest.fixture
-def actor_systems(actor_guard: Guard, request: pytest.FixtureRequest) -> ActorSystems:
+def actor_systems(request: pytest.FixtureRequest) -> ActorSystems:
     """Start a system: `system = await actor_systems("name", store=...)`, as often as the test likes."""
     from .guarded import GuardedSystem
 
-    wanted = _wanted(request.node)
+    guard, wanted = _guard_in_loop_of_test(request), _wanted(request.node)
 
     async def start(name: str = "app", **options: Any) -> GuardedSystem:
-        system = await actor_guard.start(GuardedSystem(name, **{**wanted.options, **options}))
+        system = await guard.start(GuardedSystem(name, **{**wanted.options, **options}))
         wanted.tell(system)
         return system
 
@@ -194,7 +201,9 @@ def actor_systems(actor_guard: Guard, request: pytest.FixtureRequest) -> ActorSy
 @pytest.fixture
 def actor_system(request: pytest.FixtureRequest) -> GuardedSystem:
     """A running system of the test's own, on the test's loop; it ends with the test."""
-    system: GuardedSystem = _in_loop_of_test(request, "holdfast_system")
+    system = _guard_in_loop_of_test(request).first
+    if system is None:
+        pytest.fail("actor_system is to be a parameter of the test or of its fixtures", pytrace=False)
     return system
 
 

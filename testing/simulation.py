@@ -1,137 +1,382 @@
-"""Deterministic simulation: one seed decides the order in which ready actors run and which faults strike.
+"""Deterministic simulation: one seed decides everything in which two runs of a test can differ.
 
-A run is exact for actors in this process: on the virtual clock, one turn at a time, the next actor drawn by the seed.
-The same seed gives the same run; a failure names the seed that repeats it.
+Which actor has the next turn, which task of the program goes on, which of two timers at one moment fires first, which
+faults strike and how late what is late comes, `random`, `uuid` and the time: see `schedules`. A failure is repeated,
+shrunk, and shown.
 
-Source: the simulation testing of FoundationDB (Zhou et al. 2021, section 4) and of Turmoil and madsim (Rust).
+Source: the simulation testing of FoundationDB (Zhou et al. 2021, section 4); controlled schedules: Coyote, Shuttle.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import inspect
+import math
 import os
 import random
-from collections import deque
+import sys
+import tempfile
+import warnings
 from collections.abc import Callable, Coroutine, Iterable
+from pathlib import Path
 from typing import Any
+from unittest import SkipTest
 
-from ..actors.kernel import loop as run_loop
-from ..actors.kernel.cell import NEXT_URGENT, Cell
-from ..actors.kernel.message import message_of
-from ..checkpoint.life.recorded_inbox import Fed
-from .clock import virtual
+from ..actors.errors import AskFailed, SpecError
+from ..actors.kernel.cell import GONE
+from ..actors.kernel.mailbox import admit_gone
+from ..actors.kernel.node import Node
+from ..actors.kernel.ref import ActorRef, current
+from .barrier import waiter_of
 from .faults import Faults
+from .guard.leaks import Leaks
+from .guard.loop_leaks import LoopLeaks
 from .guarded import GuardedSystem, UnexpectedEnd
-from .leaks import Leaks, TaskLeaks
+from .schedules.charts import Recorder
+from .schedules.charts import as_html as chart_as_html
+from .schedules.charts import as_text as chart_as_text
+from .schedules.choices import (
+    MOMENT,
+    TURN,
+    Choices,
+    NotRepeatable,
+    Taken,
+    Translated,
+    as_text,
+    from_text,
+    repeated,
+    size,
+)
+from .schedules.control import Control, ControlledLoop, Root, inside
+from .schedules.disk import PATH, Latency, NoRootToKill, SimulatedDisk
+from .schedules.processes import SimulatedWorkers
+from .schedules.shrinking import shrink
+from .schedules.strategies import DEPTH, Strategy, mixed, strategy
+from .schedules.world import EPOCH, World
 from .swaps import Swaps
-from .turns import TurnWatcher, watch_turns
-from .wanted import running
+from .turns import Tracer, watch_turns
+from .wanted import Wanted, running
 
 SEED = "HOLDFAST_SEED"
 """The environment variable that picks one seed for every simulated test of a run."""
-EPOCH = 1_700_000_000.0
-"""Unix time at which each simulated run begins."""
-SHOWN = 20
-"""Turns before a failure that are told."""
+TWICE = 10
+"""Every so manieth run is made twice, to see whether its choices repeat it: the first one, too, and each failure."""
+REAL_RUNS = 3
+"""How often a test is run on a real loop, if nothing else is said."""
+NIGHTLY = 25
+"""So many times as many seeds are tried under the profile `nightly`."""
 
 
-class SeededQueue(deque[Cell]):
-    """The run queue: whoever is ready is drawn by the seed."""
-
-    def __init__(self, cells: Iterable[Cell], draw: random.Random) -> None:
-        super().__init__(cells)
-        self._draw = draw
-
-    def popleft(self) -> Cell:
-        if len(self) > 1:
-            self.rotate(-self._draw.randrange(len(self)))
-        return super().popleft()
+class NotExhausted(UserWarning):
+    """An exhaustive search has ended before it had tried every schedule."""
 
 
-class Simulation(TurnWatcher):
+Test = Callable[..., Coroutine[Any, Any, None]]
+Seconds = tuple[float, float]
+"""The least and the longest."""
+
+
+class Simulation:
     """One run of a system under a seed.
 
     Attributes:
         seed: what decides.
         trace: (address, what was handled) of each turn, in the order in which they began.
+        choices: what was chosen.
+        faults: those of the seed.
+        disk: the simulated store, which outlives the root; None: there is none.
+        escaped: what the run has used that no seed decides.
+        is_real: whether it is none, but a run on a real loop (`--holdfast-real`).
     """
 
-    def __init__(self, seed: int) -> None:
-        self.seed = seed
-        self.trace: list[tuple[str, str]] = []
-        self._draw = random.Random(seed)
-        self._swaps = Swaps()
-        self._ticks = 0.0
-        self._unwatch: Callable[[], None] | None = None
+    is_real = False
 
-    def install(self, system: GuardedSystem) -> None:
-        """From here on the seed decides. On a loop with a virtual clock, or the run is not exact."""
-        node = system.node
-        self._swaps.put(node, "ready", SeededQueue(node.ready, self._draw))
-        self._swaps.put(node, "most", 1)
-        self._swaps.put(node, "stride", run_loop.STRIDE)
-        self._swaps.put(node, "wall", lambda: EPOCH + node.loop.time())
-        self._swaps.put(run_loop, "MOST", 1)  # One turn, and the next actor is drawn.
-        self._swaps.put(run_loop, "clock", self._clock)
-        self._unwatch = watch_turns(node, self)
+    def __init__(self, choices: Choices, latency: Seconds = (0.0, 0.0), sync: Seconds = (0.0, 0.0)) -> None:
+        self.seed, self.latency, self._sync = choices.seed, latency, sync
+        self.disk: SimulatedDisk | None = None
+        self._store: object = None
+        self._roots: list[Root] = []  # each after the first has succeeded one that was killed
+        self._life = contextlib.AsyncExitStack()  # of the system that lives
+        self._make: Callable[[], GuardedSystem] = GuardedSystem
+        self._test: asyncio.Task[Any] | None = None
+        self._draw = random.Random(f"moments {choices.seed}")
+        self.choices = choices
+        self.trace: list[tuple[str, str]] = []
+        self.faults = Faults(choices.seed, choices)
+        self.escaped: tuple[str, ...] = ()
+        self._control = Control(choices, self.trace)
+        self._swaps = Swaps()
+        self._ends: list[Callable[[], None]] = []
+        self._surroundings = contextlib.ExitStack()
+
+    def enter(self, loop: asyncio.AbstractEventLoop) -> None:
+        """From here to `remove` the world is the seed's."""
+        world = self._surroundings.enter_context(World(self.seed, loop))
+        self._surroundings.callback(lambda: setattr(self, "escaped", tuple(world.escaped)))
+
+    async def begin(
+        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
+    ) -> GuardedSystem:
+        """Start the system; from here on the seed decides."""
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, ControlledLoop)
+        self._store = options.get("store")  # The marker of the test may name it, too.
+        if self._store == PATH:
+            self.disk = SimulatedDisk()
+        elif self._sync != (0.0, 0.0):
+            raise SpecError("simulate", f"sync= is how long a sync of the simulated store takes: give store={PATH!r}")
+
+        def make() -> GuardedSystem:
+            if self.disk is not None:
+                options["store"] = self.disk.open()
+            return GuardedSystem(**options)
+
+        self._make, self._test, self._looks = make, asyncio.current_task(), looks
+        loop.sync_seconds = Latency(self.choices, "syncs", self._sync)
+        if recorder is not None:
+            self._control.on_node = lambda node: self._ends.append(watch_turns(node, recorder))
+        root = await self._start()
+        self._control.install(root.node, loop)
+        return root.system
+
+    async def _start(self) -> Root:
+        """Start the next system, all of whose callbacks are marked as its root's."""
+        root = Root(self._make())
+        mark = inside.set(root)
+        self._roots.append(root)
+        try:
+            await self._life.enter_async_context(root.system)
+        except BaseException:
+            self._roots.remove(root)
+            _kill(root)  # What was begun of it must not go on.
+            raise
+        finally:
+            inside.reset(mark)
+        root.node, root.is_up = root.system.node, True
+        root.system._body = self._test
+        self._swaps.put(root.node, "wall", lambda: EPOCH + root.node.loop.time())
+        pool = root.system._workers
+        if isinstance(pool, SimulatedWorkers):
+            pool.draw_from(self.choices, self.latency)
+        if not self._looks:
+            root.system.look_away()
+        return root
+
+    async def end(self, kind: Any = None, error: Any = None, trace: Any = None) -> None:
+        """End the system that lives."""
+        await self._life.__aexit__(kind, error, trace)
+
+    def problems(self) -> list[str]:
+        """What happened and was not expected, as texts."""
+        return [problem for root in self._roots for problem in root.system.problems()]
+
+    def asks(self) -> dict[asyncio.Future[Any], tuple[str, object]]:
+        """What was asked, and of whom."""
+        return {future: asked for root in self._roots for future, asked in root.system.asks.items()}
+
+    @property
+    def are_exceptions_expected(self) -> bool:
+        """Whether exceptions may go unseen."""
+        return any(root.system.are_exceptions_expected for root in self._roots)
+
+    async def moment(self, turns: int = 100) -> None:
+        """Wait for a drawn number of turns of actors, and no longer than until nothing else can happen."""
+        if turns < 1:
+            raise ValueError(f"moment takes one turn or more, not {turns!r}")
+        number = self.choices.draw(MOMENT, turns + 1, self._draw.randint(0, turns))
+        if number:
+            await self._control.moment(number)
+
+    async def crash_root(self, *, power: bool = False) -> GuardedSystem:
+        """SIGKILL for the process in which the system lives, at this very moment; then it is started again.
+
+        Nothing of it runs again, and its actors' processes end with it. What it had written is in its store. The test,
+        its clients, lives on: what they wait for there (asks, sends, starts) fails with AskFailed. Refs, probes and
+        faults of the killed one are of no use any more. What a test expects (`expect_crashes`) holds for both.
+
+        Args:
+            power: a power cut. What was not synced is lost too, from some write on, which is drawn.
+
+        Returns:
+            The new system, with the same options, to which the program gives its tree. With `store="simulated"` it
+            finds what the killed one has left; without a store, nothing.
+
+        Raises:
+            NoRootToKill: it has another store, which cannot be left so; or an actor calls; or it is being started
+                again since it was killed.
+        """
+        if self._store not in (None, "memory", PATH):
+            raise NoRootToKill(f"its store is {self._store!r}, which the killed root would still hold: take {PATH!r}")
+        if current.get(None) is not None or inside.get() is not None:
+            raise NoRootToKill("an actor cannot do it, only the test")
+        before = self._roots[-1]
+        if not before.is_up:
+            raise NoRootToKill("it was killed, and is being started again")
+        if not before.is_dead:  # Else the start of its successor was given up, and this is another attempt.
+            self._life.pop_all()
+            _kill(before)
+        if self.disk is not None and power:
+            self.disk.cut_power(self.choices)
+        root = await self._start()
+        root.system.succeed(before.system)
+        self._control.add(root.node)
+        return root.system
+
+    def kill_process(self, ref: ActorRef[Any]) -> None:
+        """SIGKILL for the process of an actor, at this very moment.
+
+        Raises:
+            SpecError: it has none now.
+        """
+        worker = self._roots[-1].system._workers.of(ref._cell)
+        if worker is None:
+            raise SpecError(ref.path, "it has no process of its own")
+        worker.forked.kill()
+
+    def stop_recording(self) -> None:
+        """The test is over: how its actors end belongs to no chart."""
+        while self._ends:
+            self._ends.pop()()
 
     def remove(self) -> None:
         """Leave the system as it was."""
+        self._control.remove()
         self._swaps.undo()
-        if self._unwatch is not None:
-            self._unwatch()
-
-    def _clock(self) -> float:
-        """The run loop's measure of its slices: how long they are is the seed's, too, and not the machine's."""
-        self._ticks += run_loop.SLICE * self._draw.random()
-        return self._ticks
-
-    def begins(self, cell: Cell, item: Any) -> None:
-        self.trace.append((cell.path, _told(cell, item)))
+        self.stop_recording()
+        self._surroundings.close()
 
 
-def _told(cell: Cell, item: Any) -> str:
-    """What a turn handles, in a word or two."""
-    if item is NEXT_URGENT:
-        commands = cell.more.urgent if cell.more is not None else None
-        item = commands[0] if commands else item
-    elif isinstance(item, Fed):
-        feed = item.feed
-        return feed.name.rpartition(":")[2] or feed.kind
-    message = message_of(item)
-    return type(item if message is None else message).__name__
+class RealRun(Simulation):
+    """A simulated test on a real loop, with real processes: `pytest --holdfast-real`. Its seed decides only
+    its faults."""
+
+    is_real = True
+
+    def enter(self, loop: asyncio.AbstractEventLoop) -> None:
+        """The world stays as it is."""
+
+    async def begin(
+        self, options: dict[str, Any], recorder: Recorder | None = None, *, looks: bool = True
+    ) -> GuardedSystem:
+        if options.get("store") == PATH:
+            folder = self._surroundings.enter_context(tempfile.TemporaryDirectory(prefix="holdfast-"))
+            options["store"] = f"sqlite:{Path(folder, 'app.db')}"
+        system = await self._life.enter_async_context(GuardedSystem(**options))
+        self._roots.append(Root(system))
+        self._ends.append(watch_turns(system.node, Tracer(self.trace)))
+        return system
+
+    async def moment(self, turns: int = 100) -> None:
+        """Wait for a drawn number of ticks of the loop."""
+        for _ in range(self._draw.randint(0, turns)):
+            await asyncio.sleep(0)
+
+    async def crash_root(self, *, power: bool = False) -> GuardedSystem:
+        raise SkipTest(
+            "the root of a real run is the process of the test, which cannot be killed: without --holdfast-real"
+        )
+
+
+def _kill(root: Root) -> None:
+    """Nothing of a root, whose system may only have begun, runs any more; whoever waits for it hears of that."""
+    system, loop = root.system, asyncio.get_running_loop()
+    node = system._node
+    if node is None:
+        return
+    assert isinstance(loop, ControlledLoop)
+    root.node, system._body = node, None
+    pool = vars(system).get("_workers")  # None: it did not come so far.
+    if isinstance(pool, SimulatedWorkers):
+        pool.end()
+    loop.drop(root)
+    node.threads.close()
+    cells = [] if node.root is None else [node.root]
+    for cell in cells:  # It grows meanwhile.
+        cells += (cell.children or {}).values()
+        cell.state, cell.admit = GONE, admit_gone
+    for ask in node.deadlines.close():
+        if ask.sender is None:
+            ask.fail(AskFailed(ask.to.path, "the root was killed"))
+            if isinstance(ask.future, asyncio.Future):
+                ask.future.exception()  # A client that waits no more need not see it.
+    for task in asyncio.all_tasks():
+        waiter = waiter_of(task)
+        if waiter is not None and not waiter.done() and _is_called_by(task, system, node):
+            waiter.set_exception(AskFailed(f"/{node.name}", "the root was killed"))
+    system._node = system._root = None  # It is not running.
+
+
+def _is_called_by(task: asyncio.Task[Any], system: GuardedSystem, node: Node) -> bool:
+    """Whether a task waits within a call of a system or of a ref to one of its actors, such as `send`."""
+    coro: Any = task.get_coro()
+    while inspect.iscoroutine(coro):
+        called = coro.cr_frame.f_locals.get("self") if coro.cr_frame is not None else None
+        if called is system or (isinstance(called, ActorRef) and called._cell.node is node):
+            return True
+        coro = coro.cr_await
+    return False
 
 
 def simulate(
-    test: Callable[..., Coroutine[Any, Any, None]] | None = None,
+    test: Test | None = None,
     *,
     seeds: int = 200,
     seed: int | None = None,
+    replay: str | None = None,
+    strategy: str = "mixed",
+    depth: int = DEPTH,
+    latency: float | Seconds = 0.0,
+    sync: float | Seconds = 0.0,
     **options: Any,
 ) -> Any:
-    """Run an async test under many seeds, each on a virtual clock with a system of its own.
+    """Run an async test under many schedules, each on a virtual clock with a system of its own.
 
     The test takes `system` (a running GuardedSystem) and, if it names them, `faults` (the seed's `Faults`) and
     `simulation`. Whatever else it takes are fixtures; they are made once, for all seeds, and must not be async. What
     the marker `holdfast` says holds for each seed. `@given` may stand above: each example runs under all seeds.
 
+    A test is run more often than there are seeds: some runs are made twice, and a failing one is repeated while it is
+    shrunk. What it leaves in its surroundings must not change the next run.
+
     Args:
         test: the test; `@simulate` alone takes the defaults.
-        seeds: how many: 0, 1, ..., seeds - 1.
-        seed: only this one. The environment variable HOLDFAST_SEED says the same, for all tests.
-        options: for ActorSystem.
+        seeds: how many schedules at most: 0, 1, ..., seeds - 1. The option --holdfast-seeds says it for all tests,
+            and the profile `nightly` multiplies it by 25.
+        seed: only this one. The option --holdfast-seed or the environment variable HOLDFAST_SEED says the same, for
+            all tests.
+        replay: only this schedule, as a failure has printed it. The option --holdfast-replay FILE says the same.
+        strategy: mixed, random, pct, exhaustive, coverage.
+        depth: of PCT: how many events have to come in one order for the bug to show.
+        latency: seconds that what an actor's process and the root write to each other takes; (least, longest): drawn.
+        sync: seconds that a sync of the simulated store takes; (least, longest): drawn.
+        options: for ActorSystem. `store="simulated"`: a store in memory, which outlives the root (`crash_root`).
 
     Raises:
-        whatever the test raises, with a note that names the seed.
+        whatever the test raises, with a note that shows the run and says how to repeat it. NotRepeatable: two runs with
+        the same choices differ. SpecError, ValueError, TypeError: the arguments are wrong.
     """
     if test is None:
-        return functools.partial(simulate, seeds=seeds, seed=seed, **options)
+        return functools.partial(
+            simulate,
+            seeds=seeds,
+            seed=seed,
+            replay=replay,
+            strategy=strategy,
+            depth=depth,
+            latency=latency,
+            sync=sync,
+            **options,
+        )
+    late, syncs = _seconds("latency", latency), _seconds("sync", sync)
     if seeds < 1:
         raise ValueError(f"simulate takes one seed or more, not seeds={seeds}")
     if not inspect.iscoroutinefunction(test):
         raise TypeError(f"@simulate takes an `async def` test, not {test!r}")
+    search_of(strategy, depth)  # Refused where it stands.
+    if replay is not None:
+        from_text(replay)
     wanted = inspect.signature(test).parameters
     own = {name for name in ("system", "faults", "simulation") if name in wanted}
 
@@ -140,10 +385,16 @@ def simulate(
     @functools.wraps(test)
     def run(*args: Any, **fixtures: Any) -> None:
         given = signature.bind(*args, **fixtures).arguments  # By name: ours may stand in front of them.
-        leaks = None if running.get().leaks else Leaks()
-        for chosen in _seeds(seeds, seed):
-            run_seed(functools.partial(test, **given), chosen, own, options)
-        left = [] if leaks is None else leaks.outside()
+        leaks, called = Leaks(running.get().leaks), functools.partial(test, **given)
+        try:
+            if running.get().option("real"):
+                run_real(called, own, options, _said(running.get(), REAL_RUNS, seed))
+            else:
+                search = Search(called, own, options, search_of(strategy, depth), strategy, late, syncs)
+                search.run(seeds, seed, replay)
+        finally:
+            leaks.close()
+        left = leaks.outside()
         if left:
             raise UnexpectedEnd(tuple(left))
 
@@ -152,58 +403,375 @@ def simulate(
     return run
 
 
-def _seeds(count: int, chosen: int | None) -> Iterable[int]:
-    said = os.environ.get(SEED, "")
+def _seconds(name: str, given: float | Seconds) -> Seconds:
+    least, longest = seconds = given if isinstance(given, tuple) else (given, given)
+    if not 0 <= least <= longest < math.inf:
+        raise SpecError("simulate", f"{name} must be >= 0 seconds, or (least, longest), not {given!r}")
+    return seconds
+
+
+search_of = strategy
+"""The strategy of that name: `simulate` has a parameter that is called so, too."""
+
+
+class Search:
+    """The runs of one test, one schedule after the other, until one fails.
+
+    Args:
+        test: what is run; `own` are those of its parameters that come from here.
+        options: of its systems.
+        strategy: what gives the schedules.
+        named: its name.
+        latency, sync: as `simulate` says.
+
+    Attributes:
+        runs: how many schedules have been tried.
+        is_complete: whether there is no other schedule.
+    """
+
+    def __init__(
+        self,
+        test: Test,
+        own: Iterable[str],
+        options: dict[str, Any],
+        strategy: Strategy,
+        named: str = "mixed",
+        latency: Seconds = (0.0, 0.0),
+        sync: Seconds = (0.0, 0.0),
+    ) -> None:
+        self._latency, self._sync = latency, sync
+        self.runs = 0
+        self.is_complete = False
+        self._test, self._own, self._options = test, set(own), options
+        self._strategy, self._named = strategy, named
+        self._wanted = running.get()
+        self._failures = self._wanted.failures()
+
+    def run(self, seeds: int, seed: int | None = None, replay: str | None = None) -> None:
+        """Try the schedules that are asked for; those that have failed the last time come first.
+
+        Raises:
+            as `simulate`.
+        """
+        said = _said(self._wanted, seeds, seed, replay)
+        if isinstance(said, str):
+            number, taken = from_text(said)
+            self._try(repeated(number, taken))
+            self._forget(said)
+            return
+        if seed is None and self._failures is not None and len(said) > 1:
+            for text in self._failures.texts():
+                number, taken = from_text(text)
+                self._try(repeated(number, taken))
+                self._failures.drop(text)
+        for number in said:
+            if self._named == "pct" and len(said) == 1 and number:
+                self._learn(self._run(search_of("pct").choices(0) or Choices(0)))
+            choices = self._strategy.choices(number)
+            if choices is None:
+                self.is_complete = True
+                return
+            self.runs += 1
+            simulation = self._try(choices, looks=number % TWICE == 0)
+            self._learn(simulation)
+            if number % TWICE == 0:
+                self._check_repeats(simulation)
+        if self._named == "exhaustive" and self._strategy.choices(0) is not None:
+            text = f"{self.runs} schedules were tried, and there are more: raise seeds=, or make the system smaller"
+            warnings.warn(text, NotExhausted, stacklevel=3)
+
+    def _learn(self, simulation: Simulation) -> None:
+        self._strategy.learn(simulation.choices, simulation.trace)
+
+    def _forget(self, text: str) -> None:
+        if self._failures is not None:
+            self._failures.drop(text)
+
+    def _run(self, choices: Choices, recorder: Recorder | None = None, *, looks: bool = True) -> Simulation:
+        late, syncs = self._latency, self._sync
+        return run_schedule(
+            self._test, choices, self._own, self._options, recorder, looks=looks, latency=late, sync=syncs
+        )
+
+    def _try(self, choices: Choices, *, looks: bool = True) -> Simulation:
+        """One run; a failure is explained.
+
+        Raises:
+            whatever the test raises.
+        """
+        try:
+            return self._run(choices, looks=looks)
+        except BaseException as error:
+            if not _is_failure(error):
+                raise
+            failure = error
+        raise self._explained(failure)
+
+    def _explained(self, failure: BaseException) -> BaseException:
+        """The failure of the shortest schedule that shows it, with a note; or that it cannot be repeated."""
+        first: Simulation = failure.__simulation__  # type: ignore[attr-defined]
+        seed, kind = first.seed, _kind(failure)
+
+        def fails(taken: Taken) -> Taken | None:
+            try:
+                self._run(repeated(seed, taken))
+            except BaseException as error:
+                if not _is_failure(error):
+                    raise
+                again: Simulation = error.__simulation__  # type: ignore[attr-defined]
+                return again.choices.kept() if _kind(error) == kind else None
+            return None
+
+        taken = first.choices.kept()
+        recorder = Recorder()
+        if fails(taken) is None:
+            try:
+                again = self._run(repeated(seed, taken), recorder)
+            except BaseException as error:
+                if not _is_failure(error):
+                    raise
+                again = error.__simulation__  # type: ignore[attr-defined]
+            failure.add_note(_head(seed, None, self._is_of_seed()))
+            failure.add_note(str(_difference(first, again) or f"the run of seed {seed} fails only sometimes"))
+            return failure
+        if not _in_hypothesis():  # It shrinks what it has given, and calls again for each.
+            taken = shrink(self._translated(seed, taken), fails)
+        recorder = Recorder()
+        try:
+            self._run(repeated(seed, taken), recorder)
+        except BaseException as error:
+            if not _is_failure(error):
+                raise
+            shown = error if _kind(error) == kind else failure
+        else:
+            shown = failure
+        last: Simulation = shown.__simulation__  # type: ignore[attr-defined]
+        shown.add_note(self._note(last, taken, recorder))
+        return shown
+
+    def _translated(self, seed: int, taken: Taken) -> Taken:
+        """The same run, kept by who is held up in it."""
+        if TURN not in taken:
+            return taken
+        choices = Translated(seed, taken)
+        try:
+            self._run(choices)
+        except BaseException as error:
+            if not _is_failure(error):
+                raise
+        return choices.kept()
+
+    def _is_of_seed(self) -> bool:
+        return self._named in ("mixed", "random", "pct")
+
+    def _note(self, simulation: Simulation, taken: Taken, recorder: Recorder) -> str:
+        seed, text = simulation.seed, as_text(simulation.seed, taken)
+        lines = [_head(seed, text, self._is_of_seed())]
+        count = size(taken)
+        lines.append(
+            f"shrunk to {count} choice{'' if count == 1 else 's'} other than production's order"
+            if count
+            else "it needs no choice: the order of production shows it"
+        )
+        lines += [f"struck: {strike}" for strike in simulation.faults.strikes]
+        lines += [f"not the seed's: {what}" for what in simulation.escaped]
+        folder = None if self._failures is None else self._failures.folder()
+        chart = chart_as_text(recorder.rows)
+        if chart:
+            lines.append(chart)
+        if folder is not None and self._failures is not None:
+            self._failures.add(text)
+            lines += _written(folder, text, recorder, "\n".join(lines), self._wanted.nodeid)
+        return "\n".join(lines)
+
+    def _check_repeats(self, simulation: Simulation) -> None:
+        """Make a run again by its choices.
+
+        Raises:
+            NotRepeatable: it went another way.
+        """
+        try:
+            again = self._run(repeated(simulation.seed, simulation.choices.kept()))
+        except BaseException as error:
+            if not _is_failure(error):
+                raise
+            again = error.__simulation__  # type: ignore[attr-defined]
+            difference = _difference(simulation, again)
+            if difference is None:
+                error.add_note(f"the run of seed {simulation.seed} has passed, and failed when it was repeated")
+                raise
+            raise difference from error
+        difference = _difference(simulation, again)
+        if difference is not None:
+            raise difference
+
+
+def _written(folder: Path, text: str, recorder: Recorder, note: str, nodeid: str) -> list[str]:
+    """Write the schedule and the chart beside each other, and say where."""
+    folder.mkdir(parents=True, exist_ok=True)
+    schedule, chart = folder / "schedule.txt", folder / "chart.html"
+    schedule.write_text(text + "\n", encoding="utf-8")
+    chart.write_text(chart_as_html(recorder.rows, nodeid, note), encoding="utf-8")
+    return [f"all of it as a chart: {chart}", f"repeat it: pytest --holdfast-replay {schedule} '{nodeid}'"]
+
+
+def _head(seed: int, text: str | None, is_of_seed: bool) -> str:
+    parts = [f"@simulate(seed={seed}) or {SEED}={seed}"] if is_of_seed else []
+    if text is not None:
+        parts.append(f'@simulate(replay="{text}")')
+    return f"seed={seed}: repeat it with {', or '.join(parts)}"
+
+
+def _said(wanted: Wanted, seeds: int, seed: int | None, replay: str | None = None) -> range | str:
+    """The seeds to try, or the schedule to repeat."""
+    file: str | None = wanted.option("replay")
+    if file:
+        return Path(file).read_text(encoding="utf-8").strip()
+    if replay is not None:
+        return replay
+    chosen = wanted.option("seed")
+    said = os.environ.get(SEED, "") if chosen is None else str(chosen)
     if said:
-        return [int(said)]
-    return range(count) if chosen is None else [chosen]
+        try:
+            seed = int(said)
+        except ValueError:
+            raise SpecError("simulate", f"{SEED} must be a number, not {said!r}") from None
+    if seed is not None:
+        return range(seed, seed + 1)
+    count = wanted.option("seeds") or seeds * (NIGHTLY if wanted.option("profile") == "nightly" else 1)
+    return range(int(count))
 
 
-def run_seed(
-    test: Callable[..., Coroutine[Any, Any, None]], seed: int, own: Iterable[str], options: dict[str, Any]
-) -> Simulation:
-    """One run. Returns what happened.
+def _is_failure(error: BaseException) -> bool:
+    """Whether it is the outcome of a run, and not the wish to end the test."""
+    pytest = sys.modules.get("pytest")
+    failed = (Exception,) if pytest is None else (Exception, pytest.fail.Exception)
+    return isinstance(error, failed) and hasattr(error, "__simulation__")
+
+
+def _kind(error: BaseException) -> tuple[object, ...]:
+    """What makes two failures the same: the type, and the line of the test that raised."""
+    trace, last = error.__traceback__, ("", 0)
+    while trace is not None:
+        file = trace.tb_frame.f_code.co_filename
+        if not file.startswith(_LIBRARY) or f"{os.sep}tests{os.sep}" in file:
+            last = file, trace.tb_lineno
+        trace = trace.tb_next
+    return type(error), *last
+
+
+_LIBRARY = str(Path(__file__).resolve().parents[1])
+
+
+def _difference(first: Simulation, again: Simulation) -> NotRepeatable | None:
+    """Where two runs by the same choices went different ways; None: nowhere."""
+    ended = ("", "the end of the run")
+    longest = max(len(first.trace), len(again.trace))
+    for number in range(longest):
+        one = first.trace[number] if number < len(first.trace) else ended
+        other = again.trace[number] if number < len(again.trace) else ended
+        if one != other:
+            escaped = tuple(dict.fromkeys([*first.escaped, *again.escaped]))
+            return NotRepeatable(first.seed, number + 1, " ".join(one).strip(), " ".join(other).strip(), escaped)
+    return None
+
+
+def _in_hypothesis() -> bool:
+    hypothesis = sys.modules.get("hypothesis")
+    return hypothesis is not None and bool(hypothesis.currently_in_test_context())
+
+
+def run_seed(test: Test, seed: int, own: Iterable[str], options: dict[str, Any]) -> Simulation:
+    """One run under the schedule that `mixed` has for a seed. Returns what happened.
 
     Raises:
-        whatever the test raises, with a note that names the seed and shows the last turns.
+        whatever the test raises.
     """
-    simulation = Simulation(seed)
-    faults = Faults(seed)
+    return run_schedule(test, mixed(seed), set(own), options)
+
+
+def run_schedule(
+    test: Test,
+    choices: Choices,
+    own: set[str],
+    options: dict[str, Any],
+    recorder: Recorder | None = None,
+    *,
+    looks: bool = True,
+    latency: Seconds = (0.0, 0.0),
+    sync: Seconds = (0.0, 0.0),
+) -> Simulation:
+    """One run under one schedule. Returns what happened.
+
+    Args:
+        recorder: draws up what happens.
+        latency, sync: as `simulate` says.
+        looks: whether each message is looked at, as `GuardedSystem` does: that takes most of the time of a run.
+
+    Raises:
+        whatever the test raises; `error.__simulation__` is the run.
+    """
+    simulation = Simulation(choices, latency, sync)
     try:
-        with asyncio.Runner(loop_factory=virtual) as runner:
-            runner.run(_run(test, simulation, faults, set(own), options))
+        with asyncio.Runner(loop_factory=ControlledLoop) as runner:
+            runner.run(_run(test, simulation, own, options, recorder, looks))
     except BaseException as error:
-        if not isinstance(error, KeyboardInterrupt):
-            error.add_note(_note(simulation, faults))
+        error.__simulation__ = simulation  # type: ignore[attr-defined]
         raise
     return simulation
 
 
-async def _run(test: Any, simulation: Simulation, faults: Faults, own: set[str], options: dict[str, Any]) -> None:
-    wanted, leaks = running.get(), TaskLeaks()
+def run_real(test: Test, own: set[str], options: dict[str, Any], seeds: range | str) -> None:
+    """Runs on a real loop, with real processes.
+
+    Raises:
+        whatever the test raises, with a note.
+    """
+    for seed in (from_text(seeds)[0],) if isinstance(seeds, str) else seeds:
+        simulation = RealRun(Choices(seed))
+        try:
+            with asyncio.Runner() as runner:
+                runner.run(_run(test, simulation, own, options, None, looks=True))
+        except Exception as error:
+            error.add_note(
+                f"seed={seed}, on a real loop (--holdfast-real): its faults are the seed's, and nothing else"
+            )
+            raise
+
+
+async def _run(
+    test: Any, simulation: Simulation, own: set[str], options: dict[str, Any], recorder: Recorder | None, looks: bool
+) -> None:
+    wanted, faults = running.get(), simulation.faults
+    leaks, unseen = LoopLeaks(wanted.leaks), list[str]()
     options = {"seed": simulation.seed, **wanted.options, **options}
-    system = GuardedSystem(**options)
+    simulation.enter(asyncio.get_running_loop())
     try:
-        async with system:
+        try:
+            system = await simulation.begin(options, recorder, looks=looks)
             wanted.tell(system)
-            simulation.install(system)
-            given = {"system": system, "faults": faults, "simulation": simulation}
             try:
-                await test(**{name: given[name] for name in own})
-            finally:
-                faults.end()
+                given = {"system": system, "faults": faults, "simulation": simulation}
+                try:
+                    await test(**{name: given[name] for name in own})
+                    unseen = leaks.unseen(simulation.asks())
+                finally:
+                    faults.end()
+                    simulation.stop_recording()
+                    simulation.choices.end()
+            except BaseException:
+                await simulation.end(*sys.exc_info())
+                raise
+            await simulation.end()
+        finally:
+            simulation.remove()  # The end of the actors is still the seed's.
+        leaks.forget(simulation.asks())
+        problems = [
+            *simulation.problems(),
+            *([] if wanted.exceptions or simulation.are_exceptions_expected else unseen),
+            *await leaks.told(),
+        ]
     finally:
-        simulation.remove()  # The end of the actors is still the seed's.
-    problems = [*system.problems(), *([] if wanted.leaks else await leaks.told())]
+        leaks.close()
     if problems:
         raise UnexpectedEnd(tuple(problems))
-
-
-def _note(simulation: Simulation, faults: Faults) -> str:
-    seed, turns = simulation.seed, simulation.trace[-SHOWN:]
-    lines = [f"seed={seed}: repeat it with @simulate(seed={seed}) or {SEED}={seed}"]
-    lines += [f"struck: {strike}" for strike in faults.strikes]
-    if turns:
-        lines.append(f"the last {len(turns)} of {len(simulation.trace)} turns:")
-        lines += [f"  {path}: {what}" for path, what in turns]
-    return "\n".join(lines)

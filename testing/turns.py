@@ -13,7 +13,7 @@ from ..actors.kernel import loop as run_loop
 from ..actors.kernel.cell import Cell
 from ..actors.kernel.envelope import Handler, Table
 from ..actors.kernel.loop import RunLoop, Suspended
-from ..actors.kernel.message import Message
+from ..actors.kernel.message import Message, message_of
 from .swaps import Swaps
 
 Substitute = Callable[[Handler], Handler]
@@ -29,6 +29,17 @@ class TurnWatcher:
 
     def ended(self, cell: Cell, item: Any) -> None:
         """The turn is over: its handler has returned or raised, also if it had to wait in between."""
+
+
+class Tracer(TurnWatcher):
+    """Notes (address, what was handled) of each turn."""
+
+    def __init__(self, trace: list[tuple[str, str]]) -> None:
+        self._trace = trace
+
+    def begins(self, cell: Cell, item: Any) -> None:
+        message = message_of(item)
+        self._trace.append((cell.path, type(item if message is None else message).__name__))
 
 
 class Watched:

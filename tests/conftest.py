@@ -29,10 +29,12 @@ import hypothesis
 import psutil
 import pytest
 import pytest_asyncio
+import uvloop
 
 from holdfast.actors.kernel.loop import RunLoop
 from holdfast.actors.process.fork import fork_server, launch
-from holdfast.testing.leaks import Leaks, end_processes, is_of_test
+from holdfast.testing.guard.leaks import Leaks, end_processes, is_of_test
+from holdfast.testing.guard.loop_leaks import LoopLeaks
 from tests.pairs import covering
 from tests.waits import Waits
 from tests.warm import WarmServers
@@ -167,6 +169,12 @@ def no_orphan_left() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def pipe_of_libuv() -> None:
+    """Have the one pipe opened that libuv keeps for the whole process, before any test is asked what it has opened."""
+    uvloop.new_event_loop().close()
+
+
+@pytest.fixture(scope="session", autouse=True)
 def warm_servers(no_orphan_left: None) -> Iterator[WarmServers | None]:
     """Where fork servers come from, without the start of an interpreter for each (`tests/warm.py`)."""
     if "HOLDFAST_COLD" in os.environ or not sys.platform.startswith("linux"):
@@ -184,6 +192,7 @@ def nothing_left(warm_servers: WarmServers | None) -> Iterator[None]:
     This fixture is set up before the event loop of the test and torn down after it has been closed.
     """
     leaks = Leaks()
+    leaks.close()  # What is made meanwhile is the guard's to tell, in the tests that have one.
     yield
     left = leaks.processes()
     assert not left, f"the test left child processes: {left}"
@@ -233,7 +242,8 @@ async def no_task_left(monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[None]:
         # What looks at calls goes by the attribute, what keeps origins (futures, tasks, handles) asks the method.
         monkeypatch.setattr(loop, "_debug", True)
         monkeypatch.setattr(loop, "get_debug", lambda: False)
-    leaks = Leaks()
+    leaks = LoopLeaks()
+    leaks.close()
     yield
     left = await leaks.tasks()
     assert not left, f"the test left tasks running: {left}"

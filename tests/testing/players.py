@@ -55,3 +55,25 @@ class Counter(hf.Actor):
         await asyncio.sleep(message.seconds)
         self.total += 1
         return self.total
+
+
+class Put(hf.Message):
+    items: list[int]
+
+
+class Count(hf.Message[int]): ...
+
+
+class Shelf(hf.Actor):
+    """Counts what was put there."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    @hf.on(Put)
+    def put(self, message: Put) -> None:
+        self.count += len(message.items)
+
+    @hf.on(Count)
+    def tell_count(self, message: Count) -> int:
+        return self.count

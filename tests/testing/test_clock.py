@@ -8,6 +8,7 @@ import pytest
 
 from holdfast.testing.clock import NothingToWaitFor, VirtualClockLoop
 from holdfast.testing.clock import virtual as virtual_loop
+from holdfast.testing.threads import Threads
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -102,6 +103,30 @@ def test_a_thread_that_the_loop_does_not_know_may_still_wake_it() -> None:
 
     with asyncio.Runner(loop_factory=virtual_loop) as runner:
         assert runner.run(main()) == "woken"
+
+
+def test_of_two_threads_that_wake_each_other_one_is_always_at_work() -> None:
+    others = Threads()
+    gates = (threading.Lock(), threading.Lock())
+    ended = threading.Event()
+
+    def pass_on(own: threading.Lock, other: threading.Lock) -> None:
+        while not ended.is_set():
+            own.acquire()
+            other.release()
+
+    for gate in gates:
+        gate.acquire()
+    threads = [threading.Thread(target=pass_on, args=pair) for pair in (gates, gates[::-1])]
+    for thread in threads:
+        thread.start()
+    gates[0].release()
+    try:
+        assert all(others.at_work() for _ in range(1_000))
+    finally:
+        ended.set()
+        for thread in threads:
+            thread.join()
 
 
 def test_the_clock_begins_where_it_is_told_to() -> None:

@@ -179,6 +179,15 @@ async def test_admit_reorder_comes_after_the_next(probe: Probe, faults: Faults) 
     await probe.expect(Add(7))
 
 
+async def test_a_reordered_ask_that_stays_alone_is_late_and_not_lost(
+    actor_system: GuardedSystem, faults: Faults
+) -> None:
+    counter = actor_system.spawn(hf.start(Counter))
+    async with faults.on(counter, at="admit", reorder=1.0, seconds=0.01) as strikes:
+        assert await counter.ask(Add(1)) == 1
+    assert [strike.kind for strike in strikes.struck] == ["reorder"]
+
+
 async def test_admit_corrupt_is_another_value_of_the_same_type(probe: Probe, faults: Faults) -> None:
     async with faults.on(probe.ref, at="admit", corrupt=1.0):
         probe.ref.tell(Add(5))

@@ -5,36 +5,7 @@ import sys
 
 import pytest
 
-CONFTEST = """
-from importlib.metadata import entry_points
-pytest_plugins = [] if entry_points(group="pytest11", name="holdfast") else ["holdfast.testing.plugin"]
-"""
-HEAD = """
-import asyncio, pytest
-import holdfast as hf
-
-class Add(hf.Message[int]):
-    n: int
-
-class Many(hf.Message):
-    items: list[int]
-
-class Counter(hf.Actor):
-    def __init__(self):
-        self.total = 0
-
-    @hf.on(Add)
-    def add(self, message):
-        if message.n < 0:
-            raise ValueError("negative")
-        self.total += message.n
-        return self.total
-
-    @hf.on(Many)
-    async def many(self, message):
-        await asyncio.sleep(0)
-        message.items.append(1)
-"""
+from tests.testing.suites import CONFTEST, HEAD, run_suite
 
 
 @pytest.fixture
@@ -42,11 +13,7 @@ def suite(pytester: pytest.Pytester):
     """Runs test functions of a user; `options` go into the pytest configuration."""
 
     def run(tests: str, *args: str, **options: str) -> pytest.RunResult:
-        pytester.makeconftest(CONFTEST)
-        lines = {"asyncio_mode": "auto", "asyncio_default_fixture_loop_scope": "function", **options}
-        pytester.makeini("[pytest]\n" + "\n".join(f"{name} = {value}" for name, value in lines.items()))
-        pytester.makepyfile(HEAD + tests)
-        return pytester.runpytest_inprocess("-p", "no:cacheprovider", "-p", "no:randomly", *args)
+        return run_suite(pytester, HEAD + tests, *args, **options)
 
     return run
 
@@ -162,7 +129,7 @@ async def test_does_not_wait(actor_system):
     ],
 )
 def test_a_leak_fails_the_test(suite, leak: str, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("holdfast.testing.leaks.GRACE", 0.1)
+    monkeypatch.setattr("holdfast.testing.guard.leaks.GRACE", 0.1)
     result = suite(f"""
 kept = []
 
@@ -507,3 +474,44 @@ async def test_finds(system, n):
 """)
     result.assert_outcomes(passed=1, failed=1)
     result.stdout.fnmatch_lines(["*seed=0: repeat it*"])
+
+
+REAL = """
+import os
+from holdfast.testing import simulate
+
+@simulate(seeds=200, store="simulated", latency=(0.0, 1.0))
+async def test_nothing_is_lost(system, simulation, faults):
+    system.expect_crashes()
+    child = hf.child("counter", hf.start(Counter), isolation="process", recovery=hf.hybrid())
+    counter = await system.start(child)
+    assert simulation.is_real == (system.pid_of(counter) < 2**22)
+    asks = [counter.ask(Add(1)) for _ in range(5)]
+    await simulation.moment(20)
+    simulation.kill_process(counter)
+    assert sorted(await asyncio.gather(*asks)) == [1, 2, 3, 4, 5]
+    with open("seeds", "a") as seeds:
+        print(simulation.seed, simulation.is_real, faults.seed, bool(simulation.trace), file=seeds)
+
+@simulate(seeds=2, store="simulated")
+async def test_kills_the_root(system, simulation):
+    await simulation.crash_root()
+
+@simulate(seeds=2)
+async def test_fails(system, simulation):
+    assert simulation.seed < 1
+"""
+
+
+def test_simulated_tests_run_on_real_processes_too(suite) -> None:
+    result = suite(REAL, "--holdfast-real")
+    result.assert_outcomes(passed=1, skipped=1, failed=1)
+    result.stdout.fnmatch_lines(["*seed=1, on a real loop (--holdfast-real): its faults are the seed's*"])
+    with open("seeds", encoding="ascii") as seeds:
+        assert seeds.read().split("\n") == ["0 True 0 True", "1 True 1 True", "2 True 2 True", ""]
+    result = suite(REAL, "--holdfast-real", "--holdfast-seed", "7", "-k", "nothing")
+    result.assert_outcomes(passed=1, deselected=2)
+    with open("seeds", encoding="ascii") as seeds:
+        assert seeds.read().split("\n")[3:] == ["7 True 7 True", ""]
+    result = suite(REAL, "--holdfast-seeds", "2")
+    result.assert_outcomes(passed=2, failed=1)

@@ -7,7 +7,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.testing import Faults, GuardedSystem, Simulation, idle, simulate
-from holdfast.testing.simulation import run_seed
+from holdfast.testing.schedules.choices import Walk
+from holdfast.testing.simulation import run_schedule, run_seed
 
 
 class Note(hf.Message):
@@ -155,8 +156,8 @@ def test_one_turn_and_the_next_actor_is_drawn() -> None:
                 log.tell(Note(name))
         await idle(system)
 
-    orders = {"".join(path[-1] for path, what in run_seed(run, seed, {"system"}, {}).trace if what == "Note")
-              for seed in range(30)}  # fmt: skip
+    traces = [run_schedule(run, Walk(seed), {"system"}, {}).trace for seed in range(30)]
+    orders = {"".join(path[-1] for path, what in trace if what == "Note") for trace in traces}
     assert any(order not in ("aaaabbbb", "bbbbaaaa") for order in orders)
     assert len(orders) > 10
 

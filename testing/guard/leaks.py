@@ -1,0 +1,237 @@
+"""Leaks: tasks, timers, threads, child processes and open descriptors that a test leaves behind."""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import sys
+import sysconfig
+import threading
+import weakref
+from collections.abc import Callable, Collection, Iterable
+from time import monotonic
+from typing import Any, ClassVar
+
+import psutil
+
+from .loop_leaks import LoopLeaks
+from .thread_leaks import ThreadLeaks
+
+TOLD = {
+    "processes": "process was left running",
+    "threads": "thread was left running",
+    "descriptors": "descriptor was left open",
+}
+GRACE = 5.0
+"""Real seconds that processes told to end may take."""
+OPEN_FILES = "/proc/self/fd"
+RANDOM = ("/dev/urandom", "/dev/random")
+PAGES = ("-hands", "-hands (deleted)")
+"""Of a SQLite store: mapped until the last life is gone that has a word in it (`checkpoint/sqlite/in_hand.py`)."""
+INSTALLED = tuple({f"{sysconfig.get_paths()[name]}/" for name in ("stdlib", "purelib", "platlib")})
+KEPT = (
+    ("multiprocessing.resource_tracker", "_resource_tracker", "_fd"),
+    ("multiprocessing.forkserver", "_forkserver", "_forkserver_alive_fd"),
+)
+"""Modules that keep a descriptor to the end of the process: the object that has it, and its attribute."""
+
+
+class Leaks(LoopLeaks):
+    """As LoopLeaks, with child processes, threads and open descriptors."""
+
+    _with_reserve: ClassVar[weakref.WeakKeyDictionary[Any, int]] = weakref.WeakKeyDictionary()  # as loops outlive tests
+
+    def __init__(self, allowed: Collection[str] = ()) -> None:
+        super().__init__(allowed)
+        self._threads = ThreadLeaks()
+        self._children = pids()
+        self._files = identities()
+
+    def outside(self) -> list[str]:
+        """What is left outside of the loop, as problems."""
+        left = {"processes": self.processes, "threads": self.threads, "descriptors": self.files}
+        return [
+            f"a {TOLD[kind]}: {text}" for kind, look in left.items() if kind not in self._allowed for text in look()
+        ]
+
+    def processes(self) -> list[str]:
+        """Child processes that did not end in time; they are killed."""
+        if pids() <= self._children:
+            return []
+        return end_processes(lambda: [child for child in children() if child.pid not in self._children])
+
+    def threads(self) -> list[str]:
+        """Threads that the test has started, and that do not end."""
+        return self._threads.told()
+
+    def files(self) -> list[str]:
+        """What is open and was not."""
+        if not self._opened():
+            return []
+        gc.collect()  # What only a reference cycle holds is no leak.
+        return sorted(self._opened().values())
+
+    def _opened(self) -> dict[int, str]:
+        new = [number for number, file in identities().items() if self._files.get(number) != file]
+        targets = open_files() if new else {}
+        opened = {
+            number: targets[number] for number in new if number in targets and not is_kept(number, targets[number])
+        }
+        if opened and type(self._loop).__module__.partition(".")[0] == "uvloop":
+            for number in (*self._reserve(opened), *of_uvloop(opened)):
+                opened.pop(number, None)
+        return opened
+
+    def _reserve(self, opened: dict[int, str]) -> list[int]:
+        """The one /dev/null that uvloop opens with the first stream of each loop, as a reserve."""
+        if self._loop not in self._with_reserve:
+            found = next((number for number, target in opened.items() if target == "/dev/null"), None)
+            if found is None:
+                return []
+            self._with_reserve[self._loop] = found
+            return [found]
+        return [number for number in opened if number == self._with_reserve[self._loop]]
+
+    def close(self) -> None:
+        """Note nothing any more."""
+        super().close()
+        self._threads.close()
+
+
+def identities() -> dict[int, tuple[int, int]]:
+    """Which file is open, by number: its device and inode, which are read in a third of the time of its name."""
+    found: dict[int, tuple[int, int]] = {}
+    try:
+        numbers = os.listdir(OPEN_FILES)
+    except FileNotFoundError:  # There is no /proc.
+        return found
+    for name in numbers:
+        try:
+            status = os.fstat(int(name))
+        except OSError:  # the descriptor of the listing itself
+            continue
+        found[int(name)] = status.st_dev, status.st_ino
+    return found
+
+
+def open_files() -> dict[int, str]:
+    """What is open, by number; empty where there is no /proc."""
+    found: dict[int, str] = {}
+    try:
+        for name in os.listdir(OPEN_FILES):
+            try:
+                found[int(name)] = os.readlink(f"{OPEN_FILES}/{name}")
+            except FileNotFoundError:  # the descriptor of the listing itself
+                pass
+    except FileNotFoundError:
+        pass
+    return found
+
+
+def is_kept(number: int, target: str) -> bool:
+    """Whether a library opens this once and keeps it: a source of random numbers, what multiprocessing talks to its
+    own processes through, files of installed packages, and the page of a closed store that a ref still refers to.
+    """
+    if target in RANDOM or target.startswith(INSTALLED) or target.endswith(PAGES):
+        return True
+    for module, name, attribute in KEPT:
+        holder = getattr(sys.modules.get(module), name, None)
+        if getattr(holder, attribute, None) == number:
+            return True
+    return False
+
+
+def of_uvloop(opened: dict[int, str]) -> list[int]:
+    """The pair of sockets that uvloop makes for signals, anew with each `run_until_complete` of a loop.
+
+    One is the wake-up descriptor, and the inode of the other is its neighbour.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    wake = signal.set_wakeup_fd(-1)
+    signal.set_wakeup_fd(wake, warn_on_full_buffer=False)
+    sockets = {number: _inode(target) for number, target in opened.items() if target.startswith("socket:")}
+    if wake not in sockets:
+        return []
+    own = sockets.pop(wake)
+    return [wake, *sorted(sockets, key=lambda number: abs(sockets[number] - own))[:1]]
+
+
+def _inode(target: str) -> int:
+    return int(target.partition("[")[2].rstrip("]"))
+
+
+def children() -> list[psutil.Process]:
+    """Our living descendants.
+
+    By the kernel's own lists of children, where it keeps them: psutil reads every process of the machine, which is too
+    slow to be done twice for each test.
+    """
+    if (found := _descendants()) is None:
+        return [child for child in psutil.Process().children(recursive=True) if is_of_test(child)]
+    living: list[psutil.Process] = []
+    for pid in found:
+        try:
+            living.append(psutil.Process(pid))
+        except psutil.Error:
+            pass
+    return [child for child in living if is_of_test(child)]
+
+
+def pids() -> set[int]:
+    """The numbers of our descendants; those that have ended may be among them."""
+    found = _descendants()
+    return {child.pid for child in psutil.Process().children(recursive=True)} if found is None else set(found)
+
+
+def _descendants() -> list[int] | None:
+    """By the kernel's lists; None where it keeps none."""
+    found = _children_of("self")
+    if found is None:
+        return None
+    for pid in found:  # It grows meanwhile.
+        found += _children_of(str(pid)) or []
+    return found
+
+
+def _children_of(pid: str) -> list[int] | None:
+    found: list[int] = []
+    try:
+        threads = os.listdir(f"/proc/{pid}/task")
+    except OSError:
+        return None
+    for thread in threads:
+        try:
+            with open(f"/proc/{pid}/task/{thread}/children", "rb", buffering=0) as told:
+                found += map(int, told.read().split())
+        except FileNotFoundError:
+            if not os.path.exists(f"/proc/self/task/{os.getpid()}/children"):
+                return None
+        except OSError:  # The thread, or all of it, ended meanwhile.
+            pass
+    return found
+
+
+def is_of_test(child: psutil.Process) -> bool:
+    """Tell a test's process from the resource tracker, which multiprocessing keeps until the interpreter ends."""
+    try:
+        return child.is_running() and "multiprocessing.resource_tracker" not in " ".join(child.cmdline())
+    except psutil.Error:
+        return False
+
+
+def end_processes(find: Callable[[], Iterable[psutil.Process]]) -> list[str]:
+    """Give the processes that `find` finds time to end, kill the rest, and say which those were."""
+    deadline = monotonic() + GRACE
+    while (left := list(find())) and monotonic() < deadline:
+        psutil.wait_procs(left, timeout=0.05)
+    described: list[str] = []
+    for process in left:
+        try:
+            described.append(f"{process.pid} {process.status()} {' '.join(process.cmdline())}")
+            process.kill()
+        except psutil.Error:
+            pass
+    psutil.wait_procs(left, timeout=1.0)
+    return described

@@ -1,0 +1,164 @@
+"""Leaks in a loop: tasks and timers that a test leaves behind, and exceptions that nobody has seen."""
+
+from __future__ import annotations
+
+import asyncio
+import weakref
+from collections.abc import Callable, Collection, Iterable, Mapping
+from typing import Any
+
+from ..swaps import Swaps
+
+TASK_GRACE = 10
+"""Turns of the loop that a cancelled task may take to end."""
+LIBRARY = __name__.partition(".")[0] + "."
+MANY = 1000
+"""Timers that are noted before those that are over are forgotten."""
+
+
+class LoopLeaks:
+    """What there was in the running loop at the beginning, so that what is more at the end is a leak.
+
+    Made before the code under test begins, in the same loop. It notes futures, tasks and timers as they are made, by
+    exchanging methods of the loop, which `told` puts back: to look through all objects at the end would take longer
+    than the test. Where no loop runs there is nothing to note.
+
+    Args:
+        allowed: kinds of leaks that are not told.
+    """
+
+    def __init__(self, allowed: Collection[str] = ()) -> None:
+        self._allowed = frozenset(allowed)
+        self._swaps = Swaps()
+        self._timers: list[tuple[asyncio.Handle, float, Any]] = []  # with when they are due, and what they call
+        self._most = MANY
+        self._futures: weakref.WeakSet[asyncio.Future[Any]] = weakref.WeakSet()
+        self._lost: list[tuple[str, BaseException]] = []
+        self._loop: Any = None
+        try:
+            self._loop = asyncio.get_running_loop()
+        except RuntimeError:
+            self._tasks, self._handler = set[asyncio.Task[object]](), None
+            return
+        self._tasks = asyncio.all_tasks()
+        self._handler = self._loop.get_exception_handler()
+        for name, time in (("call_at", lambda: 0.0), ("call_later", self._loop.time)):
+            self._swaps.put(self._loop, name, self._noting_timers(getattr(self._loop, name), time))
+        for name in ("create_future", "create_task"):
+            self._swaps.put(self._loop, name, self._noting_futures(getattr(self._loop, name)))
+        self._swaps.put(self._loop, "call_exception_handler", self._noting(self._loop.call_exception_handler))
+
+    def _noting_timers(self, call: Any, origin: Callable[[], float]) -> Any:
+        timers = self._timers
+
+        def noted(time: float, callback: Any, *args: Any, **options: Any) -> asyncio.Handle:
+            handle: asyncio.Handle = call(time, callback, *args, **options)
+            timers.append((handle, origin() + time, callback))
+            if len(timers) > self._most:
+                timers[:] = self._waiting()
+                self._most = max(MANY, 2 * len(timers))
+            return handle
+
+        return noted
+
+    def _noting_futures(self, make: Any) -> Any:
+        add = self._futures.add
+
+        def noted(*args: Any, **options: Any) -> Any:
+            made = make(*args, **options)
+            add(made)
+            return made
+
+        return noted
+
+    def _noting(self, call: Any) -> Any:
+        def noted(context: dict[str, Any]) -> None:
+            error = context.get("exception")
+            if isinstance(error, BaseException) and self._loop.get_exception_handler() is self._handler:
+                self._lost.append((str(context.get("message", "")), error))
+            call(context)
+
+        return noted
+
+    def _waiting(self) -> list[tuple[asyncio.Handle, float, Any]]:
+        now = self._loop.time()
+        return [timer for timer in self._timers if timer[1] > now and not timer[0].cancelled()]
+
+    async def told(self) -> list[str]:
+        """What is left in this loop, as problems. Nothing is noted any more."""
+        self._swaps.undo()
+        tasks = await self.tasks()
+        timers = [] if "timers" in self._allowed else self.timers(of_tasks=not tasks)
+        return [
+            *(f"a task was left running: {text}" for text in tasks if "tasks" not in self._allowed),
+            *(f"a timer was left: {text}; cancel its handle" for text in timers),
+        ]
+
+    async def tasks(self) -> list[str]:
+        """Tasks that are not ours and still run after a few turns of the loop."""
+        for _ in range(TASK_GRACE):
+            if not self._new_tasks():
+                break
+            await asyncio.sleep(0)
+        return [repr(task) for task in self._new_tasks()]
+
+    def _new_tasks(self) -> set[asyncio.Task[object]]:
+        return asyncio.all_tasks() - self._tasks - {asyncio.current_task()}
+
+    def timers(self, *, of_tasks: bool = True) -> list[str]:
+        """Timers that still wait; with those that tasks sleep by, if these are not told of themselves."""
+        found: dict[int, str] = {}
+        for handle, when, callback in self._waiting():
+            name = getattr(callback, "__qualname__", repr(callback))
+            if not of_tasks and name == "_set_result_unless_cancelled":
+                continue
+            module = getattr(callback, "__module__", None) or ""
+            if not module.startswith(LIBRARY):  # What our own systems have yet to do is no fault of the test's.
+                found[id(handle)] = f"{module}.{name}".removeprefix(".") + f", due in {when - self._loop.time():.3g} s"
+        return list(found.values())
+
+    def unseen(self, asks: Mapping[asyncio.Future[Any], tuple[str, object]] | None = None) -> list[str]:
+        """Exceptions of tasks, futures and callbacks that nobody has seen, as problems.
+
+        Args:
+            asks: by their futures, whom they have asked and what.
+        """
+        found: dict[int, str] = {}
+        for message, error in self._lost:
+            found[id(error)] = f"{_text(error)} ({message})"
+        for future in list(self._futures):
+            failure = _unseen(future)
+            if failure is None or id(failure) in found:
+                continue
+            asked = (asks or {}).get(future)
+            what = repr(future) if asked is None else f"the ask of {asked[1]!r} to {asked[0]}"
+            found[id(failure)] = f"{_text(failure)} (nobody has awaited {what})"
+        hint = "await it, or if it is meant to be: actor_system.expect_exceptions()"
+        return [f"an exception was never seen: {text}; {hint}" for text in found.values()]
+
+    def forget(self, futures: Iterable[asyncio.Future[Any]]) -> None:
+        """Nobody need see how these have ended."""
+        for future in futures:
+            _unseen(future)
+
+    def close(self) -> None:
+        """Note nothing any more."""
+        self._swaps.undo()
+        self._timers.clear()
+
+
+def _unseen(future: asyncio.Future[Any]) -> BaseException | None:
+    """The exception of a future that nobody has retrieved yet; asyncio does not tell of it any more."""
+    if not future.done() or future.cancelled() or not getattr(future, "_log_traceback", False):
+        return None
+    error = future.exception()
+    future._log_traceback = False  # It is told here; asyncio would log it again
+    return error
+
+
+def _text(error: BaseException) -> str:
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    place = "" if trace is None else f", raised at {trace.tb_frame.f_code.co_filename}:{trace.tb_lineno}"
+    return f"{type(error).__name__}: {error}{place}"

@@ -1,0 +1,65 @@
+"""Threads that a test leaves running."""
+
+from __future__ import annotations
+
+import site
+import sys
+import sysconfig
+import threading
+from pathlib import Path
+from time import monotonic
+from types import FrameType
+from typing import Any
+
+from ..swaps import Swaps
+from ..threads import Onlooker
+
+GRACE = 2.0
+"""Real seconds that a thread which is about to end may take."""
+PACKAGE = str(Path(__file__).parents[2])
+LIBRARIES = (
+    *(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    *site.getsitepackages(),
+    *(f"{PACKAGE}/{room}/" for room in ("actors", "checkpoint", "ftm", "supervision", "system", "testing")),
+)
+"""Files that begin with one of these are a library's: a thread that they start is of a pool, or is kept for later."""
+
+
+class ThreadLeaks:
+    """Notes from here to `told` which threads are started, and where."""
+
+    def __init__(self) -> None:
+        self._started: list[tuple[threading.Thread, str]] = []
+        self._swaps = Swaps()
+        self._swaps.put(threading.Thread, "start", self._noting(threading.Thread.start))
+
+    def _noting(self, start: Any) -> Any:
+        started = self._started
+
+        def noted(thread: threading.Thread) -> None:
+            frame = _starter(sys._getframe(1))
+            if frame is not None and not isinstance(thread, Onlooker):
+                started.append((thread, f"{frame.f_code.co_filename}:{frame.f_lineno}"))
+            start(thread)
+
+        return noted
+
+    def told(self) -> list[str]:
+        """The threads that do not end; nothing is noted any more."""
+        self.close()
+        deadline = monotonic() + GRACE
+        for thread, _ in self._started:
+            if thread.is_alive() and thread is not threading.current_thread():
+                thread.join(max(0.0, deadline - monotonic()))
+        return [f"{thread.name}, started at {where}" for thread, where in self._started if thread.is_alive()]
+
+    def close(self) -> None:
+        """Note nothing any more."""
+        self._swaps.undo()
+
+
+def _starter(frame: FrameType | None) -> FrameType | None:
+    """Where a thread was started, beyond `threading` itself; None: by a library."""
+    while frame is not None and frame.f_globals.get("__name__") in ("threading", __name__):
+        frame = frame.f_back
+    return None if frame is None or frame.f_code.co_filename.startswith(LIBRARIES) else frame

@@ -1,0 +1,503 @@
+"""A loop whose every step is chosen: which actor has the next turn, and which task or callback of the loop runs next.
+
+What the loop promises is kept. Callbacks that are no steps of tasks are called in the order in which they were
+scheduled; a task's steps are in order among themselves; a timer comes when it is due. All else may come in any order:
+which task goes on first, which of two timers at one moment fires first, how many turns there are between two callbacks.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Hashable, Iterable
+from contextvars import Context, ContextVar
+from typing import TYPE_CHECKING, Any, Final, TypeVar, TypeVarTuple
+
+from ...actors.kernel import loop as run_loop
+from ...actors.kernel.cell import NEXT_URGENT, Cell
+from ...actors.kernel.message import Message, message_of
+from ...actors.kernel.node import Node
+from ...checkpoint.life.recorded_inbox import Fed
+from ..clock import VirtualClockLoop
+from ..swaps import Swaps
+from .disk import simulated
+from .strategies import ALL, Explored, Footprint
+
+if TYPE_CHECKING:
+    from ..guarded import GuardedSystem
+    from .choices import Choices
+
+T = TypeVar("T")
+Ts = TypeVarTuple("Ts")
+LOOP: Final = "the loop"
+"""All callbacks that are no steps of tasks: they keep their order."""
+TICKS: Final = 30_000
+"""Ticks of the loop at one moment of virtual time: as many as it makes in some seconds."""
+MOST_TURNS: Final = 64
+"""Turns after which the loop has a look at files and threads, if no callback of its own wants to run."""
+MOST: Final = run_loop.MOST
+LONGEST: Final = 1024
+"""Turns after which a callback has to be called, whatever the schedule says."""
+
+
+class Place:
+    """Where code of a simulated run runs: the root, or a process. Of a dead one nothing runs any more.
+
+    Attributes:
+        node: whose actors are there, once it has begun.
+        tasks: that were created there.
+        lane: what keeps its callbacks in order.
+        is_dead: whether it was killed, or has ended.
+    """
+
+    node: Node
+
+    def __init__(self) -> None:
+        self.tasks: weakref.WeakSet[asyncio.Task[Any]] = weakref.WeakSet()
+        self.lane: Hashable = self
+        self.is_dead = False
+
+
+class Root(Place):
+    """The process in which a system of the run lives. The test lives there, too, and outlives it.
+
+    Attributes:
+        is_up: whether its system has been started.
+    """
+
+    def __init__(self, system: GuardedSystem) -> None:
+        super().__init__()
+        self.system, self.is_up = system, False
+        self.lane = LOOP
+
+
+inside: ContextVar[Place | None] = ContextVar("holdfast simulated place", default=None)
+"""The place whose code runs; None: the test's."""
+
+
+class DrawnHandles(deque[asyncio.Handle]):
+    """The callbacks of a loop that are due. The next one to be called is chosen."""
+
+    control: Control | None = None
+    has_dead = False
+    """Whether places have died. What is scheduled for them later must not run either."""
+
+    def popleft(self) -> asyncio.Handle:
+        if self.has_dead:
+            for handle in self:
+                if is_dead(handle):
+                    handle.cancel()
+        if self.control is None or len(self) == 1:
+            return super().popleft()
+        return self.control.pick_handle(self)
+
+
+class DrawnCells(deque[Cell]):
+    """The run queue. The next actor to have a turn is chosen."""
+
+    def __init__(self, cells: Iterable[Cell], control: Control) -> None:
+        super().__init__(cells)
+        self._control = control
+
+    def popleft(self) -> Cell:
+        control = self._control
+        cell = control.next_cell
+        if cell is not None:
+            control.next_cell = None
+            self.remove(cell)
+        elif len(self) == 1:
+            cell = super().popleft()
+        else:
+            index = control.choices.turn(len(self), self._keys)
+            if control.goes_on(self):
+                index -= 1  # The last one is the first.
+            cell = self[index]
+            del self[index]
+        control.takes_turn(cell, self)
+        return cell
+
+    def _keys(self) -> list[Hashable]:
+        return list(self._control.in_order(self))
+
+
+class ControlledLoop(VirtualClockLoop):
+    """A loop with a virtual clock whose steps are chosen as soon as a `Control` is installed.
+
+    What a thread sends (`call_soon_threadsafe`) comes when nothing else can happen at that moment of virtual time, in
+    order: not when the machine lets the thread run.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(ticks=TICKS)
+        self.due = DrawnHandles()
+        self._ready = self.due
+        self._own_thread = threading.get_ident()
+        self._sent: deque[asyncio.Handle] = deque()  # by threads
+        self._resting: list[asyncio.Future[None]] = []
+        self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
+        self.sync_seconds: Callable[[], float] = float  # that a sync of a simulated store takes: none
+
+    async def rest(self) -> None:
+        """Wait until nothing else can happen at this moment: one tick more is not enough where others come first."""
+        if self.due.control is None:
+            await super().rest()
+            return
+        rest: asyncio.Future[None] = self.create_future()
+        self.rests(rest)
+        await rest
+
+    def rests(self, rest: asyncio.Future[None]) -> None:
+        """Have a future done when nothing else can happen at this moment, if it is not done before."""
+        self._resting.append(rest)
+
+    def held_back(self) -> int:
+        return len(self._sent)
+
+    def at_rest(self) -> bool:
+        sent, self._sent = self._sent, deque()
+        self.due.extend(sent)
+        if sent:
+            return True
+        resting, self._resting = self._resting, []
+        for rest in resting:
+            if not rest.done():
+                rest.set_result(None)
+        return bool(resting)
+
+    def call_soon_threadsafe(
+        self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
+    ) -> asyncio.Handle:
+        """As every loop from its own thread; another thread's callback waits until nothing else can happen."""
+        if threading.get_ident() == self._own_thread or self.due.control is None:
+            return super().call_soon_threadsafe(callback, *args, context=context)
+        handle = asyncio.Handle(callback, args, self, context)
+        self._sent.append(handle)
+        self._wake_up()
+        return handle
+
+    def _wake_up(self) -> None:
+        wake: Callable[[], None] = getattr(self, "_write_to_self")  # noqa: B009  # asyncio's own, which no stub has
+        wake()
+
+    def create_task(self, coro: Any, **options: Any) -> asyncio.Task[Any]:
+        task: asyncio.Task[Any] = super().create_task(coro, **options)
+        context: Context | None = options.get("context")
+        place = inside.get() if context is None else context.get(inside)
+        if place is not None:
+            place.tasks.add(task)
+        return task
+
+    def run_in_executor(self, executor: Any, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
+        """Run in a thread; but work for a simulated store is done here, when its drawn seconds are over."""
+        work = simulated(func, args)
+        if work is None:
+            return super().run_in_executor(executor, func, *args)
+        done: asyncio.Future[T] = self.create_future()
+        self.call_later(self.sync_seconds(), _do, done, work)
+        return done
+
+    def add(self, place: Place) -> None:
+        """A place begins to run in this loop."""
+        if self.due.control is not None:
+            self.due.control.add(place.node)
+
+    def drop(self, place: Place) -> None:
+        """Nothing of this place runs any more."""
+        place.is_dead = self.due.has_dead = True
+        timers: Any = self._scheduled
+        for handle in [*self.due, *timers, *self._sent]:
+            if is_dead(handle):
+                handle.cancel()
+        node = place.node
+        tasks: list[Any] = [*place.tasks, *(runner.task for runner in node._runners)]
+        for task in tasks:
+            asyncio._unregister_task(task)  # Nobody waits for it, and it cleans nothing up.
+            task._log_destroy_pending = False
+        self._dead += tasks
+        node.wake = _never  # type: ignore[method-assign]
+        node.idle_again = _no_more  # type: ignore[method-assign]
+        if self.due.control is not None:
+            self.due.control.drop(node)
+
+    def close(self) -> None:
+        """As every loop. What was left of killed processes is collected now: Python runs the `finally` of each then."""
+        dead, self._dead = self._dead, []
+        for task in dead:
+            try:
+                task.get_coro().close()
+            except BaseException:  # Whatever it raises, nobody is there to hear of it.
+                pass
+        super().close()
+
+    def scheduled_timers(self) -> int:
+        """How many timers there are."""
+        return len(self._scheduled)
+
+
+def is_dead(handle: Any) -> bool:
+    """Whether a callback belongs to a place that is dead."""
+    if handle._cancelled:
+        return False
+    place = handle._context.get(inside)
+    if place is not None:
+        return bool(place.is_dead)
+    owner = getattr(handle._callback, "__self__", None)  # Who is called for, by the test, may be dead as well.
+    return isinstance(owner, Node) and owner.wake is _never
+
+
+def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:
+    if done.cancelled():
+        return
+    try:
+        done.set_result(work())
+    except Exception as error:
+        done.set_exception(error)
+
+
+def _never() -> None:
+    """In place of the wake-up of a dead node."""
+
+
+def _no_more(runner: object) -> bool:
+    """A dead node needs no runner again."""
+    return False
+
+
+class Control:
+    """Has the choices of one run carried out, and notes the turns.
+
+    Attributes:
+        trace: (address, what was handled) of each turn, in the order in which they began.
+    """
+
+    def __init__(self, choices: Choices, trace: list[tuple[str, str]]) -> None:
+        self.choices, self.trace = choices, trace
+        self.next_cell: Cell | None = None
+        self._next_handle: asyncio.Handle | None = None
+        self._now = 0.0
+        self._has_stepped = False
+        self._turns = 0  # since a callback was called
+        self._last: Cell | None = None
+        self._in_a_row = 0  # turns of that one
+        self._names: dict[type, str] = {}
+        self._swaps = Swaps()
+        self._node: Node | None = None
+        self._nodes: dict[object, DrawnCells] = {}
+        self._draining: deque[Cell] = deque()
+        self.on_node: Callable[[Node], None] = lambda node: None
+        self._host = DrawnHandles()
+        self._moments: list[tuple[int, asyncio.Future[None]]] = []  # after so many turns of the run
+        self._before: dict[Cell, tuple[Any, ...]] = {}
+        self._touched: set[Hashable] = set()
+
+    def install(self, node: Node, loop: ControlledLoop) -> None:
+        """From here on every step is chosen."""
+        self._node, self._host, self._loop = node, loop.due, loop
+        if isinstance(self.choices, Explored):
+            self.choices.control = self
+        self._swaps.put(run_loop, "clock", self._clock)
+        for name in ("MOST", "STRIDE"):
+            self._swaps.put(run_loop, name, 1)
+        self.add(node)
+        loop.due.control = self
+
+    def add(self, node: Node) -> None:
+        """The turns of this node are chosen, too: the root's, or that of a process."""
+        cells = self._nodes[node] = DrawnCells(node.ready, self)
+        self._swaps.put(node, "ready", cells)
+        for name in ("most", "stride"):
+            self._swaps.put(node, name, 1)  # One turn, and a look at the clock, which is where the next step is chosen.
+        self.on_node(node)
+
+    def drop(self, node: Node) -> None:
+        """Nothing of this node has a turn any more."""
+        cells = self._nodes.get(node)
+        if cells is not None:
+            cells.clear()
+        if self.next_cell is not None and self.next_cell.node is node:
+            self.next_cell = None
+
+    def moment(self, turns: int) -> asyncio.Future[None]:
+        """A future that is done after so many turns, or when nothing else can happen."""
+        moment: asyncio.Future[None] = self._loop.create_future()
+        self._moments.append((len(self.trace) + turns, moment))
+        self._loop.rests(moment)
+        return moment
+
+    def remove(self) -> None:
+        """Let the rest of the run be as in production."""
+        self._host.control = None
+        self._swaps.undo()
+        for node, cells in self._nodes.items():
+            ready: deque[Cell] = node.ready  # type: ignore[attr-defined]
+            if ready is not cells:
+                ready.clear()
+                ready.extend(cells)
+
+    def goes_on(self, ready: deque[Cell]) -> bool:
+        """Whether the actor that had the last turn has another one first, as in production."""
+        return ready[-1] is self._last and self._in_a_row < MOST
+
+    def in_order(self, ready: deque[Cell]) -> list[Cell]:
+        """Who is ready, in the order in which production would let them run."""
+        return [ready[-1], *itertools.islice(ready, len(ready) - 1)] if self.goes_on(ready) else [*ready]
+
+    # -- steps --------------------------------------------------------------------------------------------------------
+
+    def takes_turn(self, cell: Cell, ready: DrawnCells) -> None:
+        """The cell has the next turn; `ready` are those of the same node."""
+        self._has_stepped, self._draining = True, ready
+        if self._moments:
+            self._tell_moments()
+        self._turns += 1
+        self._in_a_row = self._in_a_row + 1 if cell is self._last else 1
+        self._last = cell
+        queue = cell.queue
+        if queue:
+            item = queue[0]
+            kind = type(item)
+            name = self._names.get(kind)
+            if name is None:
+                name = told(cell, item)
+                if issubclass(kind, Message):
+                    self._names[kind] = name
+            self.trace.append((cell.path, name))
+        if self._before:
+            self._touched.add(cell.path)
+
+    def _tell_moments(self) -> None:
+        for number, moment in self._moments:
+            if number <= len(self.trace) and not moment.done():
+                moment.set_result(None)
+        self._moments = [one for one in self._moments if not one[1].done()]
+
+    def _clock(self) -> float:
+        """The run loop's measure of its slices: asked before the first turn and after each."""
+        if not self._has_stepped:
+            return self._now
+        self._has_stepped = False
+        ready = self._draining
+        if not ready:
+            return self._now
+        if not self._host:
+            if self._turns % MOST_TURNS == 0:
+                self._now += 1.0
+            return self._now
+        others = self._others(self._host)
+        count = len(ready)
+        cells = self.in_order(ready)
+        chosen = count if self._turns >= LONGEST else self._chosen(count + len(others), cells, others)
+        if chosen < count:
+            self.next_cell = cells[chosen]
+        else:
+            self._next_handle = others[chosen - count][1]
+            self._now += 1.0  # The slice is over.
+        return self._now
+
+    def _chosen(self, count: int, cells: list[Cell], others: list[tuple[Hashable, asyncio.Handle]]) -> int:
+        if count == 1:
+            return 0
+        return self.choices.turn(count, lambda: [*cells, *(key for key, _ in others)])
+
+    def pick_handle(self, due: DrawnHandles) -> asyncio.Handle:
+        """Take the callback that is called next from those that are due."""
+        handle, self._next_handle = self._next_handle, None
+        if handle is None or handle not in due:
+            handle = self._choose_handle(due)
+        due.remove(handle)
+        if self.next_cell is None:
+            self._turns = 0
+            if self._before:
+                self._touched |= ALL
+        return handle
+
+    def _choose_handle(self, due: DrawnHandles) -> asyncio.Handle:
+        options: list[tuple[Hashable, asyncio.Handle]] = []
+        for key, handle in self._others(due):
+            cells = self._nodes.get(key)
+            if cells:
+                options += [(cell, handle) for cell in self.in_order(cells)]
+            else:
+                options.append((key, handle))
+        if not options:  # All are cancelled.
+            return due[0]
+        index = 0 if len(options) == 1 else self.choices.turn(len(options), lambda: [key for key, _ in options])
+        key, handle = options[index]
+        if isinstance(key, Cell):
+            self.next_cell = key
+        return handle
+
+    def _others(self, due: DrawnHandles) -> list[tuple[Hashable, asyncio.Handle]]:
+        """What may be called next, with whose step it is."""
+        found: list[tuple[Hashable, asyncio.Handle]] = []
+        tasks: set[Hashable] = set()
+        nodes = self._nodes
+        loops: set[Hashable] = set()
+        handle: Any
+        for handle in due:
+            if handle._cancelled:
+                continue
+            owner = getattr(handle._callback, "__self__", None)
+            if type(owner) is Node and owner in nodes:
+                found.append((owner, handle))
+            elif isinstance(owner, asyncio.Task):
+                if owner not in tasks:
+                    tasks.add(owner)
+                    found.append((owner, handle))
+            elif type(handle) is asyncio.TimerHandle:
+                found.append((handle, handle))
+            else:
+                place = None if len(nodes) == 1 else handle._context.get(inside)
+                key = LOOP if place is None else place.lane
+                if key not in loops:
+                    loops.add(key)
+                    found.append((key, handle))
+        return found
+
+    # -- what a step touches ------------------------------------------------------------------------------------------
+
+    def begin_footprint(self) -> None:
+        """A step begins: note how everything is."""
+        self._before = self._state()
+        self._touched = set()
+        self._begun = self._outside()
+
+    def footprint(self) -> Footprint:
+        """The actors that the steps since then have touched; ALL if anything else may have changed."""
+        if self._outside() != self._begun or "all" in self._touched:
+            return ALL
+        after = self._state()
+        if after.keys() != self._before.keys():
+            return ALL
+        changed = {cell.path for cell, state in after.items() if state != self._before[cell]}
+        return frozenset(self._touched | changed)
+
+    def _outside(self) -> tuple[int, int]:
+        return len(self._host), self._loop.scheduled_timers()
+
+    def _state(self) -> dict[Cell, tuple[Any, ...]]:
+        assert self._node is not None
+        found: dict[Cell, tuple[Any, ...]] = {}
+        cells = [self._node.root] if self._node.root is not None else []
+        for cell in cells:  # It grows meanwhile.
+            more = cell.more
+            urgent = len(more.urgent or ()) if more is not None else 0
+            queue = cell.queue
+            found[cell] = (len(queue) if queue is not None else -1, cell.state, cell.life, urgent)
+            cells += (cell.children or {}).values()
+        return found
+
+
+def told(cell: Cell, item: Any) -> str:
+    """What a turn handles, in a word or two."""
+    if item is NEXT_URGENT:
+        commands = cell.more.urgent if cell.more is not None else None
+        item = commands[0] if commands else item
+    elif isinstance(item, Fed):
+        feed = item.feed
+        return feed.name.rpartition(":")[2] or feed.kind
+    message = message_of(item)
+    return type(item if message is None else message).__name__

@@ -1,0 +1,343 @@
+"""The store of a simulated run: a disk in memory that outlives a killed root, and a power cut as far as it was synced.
+
+What is written is there at once for whoever opens the store next. What was not synced is lost by a power cut, from some
+write on: which one is drawn. A sync takes drawn seconds.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import functools
+import random
+from array import array
+from collections.abc import Callable, Collection, Generator, Sequence
+from typing import Any, Final, NamedTuple
+
+from ...actors.errors import HoldfastError
+from ...checkpoint.journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
+from ...checkpoint.snapshot.shared_blocks import Segment
+from .choices import DELAY, LEVELS, LOSS, Choices
+
+PATH: Final = "simulated"
+"""The name of the store in errors, and in `simulate(store=...)`."""
+
+
+class Latency:
+    """Seconds that something takes, drawn anew each time.
+
+    Args:
+        choices: of the run.
+        what: the name of what takes them.
+        seconds: (least, longest).
+    """
+
+    def __init__(self, choices: Choices, what: str, seconds: tuple[float, float]) -> None:
+        self._choices, self._seconds = choices, seconds
+        self._draw = random.Random(f"{what} {choices.seed}")
+
+    def __call__(self) -> float:
+        """The seconds that it takes this time."""
+        least, longest = self._seconds
+        if least == longest:
+            return least
+        level = self._choices.draw(DELAY, LEVELS, int(self._draw.random() * LEVELS))
+        return least + (longest - least) * level / (LEVELS - 1)
+
+
+class Kept(NamedTuple):
+    """A snapshot, with the positions of all entries that it contains."""
+
+    data: bytes
+    turn: int
+    contains: frozenset[int]
+
+
+Change = tuple[str, tuple[Any, ...]]
+"""A method of `Contents`, and its arguments."""
+
+
+class Contents:
+    """All that a store holds. Each change is a method, so that it can be made twice: when it is written, and when it is
+    synced."""
+
+    def __init__(self) -> None:
+        self.last = 0
+        self.entries: dict[str, dict[int, Entry]] = {}
+        self.snapshots: dict[str, list[Kept]] = {}
+        self.blocks: dict[tuple[str, int], dict[tuple[int, int], bytes]] = {}
+        self.notes: dict[str, bytes] = {}
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> None:
+        """Add entries behind the last position."""
+        for address, entry in entries:
+            self.last += 1
+            self.entries.setdefault(address, {})[self.last] = entry
+
+    def cut(self, address: str, snapshot: bytes, drop: Collection[int], turn: int, keep: int) -> None:
+        """Add a snapshot, and forget what the oldest one that is kept contains."""
+        kept, entries = self.snapshots.setdefault(address, []), self.entries.get(address, {})
+        before = kept[-1].contains if kept else frozenset[int]()
+        kept.append(Kept(snapshot, turn, frozenset(p for p in entries if p in before or p in drop)))
+        del kept[:-keep]
+        for position in kept[0].contains:
+            entries.pop(position, None)
+
+    def erase(self, address: str) -> None:
+        """Forget an address."""
+        self.entries.pop(address, None)
+        self.snapshots.pop(address, None)
+        self.forget_blocks(address, ())
+
+    def keep_blocks(self, address: str, number: int, blocks: dict[tuple[int, int], bytes]) -> None:
+        """Add a pack of blocks."""
+        self.blocks[address, number] = blocks
+
+    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+        """Forget the packs of an address but those that are needed."""
+        self.blocks = {key: pack for key, pack in self.blocks.items() if key[0] != address or key[1] in needed}
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """Set or forget a note."""
+        self.notes.pop(key, None)
+        if value is not None:
+            self.notes[key] = value
+
+
+class SimulatedDisk:
+    """What outlives a root of a simulated run.
+
+    Attributes:
+        written: what whoever opens it next finds, unless the power is cut.
+        epoch: of the newest opening.
+        words: by address: 1 + the input in hand, or 0.
+    """
+
+    def __init__(self) -> None:
+        self.written = Contents()
+        self.epoch = 0
+        self.words: dict[str, array[int]] = {}
+        self._synced = Contents()
+        self._unsynced: list[list[Change]] = []  # what stands together is lost together
+
+    def open(self) -> SimulatedJournal:
+        """The store, opened anew: openings before it may write nothing any more."""
+        self.epoch += 1
+        return SimulatedJournal(self)
+
+    def write(self, change: str, *args: Any) -> None:
+        """Make a change."""
+        getattr(self.written, change)(*args)
+        self._unsynced.append([(change, args)])
+
+    @contextlib.contextmanager
+    def together(self) -> Generator[None, None, None]:
+        """All changes that are made inside are lost together, and undone if it raises."""
+        before, count = copy.deepcopy(self.written), len(self._unsynced)
+        try:
+            yield
+        except BaseException:
+            self.written = before
+            del self._unsynced[count:]
+            raise
+        made = self._unsynced[count:]
+        self._unsynced[count:] = [[change for changes in made for change in changes]]
+
+    def write_through(self, change: str, *args: Any) -> None:
+        """Make a change that no power cut undoes; it must have nothing to do with those that are not synced."""
+        for contents in (self.written, self._synced):
+            getattr(contents, change)(*args)
+
+    def newest(self) -> list[Change] | None:
+        """The last write that is not synced: a sync that begins now covers all up to it, and none that comes later."""
+        return self._unsynced[-1] if self._unsynced else None
+
+    def sync(self, newest: list[Change] | None) -> None:
+        """No power cut undoes what has been written up to this write; if it is synced already, nothing happens."""
+        count = next((number for number, made in enumerate(self._unsynced, 1) if made is newest), 0)
+        synced, self._unsynced = self._unsynced[:count], self._unsynced[count:]
+        for changes in synced:
+            for change, args in changes:
+                getattr(self._synced, change)(*args)
+
+    def cut_power(self, choices: Choices) -> None:
+        """Lose what was not synced, from some change on, and which inputs are in hand."""
+        count = len(self._unsynced)
+        lost = choices.draw(LOSS, count + 1, random.Random(f"loss {choices.seed}").randint(0, count)) if count else 0
+        del self._unsynced[count - lost :]
+        self.sync(self.newest())
+        self.written = copy.deepcopy(self._synced)
+        self.words = {}
+
+
+class Hands:
+    """Which inputs are in hand, in words that outlive the root."""
+
+    def __init__(self, words: dict[str, array[int]]) -> None:
+        self._begun = {address: word[0] - 1 for address, word in words.items()}
+        self._words = words
+
+    def begun(self, address: str) -> int:
+        """The input that was in hand when the store was opened; -1: none."""
+        return self._begun.get(address, -1)
+
+    def word(self, address: str) -> memoryview:
+        """The word of an address."""
+        return memoryview(self._words.setdefault(address, array("Q", [0])))
+
+
+class SimulatedJournal:
+    """One opening of a simulated disk; see `Journal`."""
+
+    durable = True
+
+    def __init__(self, disk: SimulatedDisk) -> None:
+        self.epoch, self.in_hand = disk.epoch, Hands(disk.words)
+        self.disk = disk
+        self._covers: tuple[list[Change] | None] | None = None
+        self._is_open = True
+
+    @property
+    def _contents(self) -> Contents:
+        return self.disk.written
+
+    def _check(self) -> None:
+        if not self._is_open:
+            raise StoreFailed(PATH, "it is closed")
+        if self.epoch != self.disk.epoch:
+            raise StaleEpoch(PATH, self.epoch, self.disk.epoch)
+
+    def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
+        """See `Journal`."""
+        self._check()
+        for _, entry in entries:
+            if not isinstance(entry, tuple) or not entry or not isinstance(entry[0], str):
+                raise TypeError(f"{entry!r} is no entry")
+            _check_entry(entry)
+        first = self._contents.last + 1
+        self.disk.write("append", list(entries))
+        return list(range(first, first + len(entries)))
+
+    def sync(self) -> None:
+        """See `Journal`."""
+        self._check()
+        self.disk.sync(self.disk.newest() if self._covers is None else self._covers[0])
+
+    @contextlib.contextmanager
+    def covering(self, newest: list[Change] | None) -> Generator[None, None, None]:
+        """Have a sync that is made inside cover nothing behind this write."""
+        self._covers = (newest,)
+        try:
+            yield
+        finally:
+            self._covers = None
+
+    def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
+        """See `Journal`."""
+        self._check()
+        dropped = drop if isinstance(drop, range) else frozenset(drop)
+        self.disk.write("cut", address, bytes(snapshot), dropped, turn, keep)
+
+    @contextlib.contextmanager
+    def together(self) -> Generator[None, None, None]:
+        """See `Journal`."""
+        self._check()
+        with self.disk.together():
+            yield
+
+    def load(self, address: str, *, older: int = False) -> Saved:
+        """See `Journal`."""
+        contents = self._contents
+        kept, entries = contents.snapshots.get(address), contents.entries.get(address, {})
+        if not kept:
+            return Saved(None, 0, list(entries.items()))
+        newest = kept[max(0, len(kept) - 1 - int(older))]
+        rest = [(position, entry) for position, entry in entries.items() if position not in newest.contains]
+        return Saved(newest.data, newest.turn, rest)
+
+    def erase(self, address: str) -> None:
+        """See `Journal`."""
+        self._check()
+        self.disk.write("erase", address)
+
+    def keep_blocks(
+        self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
+    ) -> None:
+        """See `Journal`."""
+        self._check()
+        pack = {(offset, len(block)): bytes(block) for offset, block in blocks}
+        self.disk.write_through("keep_blocks", address, number, pack)
+
+    def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
+        """See `Journal`."""
+        pack = self._contents.blocks.get((address, number), {})
+        missing = [place for place in places if place not in pack]
+        if missing:
+            raise DamagedStore(PATH, address, None, f"pack {number} has no block at {missing[0]}")
+        return Segment.of(number, [(place[0], pack[place]) for place in places])
+
+    def forget_blocks(self, address: str, needed: Collection[int]) -> None:
+        """See `Journal`."""
+        self._check()
+        self.disk.write("forget_blocks", address, frozenset(needed))
+
+    def addresses(self) -> list[str]:
+        """See `Journal`."""
+        contents = self._contents
+        used = {*contents.snapshots, *(address for address, _ in contents.blocks)}
+        return sorted(used | {address for address, entries in contents.entries.items() if entries})
+
+    def note(self, key: str, value: bytes | None) -> None:
+        """See `Journal`."""
+        self._check()
+        self.disk.write("note", key, None if value is None else bytes(value))
+
+    def noted(self, key: str) -> bytes | None:
+        """See `Journal`."""
+        return self._contents.notes.get(key)
+
+    def notes(self, prefix: str) -> dict[str, bytes]:
+        """See `Journal`."""
+        return {key: value for key, value in self._contents.notes.items() if key.startswith(prefix)}
+
+    def close(self) -> None:
+        """See `Journal`. In good order nothing is in hand."""
+        if self._is_open and self.epoch == self.disk.epoch:
+            self.disk.sync(self.disk.newest())
+            self.disk.words = {}
+        self._is_open = False
+
+
+def _check_entry(part: object) -> None:
+    if isinstance(part, tuple):
+        for one in part:
+            _check_entry(one)
+    elif part is not None and not isinstance(part, (int, float, str, bytes)):
+        raise TypeError(f"an entry cannot hold {part!r}")
+
+
+class Work:
+    """Work for a simulated store, which needs no thread: it begins now, and is done when its seconds are over."""
+
+    def __init__(self, journal: SimulatedJournal, call: Callable[[], Any]) -> None:
+        self._disk, self._journal, self._call = journal.disk, journal, call
+        self._newest = journal.disk.newest()
+
+    def __call__(self) -> Any:
+        """Do it: a sync covers what had been written when it began."""
+        with self._journal.covering(self._newest):
+            return self._call()
+
+
+def simulated(call: Callable[..., Any], args: tuple[Any, ...]) -> Work | None:
+    """The work that this call is, if it is one for a simulated store."""
+    function = call.args[0] if isinstance(call, functools.partial) and call.args else call  # of `asyncio.to_thread`
+    owner = getattr(function, "__self__", None)
+    journal = getattr(owner, "_engine", owner)
+    return Work(journal, functools.partial(call, *args)) if isinstance(journal, SimulatedJournal) else None
+
+
+class NoRootToKill(HoldfastError, text="the root cannot be killed: {why}"):
+    """`crash_root` was called where it cannot do what it says."""
+
+    why: str

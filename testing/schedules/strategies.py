@@ -1,0 +1,293 @@
+"""Strategies: in which order the schedules of a test are tried.
+
+- `mixed` (the default): a run as in production, then random walks of several tempers and PCT of several depths.
+- `random`: whoever could run is as likely as any other.
+- `pct`: random priorities and `depth - 1` moments at which one falls. Among n tasks and k choices it finds a bug that
+  needs `depth` events in one order with a probability of at least 1 / (n k^(depth - 1)) in each run.
+- `exhaustive`: every schedule, except those that differ only in the order of turns that have nothing to do with each
+  other. For small systems whose actors share nothing but messages.
+- `coverage`: random changes to schedules that brought a new order of messages.
+
+Source: PCT: Burckhardt et al., ASPLOS 2010; sleep sets: Godefroid, LNCS 1032 (1996), chapter 5; mixing strategies and
+feedback: Coyote (Deligiannis et al., TACAS 2023) and AFL.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Hashable, Sequence
+from typing import TYPE_CHECKING, Final, Literal, Protocol, get_args
+
+from ...actors.errors import SpecError
+from .choices import TURN, Choices, Keys, Production, Replay, Taken, Walk
+
+if TYPE_CHECKING:
+    from .control import Control
+
+Name = Literal["mixed", "random", "pct", "exhaustive", "coverage"]
+NAMES: Final = get_args(Name)
+DEPTH: Final = 3
+TEMPERS: Final = (0.0, 0.9)
+"""How likely the next in line runs without a draw, in the random walks of `mixed`."""
+LONG: Final = 14
+"""PCT without a run to measure expects up to 2**LONG choices."""
+FAIR: Final = 200
+"""Choices in a row after which PCT puts whoever has had them behind all others: it may wait for one of them."""
+CHANGES: Final = 8
+"""At most so many choices are changed in a schedule that `coverage` builds on."""
+
+Trace = Sequence[tuple[str, str]]
+Footprint = frozenset[Hashable]
+"""The actors that one step has touched."""
+ALL: Final[Footprint] = frozenset({"all"})
+"""A step whose effects are not known to be messages alone."""
+
+
+class Strategy(Protocol):
+    """Gives one schedule after the other, and may learn from each run."""
+
+    def choices(self, seed: int) -> Choices | None:
+        """Those of the next run; None: every schedule has been tried."""
+        ...
+
+    def learn(self, choices: Choices, trace: Trace) -> None:
+        """The run is over."""
+        ...
+
+
+class EachSeed:
+    """A schedule per seed, whatever the runs before were like."""
+
+    def __init__(self, made: Callable[[int], Choices]) -> None:
+        self._made = made
+
+    def choices(self, seed: int) -> Choices | None:
+        return self._made(seed)
+
+    def learn(self, choices: Choices, trace: Trace) -> None:
+        """Nothing."""
+
+
+def strategy(name: str, depth: int = DEPTH) -> Strategy:
+    """The strategy of that name.
+
+    Raises:
+        SpecError: there is none, or `depth` is not 1 or more.
+    """
+    if depth < 1:
+        raise SpecError("simulate", f"depth must be 1 or more, not {depth!r}")
+    match name:
+        case "mixed":
+            return EachSeed(mixed)
+        case "random":
+            return EachSeed(Walk)
+        case "pct":
+            return Pct(depth)
+        case "exhaustive":
+            return Exhaustive()
+        case "coverage":
+            return Coverage()
+        case _:
+            raise SpecError("simulate", f"strategy must be one of {', '.join(NAMES)}, not {name!r}")
+
+
+def mixed(seed: int) -> Choices:
+    """By turns: production for seed 0, then walks and PCT."""
+    if seed == 0:
+        return Production(seed)
+    number = seed % 6
+    if number < len(TEMPERS):
+        return Walk(seed, TEMPERS[number])
+    draw = random.Random(f"pct of mixed {seed}")
+    return Priorities(seed, 1 + draw.randrange(4), 2 ** draw.randint(3, LONG))
+
+
+class Priorities(Choices):
+    """PCT: whoever has the highest priority runs; at `depth - 1` moments it falls below all others.
+
+    Args:
+        length: how many choices the run is expected to have.
+    """
+
+    def __init__(self, seed: int, depth: int, length: int) -> None:
+        super().__init__(seed)
+        self._draw = draw = random.Random(f"pct {seed}")
+        self._changes: dict[int, float] = {draw.randint(1, max(1, length)): -float(level) for level in range(1, depth)}
+        self._priorities: dict[Hashable, float] = {}
+        self._last: Hashable = None
+        self._in_a_row = 0
+        self._lowest = -float(depth)
+
+    def choose(self, count: int, keys: Keys) -> int:
+        options, priorities = keys(), self._priorities
+        for key in options:
+            if key not in priorities:
+                priorities[key] = self._draw.random()
+        best = max(range(count), key=lambda index: priorities[options[index]])
+        falls_to = self._changes.pop(self.steps, None)
+        self._in_a_row = self._in_a_row + 1 if options[best] == self._last else 1
+        if falls_to is None and self._in_a_row > FAIR:
+            self._lowest -= 1.0
+            falls_to, self._in_a_row = self._lowest, 1
+        if falls_to is not None:
+            priorities[options[best]] = falls_to
+            best = max(range(count), key=lambda index: priorities[options[index]])
+        self._last = options[best]
+        return best
+
+
+class Pct:
+    """PCT of one depth. The first run measures how many choices there are."""
+
+    def __init__(self, depth: int) -> None:
+        self._depth, self._length = depth, 0
+
+    def choices(self, seed: int) -> Choices | None:
+        return Priorities(seed, self._depth, self._length) if self._length else Production(seed)
+
+    def learn(self, choices: Choices, trace: Trace) -> None:
+        self._length = max(self._length, choices.steps, 1)
+
+
+class Coverage:
+    """Changes at random what has brought something new: two messages next to each other at an actor in a new order."""
+
+    def __init__(self) -> None:
+        self._seen: set[tuple[str, str, str]] = set()
+        self._corpus: list[Taken] = []
+
+    def choices(self, seed: int) -> Choices | None:
+        draw = random.Random(f"coverage {seed}")
+        if not self._corpus or draw.random() < 0.3:
+            return mixed(seed)
+        return Changed(seed, draw, self._corpus[-1 - int(len(self._corpus) * draw.random() ** 2)])
+
+    def learn(self, choices: Choices, trace: Trace) -> None:
+        last: dict[str, str] = {}
+        new = False
+        for path, what in trace:
+            pair = (path, last.get(path, ""), what)
+            last[path] = what
+            if pair not in self._seen:
+                self._seen.add(pair)
+                new = True
+        order = tuple(path for path, _ in trace[-64:])  # Who came when is something new, too.
+        pair = ("", "", str(hash(order)))
+        if new or pair not in self._seen:
+            self._seen.add(pair)
+            self._corpus.append(choices.kept())
+
+
+class Changed(Replay):
+    """A run that is repeated up to a point, with a few choices drawn anew, and goes on as a random walk."""
+
+    def __init__(self, seed: int, draw: random.Random, taken: Taken) -> None:
+        super().__init__(seed, taken)
+        self._draw = draw
+        steps = sorted(taken.get(TURN, {})) or [1]
+        last = steps[-1] + 4
+        self._anew = {draw.randint(1, last) for _ in range(draw.randint(1, CHANGES))}
+        self._until = draw.choice(steps) if draw.random() < 0.5 else last
+
+    def choose(self, count: int, keys: Keys) -> int:
+        if self.steps in self._anew or self.steps > self._until:
+            return self._draw.randrange(count)
+        return super().choose(count, keys)
+
+    def redrawn(self, kind: str, number: int, count: int, proposed: int) -> int:
+        return proposed if self._draw.random() < 0.5 else super().redrawn(kind, number, count, proposed)
+
+
+class Point:
+    """One choice of the search tree, with what has been explored below it."""
+
+    def __init__(self, options: tuple[Hashable, ...], asleep: dict[Hashable, Footprint]) -> None:
+        self.options = options
+        self.asleep = asleep  # whose order against the step that led here does not matter, with what they touch
+        self.taken = next((index for index, key in enumerate(options) if key not in asleep), 0)
+        self.footprint = ALL  # of the step taken
+
+    @property
+    def is_redundant(self) -> bool:
+        """Whether every schedule from here has an equal one that was tried."""
+        return all(key in self.asleep for key in self.options)
+
+    def advance(self) -> bool:
+        """Go on to the next option; False: there is none."""
+        self.asleep[self.options[self.taken]] = self.footprint
+        left = [index for index, key in enumerate(self.options) if key not in self.asleep]
+        if not left:
+            return False
+        self.taken = left[0]
+        return True
+
+
+class Exhaustive:
+    """Depth first through all schedules, with sleep sets."""
+
+    def __init__(self) -> None:
+        self.path: list[Point] = []
+        self._is_over = False
+
+    def choices(self, seed: int) -> Choices | None:
+        return None if self._is_over else Explored(seed, self.path)
+
+    def learn(self, choices: Choices, trace: Trace) -> None:
+        assert isinstance(choices, Explored)
+        choices.close()
+        while self.path and not self.path[-1].advance():
+            self.path.pop()
+        self._is_over = not self.path
+
+
+class Explored(Choices):
+    """One path of the search: repeated as far as it is known, then the first that does not sleep."""
+
+    def __init__(self, seed: int, path: list[Point]) -> None:
+        super().__init__(seed)
+        self.control: Control | None = None  # tells what a step has touched
+        self._path = path
+        self._names: dict[Hashable, Hashable] = {}
+        self._is_redundant = False
+
+    def _name(self, key: Hashable) -> Hashable:
+        """The same for the same actor, task or timer in each run: paths, or the order in which they came."""
+        return self._names.setdefault(key, getattr(key, "path", None) or len(self._names))
+
+    def choose(self, count: int, keys: Keys) -> int:
+        assert self.control is not None
+        number = self.steps - 1
+        options = tuple(map(self._name, keys()))
+        if self._is_redundant:
+            return 0
+        if number < len(self._path):
+            if number:
+                self._path[number - 1].footprint = self.control.footprint()
+            point = self._path[number]
+            self.control.begin_footprint()
+            return min(point.taken, count - 1)
+        self.close()
+        last = self._path[-1] if self._path else None
+        slept = {} if last is None or last.footprint is ALL else last.asleep
+        step = ALL if last is None else last.footprint
+        asleep = {
+            key: touched
+            for key, touched in slept.items()
+            if key in options and touched is not ALL and not step & touched
+        }
+        point = Point(options, asleep)
+        if point.is_redundant:
+            self._is_redundant = True
+            return 0
+        self._path.append(point)
+        self.control.begin_footprint()
+        return point.taken
+
+    def end(self) -> None:
+        self.close()
+        self._is_redundant = True
+
+    def close(self) -> None:
+        """Note what the last step has touched, with all that came without a choice after it."""
+        if self._path and not self._is_redundant and self.control is not None and self.steps >= len(self._path):
+            self._path[-1].footprint = self.control.footprint()

@@ -1,0 +1,1 @@
+"""Stores judged by a model: what a journal promises, drawn operations, kills, failures and two owners."""

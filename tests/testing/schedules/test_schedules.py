@@ -1,0 +1,329 @@
+"""Schedules: every strategy finds what it should, a run is repeated exactly, and a failure is shrunk and shown."""
+
+from __future__ import annotations
+
+import asyncio
+import datetime
+import itertools
+import os
+import random
+import subprocess
+import sys
+import threading
+import time
+import uuid
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+from holdfast.testing import GuardedSystem, Simulation, idle, simulate
+from holdfast.testing.schedules.choices import (
+    BadSchedule,
+    NotRepeatable,
+    Production,
+    Replay,
+    Walk,
+    as_text,
+    from_text,
+    size,
+)
+from holdfast.testing.schedules.shrinking import shrink
+from holdfast.testing.schedules.strategies import NAMES, Priorities, mixed, strategy
+from holdfast.testing.schedules.world import EPOCH, EscapesSimulation
+from holdfast.testing.simulation import NotExhausted, Search, run_schedule
+from tests.testing.schedules.planted import PLANTED, Go, Note, Planted, Step, Teller, order_of, restart_order
+
+OWN = {"system"}
+SHOWN_BY_PRODUCTION = {"late_reply", "recorded_non_determinism"}
+MOST = {"exhaustive": 1500}
+
+
+def runs_needed(planted: Planted, name: str, most: int = 600) -> int | None:
+    """How many runs a strategy needs until the bug shows; None: more than `most`."""
+    tried = strategy(name)
+    for number in range(most):
+        choices = tried.choices(number)
+        if choices is None:
+            return None
+        try:
+            run = run_schedule(planted, choices, OWN, {}, looks=False)
+        except Exception:  # The bug, whatever it raises.
+            return number + 1
+        tried.learn(choices, run.trace)
+    return None
+
+
+def found(test: Any, **options: Any) -> BaseException:
+    """What a simulated test fails with."""
+    with pytest.raises((AssertionError, hf.HoldfastError)) as caught:
+        simulate(test, **options)()
+    return caught.value
+
+
+@pytest.mark.parametrize("name", [name for name in PLANTED if name not in ("order_of_6",)])
+def test_the_default_finds_a_planted_bug_and_shrinks_it(name: str) -> None:
+    error = found(PLANTED[name])
+    [note] = error.__notes__
+    _, _, text = note.partition('replay="')
+    seed, taken = from_text(text.partition('"')[0])
+    if name not in SHOWN_BY_PRODUCTION:
+        assert 1 <= size(taken) <= 12
+    for _ in range(2):
+        again = found(PLANTED[name], replay=as_text(seed, taken))
+        assert type(again) is type(error)
+    assert "turns:" in note
+
+
+@pytest.mark.parametrize("name", [name for name in PLANTED if name not in SHOWN_BY_PRODUCTION])
+def test_the_order_of_production_shows_none_of_them(name: str) -> None:
+    """Else they would be no bugs that a test has to look for."""
+    run_schedule(PLANTED[name], Production(0), OWN, {})
+
+
+@pytest.mark.parametrize("name", ["order_of_3", "missed_wake_up", "timer_tie", "restart_order"])
+@pytest.mark.parametrize("tried", NAMES)
+def test_every_strategy_finds_a_bug_of_few_turns(name: str, tried: str) -> None:
+    assert runs_needed(PLANTED[name], tried) is not None
+
+
+@pytest.mark.parametrize("count", [3, 4])
+def test_priorities_find_an_order_as_often_as_they_promise(count: int) -> None:
+    """Of depth d among n tasks and k choices: at least 1 / (n k^(d-1)) of the runs. Here n = count + 2, d = count."""
+    hits, runs = 0, 400
+    for seed in range(runs):
+        try:
+            run_schedule(order_of(count), Priorities(seed, count, 2 * count), OWN, {}, looks=False)
+        except AssertionError:
+            hits += 1
+    assert hits / runs >= 1 / ((count + 2) * (2 * count) ** (count - 1))
+
+
+def test_the_exhaustive_search_sees_each_order_and_ends() -> None:
+    """Three tellers and one who notes: 3! orders of telling, and 5 ways in which the noting may lag behind each."""
+    orders: Counter[tuple[int, ...]] = Counter()
+
+    async def tells(system: GuardedSystem) -> None:
+        note = system.spawn(hf.start(Note), "note")
+        for number in range(3):
+            system.spawn(hf.start(Teller, note, number), f"teller{number}").tell(Go())
+        await idle(system)
+        actor: Any = note._cell.actor
+        orders[tuple(actor.got)] += 1
+
+    search = Search(tells, OWN, {}, strategy("exhaustive"), "exhaustive")
+    search.run(1000)
+    assert search.is_complete
+    assert set(orders) == set(itertools.permutations(range(3)))
+    assert search.runs == 30
+
+
+def test_an_exhaustive_search_that_is_not_over_says_so() -> None:
+    with pytest.warns(NotExhausted, match="2 schedules were tried, and there are more"):
+        simulate(PLANTED["order_of_5"], strategy="exhaustive", seeds=2)()
+
+
+def test_turns_that_have_nothing_to_do_with_each_other_are_not_tried_in_every_order() -> None:
+    """Three pairs, each by itself: 6! / 2^3 = 90 orders, which are one."""
+
+    async def pairs(system: GuardedSystem) -> None:
+        for number in range(3):
+            note = system.spawn(hf.start(Note), f"note{number}")
+            system.spawn(hf.start(Teller, note, number), f"teller{number}").tell(Go())
+        await idle(system)
+
+    search = Search(pairs, OWN, {}, strategy("exhaustive"), "exhaustive")
+    search.run(1000)
+    assert search.is_complete
+    assert search.runs < 20
+
+
+@pytest.mark.parametrize("planted", [restart_order, order_of(4)])
+def test_a_run_is_repeated_by_its_choices(planted: Planted) -> None:
+    def run(choices: Any) -> Simulation:
+        try:
+            return run_schedule(planted, choices, OWN, {})
+        except AssertionError as error:
+            simulation: Simulation = error.__simulation__  # type: ignore[attr-defined]
+            return simulation
+
+    for seed in range(30):
+        first = run(mixed(seed))
+        again = run(Replay(seed, first.choices.kept()))
+        assert again.trace == first.trace
+        assert again.choices.kept() == first.choices.kept()
+
+
+def test_a_schedule_is_a_line_of_text() -> None:
+    taken = {"turn": {3: 1, 9: 2}, "fault": {1: 2}, "delay": {4: 63}}
+    assert from_text(as_text(7, taken)) == (7, taken)
+    for wrong in ("", "turn=1:2", "seed=x", "seed=1 turn=1", "seed=1 colour=1:2"):
+        with pytest.raises(BadSchedule, match="not a schedule"):
+            from_text(wrong)
+    with pytest.raises(BadSchedule):
+        simulate(restart_order, replay="seed")
+
+
+def test_shrinking_leaves_what_it_takes() -> None:
+    taken = {"turn": dict.fromkeys(range(1, 200), 1), "fault": dict.fromkeys(range(1, 50), 1)}
+
+    def fails(tried: dict[str, dict[int, int]]) -> dict[str, dict[int, int]] | None:
+        turns = tried.get("turn", {})
+        return tried if 17 in turns and 150 in turns and 30 in tried.get("fault", {}) else None
+
+    assert shrink(taken, fails) == {"fault": {30: 1}, "turn": {150: 1, 17: 1}}
+
+
+# -- what the world gives ---------------------------------------------------------------------------------------------
+
+
+def test_random_numbers_and_clocks_are_the_seeds() -> None:
+    def drawn(seed: int) -> list[object]:
+        got: list[object] = []
+
+        async def draws(system: GuardedSystem) -> None:
+            got.extend([random.random(), uuid.uuid4(), os.urandom(4), random.SystemRandom().random()])
+            await asyncio.sleep(2.5)
+            got.extend([time.time(), time.monotonic(), time.perf_counter_ns()])
+
+        run_schedule(draws, Production(seed), OWN, {})
+        return got
+
+    assert drawn(1) == drawn(1)
+    assert drawn(1)[:4] != drawn(2)[:4]
+    assert drawn(1)[4:] == [EPOCH + 2.5, 2.5, 2_500_000_000]
+
+
+def test_the_world_is_as_it_was_when_the_run_is_over() -> None:
+    before = (time.time, os.urandom, threading.Thread.start, random.getstate())
+    run_schedule(restart_order, Production(0), OWN, {})
+    assert (time.time, os.urandom, threading.Thread.start, random.getstate()) == before
+    assert abs(time.time() - datetime.datetime.now().timestamp()) < 60.0
+
+
+def test_a_thread_that_a_program_starts_is_told_by_name() -> None:
+    def watches() -> None: ...
+
+    async def starts(system: GuardedSystem) -> None:
+        thread = threading.Thread(target=watches)
+        thread.start()
+        thread.join()
+
+    with pytest.warns(EscapesSimulation, match="a thread was started .*watches"):
+        run_schedule(starts, Production(0), OWN, {})
+
+
+def test_what_a_thread_brings_comes_when_nothing_else_can_happen() -> None:
+    async def works(system: GuardedSystem, simulation: Simulation) -> None:
+        note = system.spawn(hf.start(Note), "note")
+        loop = asyncio.get_running_loop()
+        jobs = [loop.run_in_executor(None, lambda: None) for _ in range(2)]
+        for number in range(20):
+            note.tell(Step(number))
+            await asyncio.sleep(0)
+        await asyncio.gather(*jobs)
+        simulation.trace.append(("the job", "done"))
+
+    for seed in range(20):
+        trace = run_schedule(works, Walk(seed), {"system", "simulation"}, {}).trace
+        assert trace.index(("the job", "done")) > max(at for at, turn in enumerate(trace) if turn[1] == "Step")
+
+
+def test_a_run_that_does_not_repeat_is_an_error_of_that_run() -> None:
+    seen: list[int] = []
+
+    async def remembers(system: GuardedSystem) -> None:
+        note = system.spawn(hf.start(Note), "note")
+        seen.append(1)
+        for _ in seen:
+            note.tell(Step(1))
+        await idle(system)
+
+    with pytest.raises(NotRepeatable, match="cannot be repeated: turn 2 was"):
+        simulate(remembers, seeds=1)()
+
+
+def test_a_failure_that_does_not_repeat_says_so() -> None:
+    seen: list[int] = []
+
+    async def fails_once(system: GuardedSystem) -> None:
+        seen.append(1)
+        assert len(seen) > 1
+
+    error = found(fails_once, seeds=1)
+    assert "fails only sometimes" in "".join(error.__notes__)
+
+
+# -- what is drawn is kept --------------------------------------------------------------------------------------------
+
+
+def test_faults_and_their_delays_are_shrunk_too() -> None:
+    async def loses(system: GuardedSystem, faults: Any) -> None:
+        note = system.spawn(hf.start(Note), "note")
+        with faults.on(note, at="admit", drop=0.2, delay=0.3, seconds=(0.1, 2.0)):
+            for number in range(20):
+                note.tell(Step(number))
+            await asyncio.sleep(5.0)
+        actor: Any = note._cell.actor
+        assert len(actor.got) == 20
+
+    [note] = found(loses).__notes__
+    assert note.count("struck: drop") == 1
+    assert "struck: delay" not in note
+    _, taken = from_text(note.partition('replay="')[2].partition('"')[0])
+    assert size(taken) == 1
+
+
+def test_delays_differ_within_their_range() -> None:
+    seconds: list[float] = []
+
+    async def late(system: GuardedSystem, faults: Any) -> None:
+        note = system.spawn(hf.start(Note), "note")
+        loop = asyncio.get_running_loop()
+        with faults.on(note, at="turn begin", delay=1.0, seconds=(0.5, 1.5)):
+            for number in range(8):
+                begin = loop.time()
+                note.tell(Step(number))
+                await idle(system)
+                while len(note._cell.actor.got) <= number:  # type: ignore[union-attr]
+                    await asyncio.sleep(0.01)
+                seconds.append(loop.time() - begin)
+
+    run_schedule(late, Walk(1), {"system", "faults"}, {})
+    assert all(0.5 <= one <= 1.6 for one in seconds)
+    assert len({round(one, 1) for one in seconds}) > 3
+
+
+@pytest.mark.parametrize("seconds", [-1.0, (2.0, 1.0), float("inf")])
+def test_a_delay_that_cannot_be_is_refused(seconds: Any) -> None:
+    async def wrong(system: GuardedSystem, faults: Any) -> None:
+        note = system.spawn(hf.start(Note), "note")
+        with pytest.raises(hf.SpecError, match="seconds must be"):
+            faults.on(note, at="admit", delay=1.0, seconds=seconds)
+
+    run_schedule(wrong, Production(0), {"system", "faults"}, {})
+
+
+@pytest.mark.parametrize("options", [{"strategy": "luck"}, {"depth": 0}])
+def test_a_strategy_that_there_is_not_is_refused(options: dict[str, Any]) -> None:
+    with pytest.raises(hf.SpecError, match="must be"):
+        simulate(restart_order, **options)
+
+
+def test_no_order_of_a_set_changes_a_run() -> None:
+    """Strings have other hashes in each process."""
+    player = Path(__file__).with_name("hash_player.py")
+    runs = [
+        subprocess.Popen(
+            [sys.executable, str(player)],
+            env={**os.environ, "PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            stdout=subprocess.PIPE,
+        )
+        for seed in ("1", "2")
+    ]
+    first, again = (run.communicate(timeout=120)[0].decode().splitlines() for run in runs)
+    assert [run.returncode for run in runs] == [0, 0]
+    assert len(first) > 1000
+    assert first == again
