@@ -7,7 +7,7 @@ PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check 
 BESIDE := $(patsubst %/,%,$(sort $(dir $(wildcard tests/*.py benchmarks/*.py examples/*.py))))
 
 .DEFAULT_GOAL := check
-.PHONY: demo test campaign soak lint check bench build clean
+.PHONY: demo test campaign soak loaded lint check bench build clean
 
 demo: $(VENV)/.demo
 	$(BIN)/holdfast demo
@@ -44,6 +44,11 @@ campaign: $(VENV)/.dev
 HOURS ?= 8
 soak: $(VENV)/.dev
 	$(BIN)/python -m tests.soak $(HOURS) $(SEED)
+
+# All tests beside four busy loops, so many times: none may fail.
+RUNS ?= 10
+loaded: $(VENV)/.dev
+	$(BIN)/python -m tests.loaded $(RUNS) $(PYTEST_ARGS)
 
 # The static part of `check`, cheapest first.
 lint: $(VENV)/.dev .link/holdfast
