@@ -1,7 +1,7 @@
 """The whole suite beside four busy loops, again and again: a machine that has other things to do fails no test.
 
-`make loaded RUNS=10`, or `python -m tests.loaded RUNS [arguments of pytest]` from the root of the repository. The output
-of a run that fails is printed, and the rest are made all the same.
+`make loaded RUNS=10`, or `python -m tests.loaded RUNS [arguments of pytest]` from the root of the repository. What
+a run that fails has printed is shown, and the rest are made all the same.
 """
 
 from __future__ import annotations
