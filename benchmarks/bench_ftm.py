@@ -29,7 +29,7 @@ from limits import echo_process
 
 import holdfast as hf
 from holdfast.ftm.events import FailedOver
-from holdfast.ftm.group import group_host
+from holdfast.ftm.group import group_place
 from holdfast.ftm.group.detector import Detection
 from holdfast.ftm.sec.authority import CertificationAuthority
 
@@ -112,7 +112,7 @@ async def latency(run: Run) -> None:
 async def _print_bricks(name: str, layers: Sequence[Any], count: int) -> None:
     marks, asks = ftm_timing.root_marks(), list[tuple[float, float]]()
     with tempfile.TemporaryDirectory() as folder:
-        before, group_host.replica = group_host.replica, ftm_timing.recipe(Path(folder))
+        before, group_place.replica = group_place.replica, ftm_timing.recipe(Path(folder))
         try:
             async with _system() as system:
                 ref = await _protected(system, "timed", layers)
@@ -122,7 +122,7 @@ async def _print_bricks(name: str, layers: Sequence[Any], count: int) -> None:
                     await ref.ask(Bump())
                     asks.append((begin, time.perf_counter()))
         finally:
-            group_host.replica = before
+            group_place.replica = before
         seen = list(marks.seen)
         for file in Path(folder).iterdir():
             for line in file.read_text().splitlines():

@@ -30,7 +30,7 @@ from harness import Run, main
 
 import holdfast as hf
 from holdfast.actors.values import decode_value, encode_value
-from holdfast.checkpoint.home.outputs import switch_of
+from holdfast.checkpoint.home.recorded_home import switch_of
 from holdfast.checkpoint.method import Method
 
 PROGRAMS_FOLDER = Path(__file__).resolve().parents[1] / "examples/programs"

@@ -74,7 +74,7 @@ def _derived(kind: type[Any]) -> list[type[Any]]:
 
 
 def recipe(folder: Path) -> Any:
-    """What stands in for `holdfast.ftm.group.group_host.replica`."""
+    """What stands in for `holdfast.ftm.group.group_place.replica`."""
 
     def replica(setting: Any, start: Start[Any], layers: tuple[Any, ...]) -> Start[Any]:
         return Start(TimedReplica, (setting, start, layers, str(folder)))

@@ -368,6 +368,10 @@ class RemoteChange:
         """Point a binding nowhere."""
         self._put("unbind", owner, port)
 
+    def protect(self, target: RemoteTarget, mechanism: Any) -> None:
+        """Have an actor protected by just these mechanisms, outermost first, whatever it has now; None: by none."""
+        self._put("protect", target, None if mechanism is None else in_full(mechanism))
+
     def attach(self, target: RemoteTarget, mechanism: Any) -> None:
         """Protect an actor by a mechanism, or by several, outermost first; a file is one of the running system's."""
         self._put("attach", target, in_full(mechanism))

@@ -28,11 +28,12 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.cell import GONE, Cell
 from ..actors.kernel.ref import DEFAULT_TIMEOUT, ActorRef
-from ..actors.process.process_host import Elsewhere
+from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
 from ..actors.process.wire.start_codec import unpack_recipe
-from ..checkpoint.home.outputs import switch_of
+from ..checkpoint.home.far_parent import SlotPlace
+from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.home.switch import Switch
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Isolation
@@ -140,9 +141,9 @@ class Controls:
         host = cell.host
         if isinstance(host, OutsideHost):
             return cast("Status", await ask_status(host.peer, cell, timeout))
-        if not isinstance(host, Elsewhere):
+        if not has_process(cell):
             return status_of(cell)
-        own, worker = status_of(cell), host.worker_of(cell)
+        own, worker = status_of(cell), host.place.process(cell)
         if worker is None:
             return dataclasses.replace(own, pid=0)
         there = cast("Status", await ask_status(worker, cell, timeout))
@@ -180,7 +181,7 @@ class Controls:
         """
         cell = self._living(ref)
         counts = cast("Statistics | None", await self._order(ref, Look(on, None), timeout))
-        if not isinstance(cell.host, Elsewhere):
+        if not has_process(cell):
             return counts
         own = tap_of(cell).switch(on, None)
         if own is None or counts is None:
@@ -196,9 +197,9 @@ class Controls:
         tap = tap_of(cell)
         await self._order(ref, Look(None, True), timeout)
         stream = tap.listen()
-        if isinstance(cell.host, Elsewhere):
+        if has_process(cell):
             tap.attach()
-        if isinstance(cell.host, (Elsewhere, OutsideHost)):
+        if has_process(cell) or isinstance(cell.host, OutsideHost):
             tap.forget = lambda: _no_more(cell)
         return stream
 
@@ -291,6 +292,11 @@ class Controls:
 
     async def _order(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
         return await order(ref._cell, wanted, timeout)
+
+
+def has_process(cell: Cell) -> bool:
+    """Whether the actor's life is lived in one process beside this one, which knows more of it than its home does."""
+    return isinstance(cell.host.place, (WorkerPlace, SlotPlace))
 
 
 def _check_saved(switch: Switch | None, before: int, path: str, verb: str) -> None:

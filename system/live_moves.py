@@ -12,24 +12,25 @@ from ..actors.control.orders import Ready
 from ..actors.control.orders_lane import order
 from ..actors.errors import CannotMove, SpecError
 from ..actors.events import Moved
-from ..actors.kernel.cell import Cell, Host
-from ..actors.kernel.lifecycle import LOCAL
+from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
 from ..actors.migration.here import ToHere
 from ..actors.migration.move import Entering, Gate, Move
 from ..actors.migration.worker import ToWorker
 from ..actors.ordered import Ordered
-from ..actors.process.process_host import ProcessHost
+from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
-from ..actors.process.worker_pool import Workers
-from ..checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
+from ..actors.process.wire.peer import OutsideHost
+from ..checkpoint.home.far_parent import FarParent
+from ..checkpoint.home.journal_home import JournalHome
 from ..checkpoint.home.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
 from ..supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor
 
 if TYPE_CHECKING:
+    from ..actors.kernel.address_host import AddressHost
     from ..actors.kernel.node import Node
     from ..checkpoint.home.homes import Homes
 
@@ -41,8 +42,8 @@ Begun = Callable[[Any], None]
 class Moves:
     """The moves of one system."""
 
-    def __init__(self, node: Node, workers: Workers) -> None:
-        self._node, self._workers = node, workers
+    def __init__(self, node: Node) -> None:
+        self._node = node
         self._turns: weakref.WeakKeyDictionary[Cell, asyncio.Lock] = weakref.WeakKeyDictionary()
         self._tasks = Ordered[asyncio.Task[None]]()
         self._under_way: dict[Cell, Move] = {}  # of mechanisms
@@ -90,9 +91,12 @@ class Moves:
     ) -> None:
         async with self.lock(cell):
             origin = place_of(cell)
+            spec = _spec_there(cell, isolation, limits)
+            if spec.mechanism is not None:  # Its replicas have processes: it lives there when nobody protects it.
+                replace_place(cell, spec)
+                return
             if origin == isolation:
                 return
-            spec = _spec_there(cell, isolation, limits)
             move = await self._moved(
                 cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
             )
@@ -121,6 +125,7 @@ class Moves:
         self, cell: Cell, homes: Homes, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun
     ) -> None:
         from ..ftm.events import MechanismAttached
+        from ..ftm.group.group_place import GroupPlace
         from ..ftm.migration.protection import into_group
 
         before = _spec_of(cell)
@@ -128,13 +133,14 @@ class Moves:
 
         def moved() -> None:
             replace_mechanism(cell, wanted)
-            probation = getattr(cell.host, "probation", None)
+            assert isinstance(cell.host.place, GroupPlace)
+            probation = cell.host.place.probation
             if probation is not None:
                 probation.detach = lambda: self.unprotect(cell, timeout)
                 begun(probation)
 
         # Without recovery, only what lives in this process has what a group needs of its state.
-        is_by_way_of_a_task = place_of(cell) == "process" and not isinstance(cell.host, RecordedProcessHost)
+        is_by_way_of_a_task = place_of(cell) == "process" and not isinstance(cell.host.home, JournalHome)
         if is_by_way_of_a_task:
             await self._settle_in(cell, "task", before.limits, timeout)
         try:
@@ -150,7 +156,7 @@ class Moves:
                 await self._settle_in(cell, "process", before.limits, timeout)
             raise
         if self._node.watched:
-            names = tuple(layer.name for layer in move.entering.host.layers)
+            names = tuple(layer.name for layer in move.entering.host.place.layers)
             self._node.emit(MechanismAttached(cell.path, names, move.gone_on_at - move.rest_at))
 
     async def unprotect(self, cell: Cell, timeout: float, gate: Gate | None = None) -> None:
@@ -206,7 +212,7 @@ class Moves:
 
     async def _adapted(self, cell: Cell, mechanism: Any, timeout: float, gate: Gate | None, begun: Begun) -> None:
         from ..ftm.events import MechanismChanged
-        from ..ftm.group.group_host import GroupHost
+        from ..ftm.group.group_place import GroupPlace
         from ..ftm.group.reconfiguration import CannotAdapt
 
         before: ChildSpec = cell.spec
@@ -215,17 +221,17 @@ class Moves:
         while True:
             if not cell.host.is_up(cell):
                 await order(cell, Ready(), timeout)  # It is being recovered: its next life is changed.
-            host = cell.host
-            if not isinstance(host, GroupHost):
+            host, place = cell.host, cell.host.place
+            if not isinstance(place, GroupPlace):
                 raise CannotAdapt(cell.path, "it has no mechanism")
-            old, life = host.layers, cell.life
+            old, life = place.layers, cell.life
 
-            def switched(host: GroupHost = host) -> None:
+            def switched(place: GroupPlace = place) -> None:
                 replace_mechanism(cell, wanted)
-                begun(host.probation)
+                begun(place.probation)
 
             try:
-                change = await host.adapt(cell, mechanism, switched, gate=gate)
+                change = await place.adapt(cell, mechanism, switched, gate=gate)
                 break
             except CannotAdapt:
                 if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
@@ -257,9 +263,7 @@ class Moves:
         move = self._under_way.get(cell)
         if move is not None:
             move.give_up(why)
-        group = getattr(cell.host, "group", None)
-        if group is not None and group.change is not None:
-            group.change.give_up(why)
+        cell.host.place.give_up(why)
 
     async def _moved(
         self,
@@ -292,12 +296,12 @@ class Moves:
         """The move that brings the actor to where its spec says."""
         return Move(cell, leaving(cell), self._entering(self._node.host_for(spec), spec.limits), timeout)
 
-    def _entering(self, host: Host, limits: Limits | None) -> Entering:
-        if isinstance(host, RecordedProcessHost):
-            return ToRecordedWorker(host, self._workers, limits)
-        if isinstance(host, ProcessHost):
-            return ToWorker(host, self._workers, limits)
-        return ToRecordedHere(host) if isinstance(host, TaskHost) else ToHere(host)
+    @staticmethod
+    def _entering(host: AddressHost, limits: Limits | None) -> Entering:
+        is_recorded = isinstance(host.home, JournalHome)
+        if isinstance(host.place, WorkerPlace):
+            return ToRecordedWorker(host, limits) if is_recorded else ToWorker(host, limits)
+        return ToRecordedHere(host) if is_recorded else ToHere(host)
 
 
 def check_isolation(isolation: object, limits: object, timeout: object) -> None:
@@ -335,7 +339,7 @@ def _spec_of(cell: Cell) -> ChildSpec:
 
 def place_of(cell: Cell) -> Isolation:
     """Where an actor lives: in a process of its own, or as a task of whatever process."""
-    return "process" if isinstance(cell.host, ProcessHost) else "task"
+    return "process" if isinstance(cell.host.place, WorkerPlace) else "task"
 
 
 def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> ChildSpec:
@@ -347,8 +351,6 @@ def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> Chil
     spec, kind = cell.spec, cell_kind(cell)
     if kind is not None and issubclass(kind, Supervisor):
         raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
-    if isinstance(spec, ChildSpec) and spec.mechanism is not None:
-        raise CannotMove(cell.path, "it is protected by a mechanism, whose replicas have processes: detach that first")
     if not _is_here(cell):
         raise CannotMove(cell.path, "its supervisor lives in another process, which cannot have processes of its own")
     if not isinstance(spec, ChildSpec):
@@ -361,5 +363,4 @@ def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> Chil
 
 def _is_here(cell: Cell) -> bool:
     """Whether it is this process that begins the lives of an actor."""
-    host: Host = cell.host
-    return host is LOCAL or isinstance(host, (ProcessHost, TaskHost))
+    return not isinstance(cell.host, OutsideHost) and not isinstance(cell.host.parent, FarParent)

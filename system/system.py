@@ -15,20 +15,22 @@ from ..actors.events import EventStream, RecoveryTableUnused
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, pack_exit
 from ..actors.kernel import lifecycle, stopping
 from ..actors.kernel.actor import Actor, Start
-from ..actors.kernel.cell import Cell, Host
-from ..actors.kernel.lifecycle import LOCAL
+from ..actors.kernel.address_host import AddressHost
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
 from ..actors.kernel.node import Node, cell_kind
 from ..actors.kernel.ref import ActorRef, current
 from ..actors.kernel.topics import publish
 from ..actors.loop_watchdog import LoopWatch, check_limits
-from ..actors.migration.quiesce import Transit
-from ..actors.process.process_host import Elsewhere, ProcessHost, on_frame
+from ..actors.process.process_host import WorkerPlace, in_process, on_frame
 from ..actors.process.worker_pool import Workers
+from ..checkpoint.home.far_parent import FarParent
 from ..checkpoint.home.homes import Homes
-from ..checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
-from ..checkpoint.home.subtree_homes import Lived, SubtreeHome, SubtreeHost
+from ..checkpoint.home.journal_home import JournalHome
+from ..checkpoint.home.life_here import recorded_here
+from ..checkpoint.home.subtree_place import subtree
 from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
 from ..checkpoint.protocol import Wanted
@@ -165,7 +167,7 @@ class ActorSystem(Recorded, Controls):
             self._homes.file, node.complete = file, file.complete
             self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
         node.host_for = self._host_for
-        self._moves = Moves(node, self._workers)
+        self._moves = Moves(node)
         node.respec = respec
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
@@ -246,7 +248,7 @@ class ActorSystem(Recorded, Controls):
         """The processes of this system."""
         return Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
 
-    def _host_for(self, spec: ChildSpec) -> Host:
+    def _host_for(self, spec: ChildSpec) -> AddressHost:
         """Where a child's lives are lived."""
         problem = "" if spec.recovery is None else self._homes.refuses(spec.recovery)
         if problem:
@@ -256,21 +258,22 @@ class ActorSystem(Recorded, Controls):
         if spec.isolation == "process":
             self._workers.want(spec.start.kind.__module__)
             if spec.recovery is not None and spec.recovery.records:
-                return RecordedProcessHost(self._workers, spec.limits, self._homes, spec.recovery)
+                home = JournalHome(self._homes, spec.recovery, NEAR)
+                return AddressHost(home, WorkerPlace(home, NEAR, self._workers, spec.limits), NEAR)
             if spec.is_supervisor:
-                return SubtreeHost(self._workers, spec.limits, self._homes, self._protect)
-            return ProcessHost(self._workers, spec.limits)
+                return subtree(self._workers, spec.limits, self._homes, self._lives_at_root)
+            return in_process(self._workers, spec.limits)
         if spec.recovery is not None and spec.recovery.records:
-            return TaskHost(self._homes, spec.recovery)
+            return recorded_here(self._homes, spec.recovery)
         return LOCAL
 
-    def _group_host(self, spec: ChildSpec) -> Host:
+    def _group_host(self, spec: ChildSpec) -> AddressHost:
         """Where the lives of a protected child are lived.
 
         Raises:
             MechanismRefused: its mechanisms do not go together, or not in this order.
         """
-        from ..ftm.group.group_host import GroupHost
+        from ..ftm.group.group_place import protected_host
         from ..ftm.model.composition import check_stack  # Most systems protect nobody.
         from ..ftm.model.mechanism import COMMON, compose
 
@@ -280,18 +283,19 @@ class ActorSystem(Recorded, Controls):
         for name in COMMON:  # A replica that changes over must not import, and perhaps compile, while requests wait.
             self._workers.want(name)
         recovery = spec.recovery
-        return GroupHost(self._homes, recovery if recovery is not None and recovery.records else None, spec.mechanism)
+        method = recovery if recovery is not None and recovery.records else None
+        return protected_host(self._homes, method, spec.mechanism)
 
-    def _protect(self, place: SubtreeHome, cell: Cell, wanted: Wanted, before: Lived | None) -> Lived:
+    def _lives_at_root(self, parent: FarParent, cell: Cell, wanted: Wanted, before: AddressHost | None) -> AddressHost:
         """The host of a protected child whose supervisor is in another process.
 
         Raises:
             MechanismRefused: its mechanisms cannot be had here, or do not go together.
         """
-        from ..ftm.migration.subtree_groups import subtree_group
+        from ..ftm.migration.subtree_groups import group_below
         from ..ftm.model.mechanism import COMMON
 
-        group = subtree_group(place, cell, wanted, before)
+        group = group_below(parent, cell, wanted, before)
         for name in (REPLICA, *COMMON):
             self._workers.want(name)
         return group
@@ -500,11 +504,11 @@ class ActorSystem(Recorded, Controls):
         """
         cell: Cell | None = ref._cell
         while cell is not None:
-            host = cell.host.old if isinstance(cell.host, Transit) else cell.host  # It is moved, and at rest there.
-            worker = host.worker_of(cell) if isinstance(host, Elsewhere) else None
+            place = cell.host.place
+            worker = place.process(cell)
             if worker is not None:
-                return worker.pid
-            if isinstance(host, ProcessHost):
+                return int(worker.pid)
+            if isinstance(place, WorkerPlace):
                 raise NoSuchActor(ref.path)
             cell = cell.parent
         return os.getpid()

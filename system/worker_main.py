@@ -7,7 +7,9 @@ import functools
 import socket
 from typing import Any, cast
 
-from ..actors.kernel.cell import Cell, Host
+from ..actors.kernel.address_host import AddressHost
+from ..actors.kernel.cell import Cell
+from ..actors.kernel.lifecycle import NEAR
 from ..actors.migration.worker_moves import Attempt
 from ..actors.process import worker_node
 from ..actors.process.wire import frames
@@ -29,13 +31,14 @@ def prepare(host: worker_node.Guest) -> None:
     host.node.host_for = functools.partial(host_for, host)
 
 
-def host_for(host: worker_node.Guest, spec: Any) -> Host:
+def host_for(host: worker_node.Guest, spec: Any) -> AddressHost:
     """Where a child below this process's supervisor is lived."""
     if spec.mechanism is None:
-        return cast("Host", host.recovery.host_for(spec))
-    from ..ftm.migration.protected_stand_ins import InnerGroupHost  # Most processes protect nobody.
+        return cast("AddressHost", host.recovery.host_for(spec))
+    from ..ftm.migration.protected_stand_ins import child_at_root  # Most processes protect nobody.
 
-    return InnerGroupHost(host, spec, host.recovery.port_of)
+    place = child_at_root(host, spec)
+    return AddressHost(place.home, place, NEAR)
 
 
 def child_attempt(host: worker_node.Guest, path: str, number: int) -> Attempt:

@@ -21,7 +21,7 @@ from ..actors.kernel.timers import Timer
 from ..actors.process.process_host import Outlet
 from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
-from ..checkpoint.home.outputs import switch_of
+from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.home.switch import Switch
 from ..checkpoint.protocol import STASHED
 from .clock import VirtualClockLoop

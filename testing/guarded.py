@@ -9,7 +9,7 @@ from typing import Any
 from ..actors.errors import HoldfastError
 from ..actors.events import ActorCrashed, DeadLetter, Event, HookFailed, LifeAbandoned, ProcessDied
 from ..actors.exit_reasons import Exited, Hung, OutOfMemory, Signal
-from ..actors.kernel.cell import Host
+from ..actors.kernel.address_host import AddressHost
 from ..actors.kernel.envelope import message_in
 from ..actors.kernel.node import Node
 from ..actors.process.worker_pool import Workers
@@ -90,7 +90,7 @@ class GuardedSystem(ActorSystem):
         loop = asyncio.get_running_loop()
         return SimulatedWorkers(node, loop) if isinstance(loop, ControlledLoop) else super()._make_pool(node)
 
-    def _host_for(self, spec: ChildSpec) -> Host:
+    def _host_for(self, spec: ChildSpec) -> AddressHost:
         loop = self.node.loop
         if spec.isolation == "process" and isinstance(loop, VirtualClockLoop) and not isinstance(loop, ControlledLoop):
             raise RealTimeNeeded(f"{spec.id!r} with isolation='process'")

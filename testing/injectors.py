@@ -16,10 +16,11 @@ from ..actors.kernel.cell import GONE, Cell
 from ..actors.kernel.envelope import Ask, Envelope, Handler
 from ..actors.kernel.message import message_of
 from ..actors.kernel.ref import ActorRef
+from ..actors.process.process_host import WorkerPlace
 from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
 from ..checkpoint.group_commit import Submission
-from ..checkpoint.home.outputs import switch_of
+from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.inputs import HomeJournal
 from ..checkpoint.journal import Saved, StoreFailed
 from ..checkpoint.life.recorded_inbox import Fed
@@ -268,7 +269,7 @@ async def _given(result: object) -> object:
 def turn(strikes: Strikes, target: Target) -> None:
     """Install at "turn begin" and "turn end"."""
     cell = _cell(strikes, target)
-    if cell.more is not None and getattr(cell.host, "_workers", None) is not None:
+    if cell.more is not None and isinstance(cell.host.place, WorkerPlace):
         raise SpecError("faults", f"the turns of {cell.path} are in another process: use 'frame out' or 'frame in'")
     watcher = TurnFaults(strikes, cell)
     strikes.at_end(watcher.end)
@@ -363,8 +364,8 @@ class FrameFaults:
 def frame(strikes: Strikes, target: Target) -> None:
     """Install at "frame out" and "frame in", in the present process and in those that follow."""
     cell = _cell(strikes, target)
-    workers = getattr(cell.host, "_workers", None)
-    if workers is None:
+    place = cell.host.place
+    if not isinstance(place, WorkerPlace):
         raise SpecError("faults", f"{cell.path} has no process of its own: {strikes.at!r} is where frames pass")
     faults = FrameFaults(strikes, cell)
     adopt = Worker.adopt
@@ -375,7 +376,7 @@ def frame(strikes: Strikes, target: Target) -> None:
             faults.install(worker)
 
     faults.swaps.put(Worker, "adopt", adopted)
-    present = workers.of(cell)
+    present = place.workers.of(cell)
     if present is not None:
         faults.install(present)
     strikes.at_end(faults.let_go)

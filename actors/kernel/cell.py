@@ -17,10 +17,10 @@ from .message import Message, Order, require_message
 from .ref import ActorRef
 
 if TYPE_CHECKING:
-    from ..control.orders_lane import Call
     from ..control.tracing import Tap
     from ..errors import StartFailed
     from .actor import Actor, Start
+    from .address_host import Call, Home, Parent, Place
     from .context import ActorContext
     from .loop import Suspended
     from .mailbox import Bound
@@ -38,13 +38,27 @@ ANY = AnyTable()
 
 
 class Host(Protocol):
-    """Where and how the lives at an address are lived: in this process, in another one, recorded or not.
+    """Where and how the lives at an address are lived, as the address asks for it (`address_host.py`)."""
 
-    What most hosts do stands here; a host that says so inherits it.
-    """
+    @property
+    def home(self) -> Home:
+        """What is accepted at the address."""
+        ...
 
-    takes_parcels: bool
-    """Whether messages that came encoded are passed on as they are."""
+    @property
+    def place(self) -> Place:
+        """Where its turns run."""
+        ...
+
+    @property
+    def parent(self) -> Parent:
+        """Its supervisor."""
+        ...
+
+    @property
+    def takes_parcels(self) -> bool:
+        """Whether messages that came encoded are passed on as they are."""
+        ...
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
@@ -69,16 +83,15 @@ class Host(Protocol):
     def progress(self, cell: Cell) -> object:
         """How far the start that is under way has come: it is another value when it has come further, and while it
         waits for somebody else. None: it has no steps."""
-        return None
+        ...
 
     def recovers(self, reason: ExitReason) -> bool:
         """Whether a life that ended for this reason is brought back with its state."""
-        return False
+        ...
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it is accepted. None: it is."""
-        cell.admit(cell, item)
-        return None
+        ...
 
     def control(self, cell: Cell, call: Call) -> None:
         """Have an order carried out between two turns of the actor, ahead of all messages."""
@@ -90,7 +103,7 @@ class Host(Protocol):
 
     def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
         """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
-        return True
+        ...
 
     def backlog(self, cell: Cell) -> int:
         """Messages that wait, as far as is known in this process."""

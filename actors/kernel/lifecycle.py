@@ -10,7 +10,7 @@ import asyncio
 import contextvars
 import signal
 from collections import deque
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Iterable
 from typing import TYPE_CHECKING, Any
 
 from .. import exit_reasons
@@ -19,15 +19,16 @@ from ..events import ActorCrashed, ActorStarted, HookFailed, LifeAbandoned
 from ..exit_reasons import KILLED, NORMAL, SHUTDOWN, Crash, ExitReason
 from . import links, mailbox
 from .actor import Actor
-from .cell import DOWN, ENDING, GONE, RUNNING, Cell, Host
+from .address_host import AddressHost, Home, Parent, Place
+from .cell import DOWN, ENDING, GONE, RUNNING, Cell
 from .context import ActorContext
 from .envelope import LEAVE, Ask, Item
 from .message import Refusal
 from .ref import current
 
 if TYPE_CHECKING:
-    from ..control.orders_lane import Call
     from .actor import Start
+    from .address_host import Call
     from .loop import Suspended
 
 GRACE = 1.0
@@ -36,10 +37,26 @@ KILLED_WITHIN = 5.0
 """Seconds until a killed child is given up that has not ended; a process that was sent SIGKILL takes less."""
 
 
-class LocalHost(Host):
-    """Lives as turns in this very process."""
+class MailboxHome(Home):
+    """A deque in this process: what is sent is handled where it waits."""
 
     takes_parcels = False
+
+    def push(self, cell: Cell, item: Item) -> None:
+        mailbox.queue_of(cell).append(item)
+        cell.schedule()
+
+    def backlog(self, cell: Cell, running: int) -> int:
+        return sum(map(mailbox.counts, cell.queue or ()))
+
+    def load(self, cell: Cell) -> int:
+        return len(cell.queue or ()) + (cell.more is not None and cell.more.turn is not None)
+
+
+class HerePlace(Place):
+    """This very event loop."""
+
+    is_here = True
 
     def start(self, cell: Cell) -> asyncio.Future[None] | None:
         start = cell.extra().start
@@ -63,13 +80,6 @@ class LocalHost(Host):
         elif cell.state is RUNNING:
             cell.urge(Kill())
 
-    def retired(self, cell: Cell) -> None:
-        pass
-
-    def push(self, cell: Cell, item: Item) -> None:
-        mailbox.queue_of(cell).append(item)
-        cell.schedule()
-
     def control(self, cell: Cell, call: Call) -> None:
         if call.is_urgent:
             urge(cell, call)
@@ -80,14 +90,25 @@ class LocalHost(Host):
     def is_up(self, cell: Cell) -> bool:
         return is_up(cell)
 
-    def backlog(self, cell: Cell) -> int:
-        return sum(map(mailbox.counts, cell.queue or ()))
 
-    def load(self, cell: Cell) -> int:
-        return len(cell.queue or ()) + (cell.more is not None and cell.more.turn is not None)
+class NearParent(Parent):
+    """A supervisor in this process, or nobody: it hears of the end of a life by the mailbox."""
 
-    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        pass
+    def life_over(self, cell: Cell, reason: ExitReason, over: Callable[[bool | None], None]) -> None:
+        over(None)
+        ended(cell, reason)
+
+    def recipe(self, cell: Cell) -> Start[Any] | bytes:
+        start = cell.extra().start
+        assert start is not None
+        return start
+
+    def topics(self, cell: Cell) -> Iterable[str]:
+        start = cell.extra().start
+        return start.kind._topics if start is not None else ()
+
+    def is_restarting(self, cell: Cell) -> bool:
+        return parent_ended(cell)
 
 
 def outside_turn(
@@ -119,7 +140,8 @@ def urge(cell: Cell, command: Item) -> None:
         cell.urge(command)
 
 
-LOCAL = LocalHost()
+MAILBOX, HERE, NEAR = MailboxHome(), HerePlace(), NearParent()
+LOCAL = AddressHost(MAILBOX, HERE, NEAR)
 
 
 def begin(

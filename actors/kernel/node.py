@@ -29,6 +29,7 @@ from .topics import Topics
 if TYPE_CHECKING:
     from ..deadline_thread import Overdue
     from .actor import Actor, Start
+    from .address_host import AddressHost
     from .ref import ActorRef
 
 A = TypeVar("A", bound="Actor")
@@ -71,9 +72,9 @@ class Node(RunLoop):
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
         self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
         self.overdue: Overdue | None = None  # in an actor process: who ends it when it is blocked
-        self.here: Host = LOCAL  # lives in this very process
+        self.here: AddressHost = LOCAL  # lives in this very process
         self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody else has a path
-        self.host_for: Callable[[Any], Host] = lambda spec: self.here  # chooses where a child spec's lives are lived
+        self.host_for: Callable[[Any], AddressHost] = lambda spec: self.here  # chooses how a child's lives go
         self.keeper: Keeper = NothingKept()
         self.complete: Callable[[Any, str], Any] = lambda spec, path: spec  # what else is known of a child spec
         self.respec: Callable[[Cell, Start[Any]], None] = begin_with  # has an actor's next lives begin with this

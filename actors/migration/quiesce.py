@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Any
 
 from ..control.orders_lane import Call
@@ -129,11 +129,12 @@ class Settle(Item):
         return LEAVE
 
 
-class Transit(Host):
+class Transit:
     """Stands for the host of an actor that is at rest: what is asked for is done when it is known where it lives."""
 
     def __init__(self, old: Host, give_up: Callable[[str], None]) -> None:
         self.old, self._give_up = old, give_up
+        self.home, self.place, self.parent = old.home, old.place, old.parent
         self.waiting: list[Callable[[Host], object]] = []
         self.is_killed = False
         self.takes_parcels = old.takes_parcels
@@ -154,8 +155,17 @@ class Transit(Host):
     def push(self, cell: Cell, item: Item) -> None:
         self.waiting.append(lambda host: host.push(cell, item))
 
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        return self.home.offer(cell, item)
+
+    def progress(self, cell: Cell) -> object:
+        return None
+
     def recovers(self, reason: ExitReason) -> bool:
-        return self.old.recovers(reason)
+        return self.home.recovers(reason)
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return True
 
     def control(self, cell: Cell, call: Call) -> None:
         self.waiting.append(lambda host: host.control(cell, call))

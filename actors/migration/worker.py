@@ -14,7 +14,7 @@ from ..kernel.cell import Cell
 from ..kernel.envelope import Ask, Item
 from ..kernel.links import Monitor
 from ..kernel.stopping import PATIENCE
-from ..process.process_host import Outlet, ProcessHost, RemoteBound, admit_remote, admit_remote_bounded, undelivered
+from ..process.process_host import Outlet, RemoteBound, WorkerPlace, admit_remote, admit_remote_bounded, undelivered
 from ..process.wire.start_codec import pack_recipe
 from .here import let_in
 from .luggage import unpack, unpack_items
@@ -23,8 +23,9 @@ from .quiesce import now, sorted_out
 
 if TYPE_CHECKING:
     from ..kernel.actor import Actor
+    from ..kernel.address_host import AddressHost
     from ..process.resource_limits import Limits
-    from ..process.worker_pool import Worker, Workers
+    from ..process.worker_pool import Worker
 
 READY_WITHIN = 60.0
 """Seconds that a process may take to import what the actor needs."""
@@ -38,9 +39,9 @@ class ToWorker(Entering):
 
     to = "to a process"
 
-    def __init__(self, host: ProcessHost, workers: Workers, limits: Limits | None) -> None:
-        self.host, self._died = host, host.died
-        self._workers, self._limits = workers, limits
+    def __init__(self, host: AddressHost, limits: Limits | None) -> None:
+        assert isinstance(host.place, WorkerPlace)
+        self.host, self.place, self._limits = host, host.place, limits
         self.worker: Worker | None = None
         self.recipe = b""
 
@@ -49,9 +50,9 @@ class ToWorker(Entering):
         start = cell.extra().start
         assert start is not None
         self._began: asyncio.Future[float] = move.node.loop.create_future()
-        self._workers.want(start.kind.__module__)
+        self.place.workers.want(start.kind.__module__)
         self.recipe = pack_recipe(start, cell.path)
-        worker = self.worker = await self._workers.take()
+        worker = self.worker = await self.place.fork()
         worker.reserve(cell, self._limits, lambda cell, reason: move.give_up(f"the new process has died ({reason})"))
         move.hear(worker, self._heard)
         await move.within(worker.prepare(cell, self.recipe), READY_WITHIN, lambda: "the new process was not ready")
@@ -86,7 +87,7 @@ class ToWorker(Entering):
         if luggage.bound is not None:
             more.bound = RemoteBound(luggage.bound).inherit(luggage.bound)
             cell.admit = admit_remote_bounded
-        worker.adopt(cell, None, self._died)
+        worker.adopt(cell, None, self.place.died)
         if luggage.stash:
             self.move.say(worker, "stash")
             for item in luggage.stash:
@@ -115,6 +116,13 @@ class FromOwnWorker(Leaving):
     def __init__(self, worker: Worker) -> None:
         self.worker = worker
         self.dead: ExitReason | None = None  # the process has died meanwhile
+
+    @property
+    def place(self) -> WorkerPlace:
+        """Where the life lives until it has moved."""
+        place = self.cell.host.place
+        assert isinstance(place, WorkerPlace)
+        return place
 
     async def quiesce(self) -> None:
         move = self.move
@@ -169,8 +177,8 @@ class FromOwnWorker(Leaving):
             if not call.ask.is_done:
                 call.ask.started = False
                 cell.host.control(cell, call)
-        old = transit.old if transit is not None else None
-        if isinstance(old, ProcessHost) and old.stop_sent is not None:  # It came when the actor was at rest already.
+        old = transit.old.place if transit is not None else None
+        if isinstance(old, WorkerPlace) and old.stop_sent is not None:  # It came when the actor was at rest already.
             cell.host.stop(cell, old.stop_sent)
 
 
@@ -244,10 +252,10 @@ class FromWorker(FromOwnWorker):
             self.move.say_now(worker, "back")
             return
         host, outlet = transit.old, cell.extra().outlet
-        assert isinstance(host, ProcessHost)
+        place = self.place
         if self.dead is None:
             self.move.say_now(worker, "back")
-            worker.on_death(host.died)
+            worker.on_death(place.died)
             outlet.worker = worker
             send_queue(cell)
             transit.over(cell, host)
@@ -259,7 +267,7 @@ class FromWorker(FromOwnWorker):
             if id(ask) not in again:
                 ask.fail(AskFailed(cell.path, str(self.dead)))
         cell.host = host
-        host.died(cell, self.dead)
+        place.died(cell, self.dead)
         transit.over(cell, host)
 
 

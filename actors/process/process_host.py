@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Coroutine
+from collections.abc import Callable, Iterable
 from time import monotonic
 from typing import TYPE_CHECKING, Any
 
@@ -16,9 +16,11 @@ from ..errors import AskFailed, BadMessage, HoldfastError, StartFailed
 from ..events import ActorStarted, StoreRefused
 from ..exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ..kernel import lifecycle, links, mailbox
-from ..kernel.cell import DOWN, GONE, RUNNING, Cell, Host
+from ..kernel.address_host import AddressHost, Home, Parent, Place
+from ..kernel.cell import DOWN, GONE, RUNNING, Cell
 from ..kernel.codec import Parcel
 from ..kernel.envelope import Ask, Envelope, Item
+from ..kernel.lifecycle import NEAR
 from ..overflow import DROPS
 from ..persistence import child_key
 from .resource_limits import Limits
@@ -207,95 +209,72 @@ def _check_codable(cell: Cell, item: Any) -> None:
         cell.node.codec.encode(message, cell.path)
 
 
-class Elsewhere(Host):
-    """What hosts have in common whose lives are lived in another process: what one does is known there."""
+class WorkerHome(Home):
+    """A home whose lives can be lived in a process of their own."""
 
-    def worker_of(self, cell: Cell) -> Worker | None:
-        """The process that the present life is lived in, if there is one now."""
+    def enter(self, cell: Cell) -> Any:
+        """A life is to begin: from here on what is sent is admitted by the home. Returns what `goes_on` needs.
+
+        Raises:
+            StartFailed: it cannot.
+        """
+        raise NotImplementedError
+
+    async def let_begin(self) -> None:
+        """Wait until the life may begin."""
+
+    def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
+        """See to it that what is published comes in."""
+        raise NotImplementedError
+
+    def hand_to(self, cell: Cell, worker: Worker) -> dict[str, Any]:
+        """Give a process what the next life begins with; returns the options of its launch."""
+        raise NotImplementedError
+
+    async def goes_on(self, cell: Cell, worker: Worker, entered: Any) -> None:
+        """The life has begun there: what waits goes to it.
+
+        Raises:
+            StartFailed: it has ended meanwhile, or cannot go on from where the last one was.
+        """
+        raise NotImplementedError
+
+    def takes_stop(self, cell: Cell) -> bool:
+        """Whether a life has come so far that it can be told to end in good order."""
+        raise NotImplementedError
+
+    def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
+        """The process is gone, or the life in it has ended. Returns what is done when it is known what follows.
+
+        None: no life was there.
+        """
         raise NotImplementedError
 
 
-class ProcessHost(Elsewhere):
-    """The host of actors with a process of their own; one per such address."""
+class FlightHome(WorkerHome):
+    """A queue here, and what is on its way to the process: sent again to the next life unless it was begun."""
 
     takes_parcels = True
 
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        """The process puts a turn's number on its page first, and only then looks whether its deadline is over."""
-        outlet: Outlet | None = cell.extra().outlet
-        if outlet is None or outlet.worker is None:
-            return True
-        page = outlet.worker.page
-        return ask.started <= max(page[0], page[1]) or monotonic() < ask.deadline
-
-    def __init__(self, workers: Workers, limits: Limits | None, options: dict[str, Any] | None = None) -> None:
-        self._workers = workers
-        self._limits = limits
-        self._options = options or {}
-        self._starting: asyncio.Task[None] | None = None
-        self._stop_wanted: ExitReason | None = None
-        self.stop_sent: ExitReason | None = None  # the life in the process has been told to stop
-
-    # -- beginning --------------------------------------------------------------------------------------------------
-
-    def start(self, cell: Cell) -> asyncio.Future[None]:
-        """Begin a life in a fresh process."""
+    def enter(self, cell: Cell) -> None:
         more = cell.extra()
-        assert more.start is not None
-        cell.table = more.start.kind._table
         if more.outlet is None:
             more.outlet = Outlet(cell.path)
             cell.admit = admit_remote
             if more.bound is not None:
                 more.bound = RemoteBound(more.bound)
                 cell.admit = admit_remote_bounded
-        return self.begin(cell, self._start(cell))
 
-    def begin(self, cell: Cell, start: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
-        """Run the start of a life outside the supervisor's turn."""
-        self._stop_wanted = self.stop_sent = None
-        self._starting = lifecycle.outside_turn(cell, start)
-        return self._starting
-
-    async def take(self, cell: Cell) -> tuple[Worker, bytes]:
-        """A process for the next life at `cell`, which is running from now on, and its recipe.
-
-        Raises:
-            StartFailed: there is none to be had, or the actor was stopped meanwhile.
-        """
-        start = cell.extra().start
-        assert start is not None
-        try:
-            recipe = pack_recipe(start, cell.path)
-            worker = await self._workers.take(again=cell.life > 0)
-        except HoldfastError as error:
-            raise StartFailed(cell.path, str(error)) from error
-        if cell.state is not DOWN:
-            worker.kill(KILLED)
-            raise StartFailed(cell.path, "it was stopped while it started")
-        cell.life += 1
-        cell.state = RUNNING
-        worker.adopt(cell, self._limits, self.died)
-        return worker, recipe
-
-    async def _start(self, cell: Cell) -> None:
-        more = cell.extra()
-        start = more.start
-        assert start is not None
-        worker, recipe = await self.take(cell)
-        for topic in start.kind._topics:
+    def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
+        for topic in topics:
             cell.node.topics.subscribe(topic, cell)
-        try:
-            await worker.launch(cell, recipe, dict(self._options, bounded=more.bound is not None))
-        except StartFailed:
-            await worker.gone()
-            raise
-        if self._workers.of(cell) is not worker:
-            raise StartFailed(cell.path, str(more.reason))  # It was up, and has died before we came to it.
-        self.up(cell, worker)
 
-    def up(self, cell: Cell, worker: Worker) -> None:
-        """The life is up: send what waits."""
+    def hand_to(self, cell: Cell, worker: Worker) -> dict[str, Any]:
+        return {"bounded": cell.extra().bound is not None}
+
+    async def goes_on(self, cell: Cell, worker: Worker, entered: Any) -> None:
+        if cell.host.place.process(cell) is not worker:
+            raise StartFailed(cell.path, str(cell.extra().reason))  # It was up, and has died before we came to it.
         node = cell.node
         if node.watched:
             node.emit(ActorStarted(cell.path, cell.life))
@@ -311,43 +290,16 @@ class ProcessHost(Elsewhere):
                     outlet.hand_over(cell, item)
                 except BadMessage as error:
                     undelivered(cell, item, error)
-        if self._stop_wanted is not None:
-            self.stop(cell, self._stop_wanted)
 
-    # -- ending -----------------------------------------------------------------------------------------------------
-
-    def stop(self, cell: Cell, reason: ExitReason) -> None:
-        """Ask the actor to end in good order; while it starts, when it is up."""
-        worker = self._workers.of(cell)
+    def takes_stop(self, cell: Cell) -> bool:
         outlet: Outlet | None = cell.extra().outlet
-        start = cell.extra().start
-        if worker is not None and start is not None and getattr(start.kind, "_supervises", False):
-            self.send_stop(worker, cell, reason)  # A supervisor can end while it starts.
-        elif worker is None or outlet is None or outlet.worker is None:
-            self._stop_wanted = reason
-        else:
-            self.send_stop(worker, cell, reason)
+        return outlet is not None and outlet.worker is not None
 
-    def send_stop(self, worker: Worker, cell: Cell, reason: ExitReason) -> None:
-        """Tell the process that its actor shall end."""
-        self.stop_sent = reason
-        connection = worker.connection
-        connection.send(frames.Command(connection.name_out(cell.path), "stop", {"reason": pack_exit(reason)}))
-
-    def kill(self, cell: Cell) -> None:
-        """SIGKILL the process."""
-        worker = self._workers.of(cell)
-        if worker is not None:
-            worker.kill(KILLED)
-        elif self._starting is not None:
-            self._starting.cancel()
-
-    def died(self, cell: Cell, reason: ExitReason) -> None:
-        """The process is gone, or the life in it has ended: keep what is queued, fail what was begun."""
+    def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
+        """Keep what is queued, fail what was begun."""
         if cell.state in (DOWN, GONE):
-            return
+            return None
         outlet: Outlet = cell.extra().outlet
-        worker = self._workers.of(cell)
         begun, queued = outlet.close()
         if queued:
             mailbox.queue_of(cell).extendleft(reversed(queued))
@@ -362,14 +314,7 @@ class ProcessHost(Elsewhere):
             for ask in worker.take_pending():
                 if id(ask) not in again:  # Asks from inside the process, or delayed replies: nobody answers them now.
                     ask.fail(AskFailed(cell.path, str(reason)))
-        lifecycle.ended(cell, reason)
-
-    def retired(self, cell: Cell) -> None:
-        worker = self._workers.of(cell)
-        if worker is not None:
-            worker.kill(KILLED)
-        elif self._starting is not None and not self._starting.done():
-            self._starting.cancel()  # It waits for a process that is not wanted any more.
+        return lambda recovers: None
 
     def push(self, cell: Cell, item: Item) -> None:
         outlet: Outlet | None = cell.extra().outlet
@@ -378,20 +323,18 @@ class ProcessHost(Elsewhere):
         else:
             send_signal(outlet.worker, cell.path, item)
 
-    def control(self, cell: Cell, call: Call) -> None:
-        from ..control.orders_lane import send_call
+    def is_open(self, cell: Cell) -> bool:
+        return self.takes_stop(cell)
 
-        worker = self._workers.of(cell)
-        if worker is not None:
-            send_call(worker, cell.path, call)
-        else:
-            cell.extra().calls.append(call)  # Sent behind the next launch.
-
-    def is_up(self, cell: Cell) -> bool:
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        """The process puts a turn's number on its page first, and only then looks whether its deadline is over."""
         outlet: Outlet | None = cell.extra().outlet
-        return outlet is not None and outlet.worker is not None
+        if outlet is None or outlet.worker is None:
+            return True
+        page = outlet.worker.page
+        return ask.started <= max(page[0], page[1]) or monotonic() < ask.deadline
 
-    def backlog(self, cell: Cell) -> int:
+    def backlog(self, cell: Cell, running: int) -> int:
         queued = sum(map(mailbox.counts, cell.queue or ()))
         outlet: Outlet | None = cell.extra().outlet
         if outlet is None or outlet.worker is None:
@@ -406,13 +349,148 @@ class ProcessHost(Elsewhere):
             return queued
         return queued + int(outlet.sent - outlet.worker.page[1])
 
-    def worker_of(self, cell: Cell) -> Worker | None:
-        return self._workers.of(cell)
+
+FLIGHT = FlightHome()
+
+
+class WorkerPlace(Place):
+    """A process of the actor's own; one such place per address."""
+
+    is_here = False
+
+    def __init__(self, home: WorkerHome, parent: Parent, workers: Workers, limits: Limits | None) -> None:
+        self.home, self.parent, self.workers, self._limits = home, parent, workers, limits
+        self._starting: asyncio.Task[None] | None = None
+        self._stop_wanted: ExitReason | None = None
+        self.stop_sent: ExitReason | None = None  # the life in the process has been told to stop
+
+    # -- beginning --------------------------------------------------------------------------------------------------
+
+    def start(self, cell: Cell) -> asyncio.Future[None]:
+        """Begin a life in a fresh process, outside the supervisor's turn."""
+        start = cell.extra().start
+        if start is not None:
+            cell.table = start.kind._table
+        entered = self.home.enter(cell)  # Now, not in the task.
+        self._stop_wanted = self.stop_sent = None
+        self._starting = lifecycle.outside_turn(cell, self._start(cell, entered))
+        return self._starting
+
+    async def fork(self, *, again: bool = False) -> Worker:
+        """A process for a life; `again`: there was one before.
+
+        Raises:
+            ProcessUnavailable: there is none to be had.
+        """
+        return await self.workers.take(again=again)
+
+    async def take(self, cell: Cell) -> tuple[Worker, bytes]:
+        """A process for the next life at `cell`, which is running from now on, and its recipe.
+
+        Raises:
+            StartFailed: there is none to be had, or the actor was stopped meanwhile.
+        """
+        start = self.parent.recipe(cell)
+        try:
+            recipe = start if isinstance(start, bytes) else pack_recipe(start, cell.path)
+            worker = await self.fork(again=cell.life > 0)
+        except HoldfastError as error:
+            raise StartFailed(cell.path, str(error)) from error
+        if cell.state is not DOWN:
+            worker.kill(KILLED)
+            raise StartFailed(cell.path, "it was stopped while it started")
+        cell.life += 1
+        cell.state = RUNNING
+        worker.adopt(cell, self._limits, self.died)
+        return worker, recipe
+
+    def options(self, cell: Cell) -> dict[str, Any]:
+        """What a launch here says besides what the home says."""
+        return {}
+
+    async def _start(self, cell: Cell, entered: Any) -> None:
+        await self.home.let_begin()
+        worker, recipe = await self.take(cell)
+        self.home.subscribe(cell, self.parent.topics(cell))
+        try:
+            await worker.launch(cell, recipe, {**self.options(cell), **self.home.hand_to(cell, worker)})
+            await self.home.goes_on(cell, worker, entered)
+        except StartFailed:
+            await worker.gone()  # The next life begins when this one is over.
+            raise
+        self.settled(cell)
+
+    def settled(self, cell: Cell) -> None:
+        """The life in the process is the one; if it was to be stopped before, it is stopped now."""
+        if self._stop_wanted is not None:
+            self.stop(cell, self._stop_wanted)
+
+    # -- ending -----------------------------------------------------------------------------------------------------
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        """Ask the actor to end in good order; while it starts, when it is up. A supervisor can end while it starts."""
+        worker = self.workers.of(cell)
+        start = cell.extra().start
+        supervises = start is not None and getattr(start.kind, "_supervises", False)
+        if worker is not None and (supervises or self.home.takes_stop(cell)):
+            self.send_stop(worker, cell, reason)
+        else:
+            self._stop_wanted = reason
+
+    def send_stop(self, worker: Worker, cell: Cell, reason: ExitReason) -> None:
+        """Tell the process that its actor shall end."""
+        self.stop_sent = reason
+        connection = worker.connection
+        connection.send(frames.Command(connection.name_out(cell.path), "stop", {"reason": pack_exit(reason)}))
+
+    def kill(self, cell: Cell) -> None:
+        """SIGKILL the process."""
+        worker = self.workers.of(cell)
+        if worker is not None:
+            worker.kill(KILLED)
+        elif self._starting is not None:
+            self._starting.cancel()
+
+    def died(self, cell: Cell, reason: ExitReason) -> None:
+        """The process is gone, or the life in it has ended."""
+        over = self.home.lost(cell, self.workers.of(cell), reason)
+        if over is not None:
+            self.parent.life_over(cell, reason, over)
+
+    def retired(self, cell: Cell) -> None:
+        worker = self.workers.of(cell)
+        if worker is not None:
+            worker.kill(KILLED)
+        elif self._starting is not None and not self._starting.done():
+            self._starting.cancel()  # It waits for a process that is not wanted any more.
+
+    # -- what else a place does -------------------------------------------------------------------------------------
+
+    def control(self, cell: Cell, call: Call) -> None:
+        from ..control.orders_lane import send_call
+
+        worker = self.workers.of(cell)
+        if worker is not None:
+            send_call(worker, cell.path, call)
+        else:
+            cell.extra().calls.append(call)  # Sent behind the next launch.
+
+    def process(self, cell: Cell) -> Worker | None:
+        return self.workers.of(cell)
+
+    def running(self, cell: Cell) -> int:
+        worker = self.workers.of(cell)
+        return -1 if worker is None else int(worker.page[0]) - 1
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
-        worker = self._workers.of(cell)
+        worker = self.workers.of(cell)
         if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
             worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
+
+
+def in_process(workers: Workers, limits: Limits | None) -> AddressHost:
+    """The host of an actor without recovery that has a process of its own."""
+    return AddressHost(FLIGHT, WorkerPlace(FLIGHT, NEAR, workers, limits), NEAR)
 
 
 def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:

@@ -81,15 +81,14 @@ class Inner:
         """The mailbox of a stand-in: the class is known here, so it is known what it handles."""
         if type(item) not in cell.table and type(item) is not Parcel:
             cell.require(item)
-        self._host.admit(cell, item)
+        self._host.home.admit(cell, item)
 
     def gone(self, path: str, reason: ExitReason, *, with_parent: bool = False) -> None:
         """The address is free; `with_parent`: because its supervisor has ended."""
         cell = self._cells.pop(path, None)
         if cell is None:
             return
-        if cell.host is not self._host:
-            cell.host.told(cell, "gone", {"with_parent": with_parent})
+        cell.host.parent.leaves(is_restarting=with_parent)
         more = cell.extra()
         more.reason = reason
         for topic in list(more.topics):

@@ -21,8 +21,10 @@ from ..events import ActorStarted, Event, event_data
 from ..exit_reasons import ExitReason, pack_exit
 from ..fast_loop import new_event_loop
 from ..kernel import lifecycle
+from ..kernel.address_host import AddressHost
 from ..kernel.cell import RUNNING, Cell
 from ..kernel.envelope import AnyTable
+from ..kernel.lifecycle import HERE, MAILBOX
 from ..kernel.message import Message, Order, message_name
 from ..kernel.node import Node
 from ..kernel.ref import current
@@ -64,8 +66,8 @@ async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prep
     os._exit(code)
 
 
-class GuestHost(lifecycle.LocalHost):
-    """The host of the actors of the process: the root knows their addresses, so that they can be reached."""
+class GuestParent(lifecycle.NearParent):
+    """Above the actors of the process: the root knows their addresses, so that they can be reached."""
 
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
@@ -139,7 +141,8 @@ class Guest(Peer):
         self._host = OutsideHost(self)
         self.node.outside = self.outside
         self.node.uplink = self
-        self.node.here = GuestHost(self)
+        self.parent = GuestParent(self)
+        self.node.here = AddressHost(MAILBOX, HERE, self.parent)
         self.node.topics = GuestTopics(self)
         self.node.overdue = Overdue(loop)
         self.node.events.add_sink(self._on_event)
@@ -168,7 +171,7 @@ class Guest(Peer):
         if cell is None:
             cell = self._outside[path] = Cell(self.node, None, path, self._host)
             cell.state = RUNNING
-            cell.admit, cell.table = self._host.admit, OUTSIDE
+            cell.admit, cell.table = self._host.home.admit, OUTSIDE
         return cell
 
     def require_granted(self, path: str, order: str) -> None:

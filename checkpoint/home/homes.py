@@ -1,38 +1,31 @@
-"""The homes of a root, and the phases of a recovery: detect, isolate, restart, restore, replay, release."""
+"""The homes of a root: what is accepted at each recorded address, from the store or since; and who is to blame."""
 
 from __future__ import annotations
 
-import asyncio
-import time
-from collections.abc import Awaitable, Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
-from ...actors.errors import ControlFailed, HoldfastError, StartFailed, StartIgnored
-from ...actors.events import ActorStarted, Recovered, RecoveryFailed
-from ...actors.exit_reasons import ExitReason
-from ...actors.kernel import lifecycle, links
-from ...actors.kernel.cell import DOWN, GONE, Cell, Host
+from ...actors.errors import ControlFailed, HoldfastError, StartFailed
+from ...actors.events import RecoveryFailed
+from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import child_key
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Journal, Saved
 from ..method import Durability, Method, hybrid
-from ..protocol import START, LifePort
-from ..recovery.recoveries import Recoveries, Recovery
+from ..protocol import START
+from ..recovery.recoveries import Recoveries
 from ..recovery_file import RecoveryFile
 from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_schedule import nobody
-from ..snapshot.unreplayed import forget_turns
-from .admission import Admission
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
-from .held_messages import hold, inlet, let_go
+from .held_messages import let_go
 from .quarantine import PLACE, Quarantine
 from .switch import Switch
 
 if TYPE_CHECKING:
-    from ...actors.kernel.envelope import Ask, Item
     from ...actors.kernel.node import Node
 
 ENDED = "it ended before it was live"
@@ -298,272 +291,3 @@ class Homes:
         for switch in self._switches.values():
             switch.images.close()
         self.journal.close()
-
-
-class Clock:
-    """The phases of one recovery. (Clocks of loops are too coarse for this.)"""
-
-    __slots__ = ("_marks",)
-
-    def __init__(self) -> None:
-        self._marks: dict[str, float] = {}
-
-    def mark(self, phase: str, when: float | None = None) -> None:
-        """This phase is over now."""
-        self._marks[phase] = time.monotonic() if when is None else when
-
-    def when(self, phase: str) -> float:
-        """The end of a phase."""
-        return self._marks[phase]
-
-    def phases(self, restore_seconds: float) -> dict[str, float]:
-        """Seconds by phase."""
-        spans: dict[str, float] = {}
-        before = self._marks.get("noticed")
-        for phase in ("detect", "isolate", "restart", "replay", "release"):
-            after = self._marks.get(phase)
-            if after is None:
-                continue
-            spans[phase] = max(0.0, after - before) if before is not None else 0.0
-            before = after
-        spans["restart"] = max(0.0, spans.get("restart", 0.0) - restore_seconds)
-        spans["restore"] = restore_seconds
-        return spans
-
-
-class HomeHost(Host):
-    """What all hosts of recorded actors have in common: the home, and the clock of the recovery at hand."""
-
-    takes_parcels = True
-    page: memoryview | None = None  # of a life in this process
-
-    def __init__(self, homes: Homes, method: Method) -> None:
-        self.homes, self.method = homes, method
-        self.switch: Switch | None = None
-        self.clock: Clock | None = None
-        self.recovery: Recovery | None = None  # that of the life which is begun now
-        self._starting: asyncio.Task[None] | None = None
-
-    def enter(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
-        """As `open`, and it is a recovery if anything comes back, or if one is not over."""
-        switch, live, recovering = self.open(cell)
-        recoveries = self.homes.recoveries
-        self.recovery = None
-        if recovering or recoveries.of(cell.path) is not None:
-            self.recovery = recoveries.starts(cell.path, self.method)
-            hold(switch)
-            switch.waits_for_release = recoveries.needs(self.recovery, "release")
-        return switch, live, recovering
-
-    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
-        return True
-
-    @property
-    def is_gated(self) -> bool:
-        """Whether the recovery of the life at hand waits for somebody on its way."""
-        return self.recovery is not None and self.homes.recoveries.is_gated(self.recovery)
-
-    async def gate(self, stage: str) -> None:
-        """Wait until the recovery may go on to this stage; not for long."""
-        recovery = self.recovery
-        if recovery is not None:
-            wait = self.homes.recoveries.gate(recovery, stage)
-            if wait is not None:
-                await asyncio.shield(wait)
-            if stage == "restart":
-                self.isolated()
-
-    def isolated(self) -> None:
-        """S2 is over: nothing reaches the actor, and nothing of its old life gets out."""
-        if self.recovery is not None:
-            self.homes.recoveries.phase(self.recovery, "isolate", time.monotonic())
-
-    def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
-        """A life is to begin: its home holds what comes. Returns the home, when it is live, and if it recovers."""
-        switch = self.switch = self.homes.of(cell, self.method)
-        if not self.method.replays:
-            forget_turns(switch)
-        self.clock = self.clock or Clock()
-        self.clock.mark("isolate")
-        return switch, switch.prepare(), not switch.is_new
-
-    def topics(self, cell: Cell) -> Iterable[str]:
-        """Those that the class subscribes to."""
-        start = cell.extra().start
-        return start.kind._topics if start is not None else ()
-
-    def is_restarting(self, cell: Cell) -> bool:
-        """Whether a retired address may have its supervisor, and so itself, started again."""
-        return lifecycle.parent_ended(cell)
-
-    def subscribe(self, cell: Cell) -> None:
-        """Have the home admit what is published, also between two lives."""
-        assert self.switch is not None
-        for topic in (*self.topics(cell), *self.switch.topics):
-            cell.node.topics.subscribe(topic, inlet(self.switch, topic))
-
-    def over(
-        self,
-        cell: Cell,
-        running: int,
-        why: str,
-        *,
-        ordered: bool,
-        noticed: float | None = None,
-        reason: ExitReason | None = None,
-        recovers: bool | None = None,
-    ) -> None:
-        """A life has ended; the home keeps everything.
-
-        Args:
-            cell: its address.
-            running: the input in hand, -1 if none.
-            why: in words.
-            ordered: we have killed it.
-            noticed: when its end was noticed, if before now.
-            reason: why it has ended; that of the cell if left out.
-            recovers: whether it is brought back; judged by its spec if left out.
-        """
-        switch = self.switch
-        if switch is None:
-            return
-        if self.page is not None:
-            self.page[0] = 0
-        self.clock = Clock()
-        self.clock.mark("noticed", noticed)
-        self.clock.mark("detect")
-        switch.died(running, ordered=ordered)
-        if recovers is None:
-            end = cell.extra().reason if reason is None else reason
-            recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
-        if recovers:
-            hold(switch, running)
-            self.homes.recoveries.crashed(cell.path, self.method, noticed)
-        cell.extra().topics.clear()  # These would be unsubscribed with the life.
-        if switch.live is not None and not switch.live.done():
-            switch.live.set_exception(StartFailed(cell.path, why))
-            switch.live.exception()  # Nobody may be left to look.
-
-    def ended_below(self, cell: Cell, reason: ExitReason, *, recovers: bool) -> None:
-        """Tell of the end of a life whose supervisor is in another process: that one decides what follows."""
-        more = cell.extra()
-        cell.state, more.reason = DOWN, reason
-        links.announce(cell, reason, recovering=recovers)
-        lifecycle.tell_enders(more, reason)
-
-    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
-        """Admit a message for a sender that waits until it counts."""
-        commits = self.homes.journal
-        before = commits.submitted
-        cell.admit(cell, item)
-        last = commits.last if commits.submitted != before else None
-        return last.accepted() if isinstance(last, Admission) else None
-
-    def progress(self, cell: Cell) -> object:
-        """How far the replay has come."""
-        return None if self.switch is None else self.switch.progress
-
-    def recovers(self, reason: ExitReason) -> bool:
-        """Whether an end for this reason is followed by a recovery."""
-        return not reason.is_clean
-
-    def is_up(self, cell: Cell) -> bool:
-        """Whether the life takes messages now."""
-        return self.switch is not None and self.switch.is_released
-
-    def backlog(self, cell: Cell) -> int:
-        """Messages that wait."""
-        return 0 if self.switch is None else self.switch.backlog(self.running(cell))
-
-    def load(self, cell: Cell) -> int:
-        """Messages that wait and those in hand; what the actor has put aside is among them."""
-        return 0 if self.switch is None else len(self.switch.open)
-
-    def running(self, cell: Cell) -> int:
-        """The input in hand, -1 if none is known."""
-        return -1
-
-    def push(self, cell: Cell, item: Item) -> None:
-        """Have the home put an item of the runtime's own behind the messages."""
-        if self.switch is not None:
-            self.switch.push(item)
-
-    def retired(self, cell: Cell) -> None:
-        """The address is gone for good: a start that is under way is not wanted any more."""
-        if self._starting is not None and not self._starting.done():
-            self._starting.cancel()
-        self.give_up(cell)
-
-    def give_up(self, cell: Cell) -> None:
-        """The address is free: it hears nothing more."""
-        if self.switch is None:
-            return
-        restarting = self.is_restarting(cell)
-        for topic in (*self.topics(cell), *self.switch.topics):
-            cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
-        self.switch.ends.drop_all("it has stopped", keep_tells=restarting)
-        let_go(self.switch)
-        why = "its supervisor has ended" if restarting else "it is not started again"
-        self.homes.recoveries.given_up(cell.path, why)
-
-    async def replay(self, cell: Cell, port: LifePort, live: asyncio.Future[float], recovering: bool) -> None:
-        """The rest of S3, what a life that has begun has handled since; then S4.
-
-        Raises:
-            StartFailed: it did not come so far.
-        """
-        assert self.clock is not None
-        assert self.switch is not None
-        self.clock.mark("restart")
-        await self.gate("replay")
-        if not live.done():  # Else it has ended meanwhile.
-            self.switch.attach(port)
-        await self.until_live(cell, live, recovering)
-
-    async def until_live(self, cell: Cell, live: asyncio.Future[float], recovering: bool) -> None:
-        """Wait until a life has caught up, and tell of it.
-
-        Raises:
-            StartFailed: it did not.
-        """
-        node, clock, switch = cell.node, self.clock, self.switch
-        assert clock is not None
-        assert switch is not None
-        try:
-            restore_seconds = await live
-            if switch.port is None:  # It was over before anybody came to look.
-                if switch.waits_for_release:
-                    raise StartFailed(cell.path, ENDED)
-                return  # It was up, and has ended in a turn: that is told by its end, and no start has failed.
-            clock.mark("replay", switch.live_at)
-            await self._let_at(switch, clock, restore_seconds)
-        except HoldfastError as error:
-            if not isinstance(error, StartIgnored):
-                node.emit(RecoveryFailed(cell.path, str(error)))
-            raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
-        except asyncio.CancelledError:
-            raise StartFailed(cell.path, "it was stopped while it started") from None
-        if node.watched:
-            node.emit(ActorStarted(cell.path, cell.life))
-        if recovering:
-            clock.mark("release")
-            if node.watched:
-                node.emit(Recovered(cell.path, cell.life, switch.replayed, clock.phases(restore_seconds)))
-        self.homes.recoveries.over(cell.path)
-
-    async def _let_at(self, switch: Switch, clock: Clock, restore_seconds: float) -> None:
-        """S4, if anybody has a say in it; else the home has done it.
-
-        Raises:
-            StartFailed: the life has ended meanwhile.
-        """
-        recovery, port = self.recovery, switch.port
-        if recovery is None:
-            return
-        self.homes.recoveries.came_up(recovery, clock.when("restart"), switch.live_at, restore_seconds)
-        if switch.waits_for_release:
-            await self.gate("release")
-            if port is None or switch.port is not port:
-                raise StartFailed(switch.path, ENDED)
-            switch.waits_for_release = False
-            switch.let_at()

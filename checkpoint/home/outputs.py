@@ -20,6 +20,7 @@ from ..life.recorded_inbox import STARTED
 from ..protocol import MESSAGE, PIPE, Answer, Hooked, Out, PipeDone
 from .held_messages import Inlet, inlet
 from .pending_asks import SwitchAsk, answer_ask, origin_of
+from .recorded_home import switch_of
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -330,11 +331,6 @@ def _failure(done: asyncio.Future[None]) -> HoldfastError | None:
     """Why something was not accepted."""
     error = None if done.cancelled() else done.exception()
     return error if isinstance(error, HoldfastError) else None
-
-
-def switch_of(cell: Cell) -> Switch | None:
-    """The switch of a recorded actor's cell."""
-    return getattr(cell.host, "switch", None)
 
 
 def went_elsewhere(home: Switch, out: Out, digest: int) -> bool:

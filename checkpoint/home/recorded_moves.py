@@ -17,18 +17,21 @@ from ...actors.migration.here import Arrival, FromHere
 from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import Settle, Transit, now, part, settle_with_queue, sorted_out
 from ...actors.migration.worker import FromOwnWorker, FromWorker, ToWorker
-from ...actors.process.process_host import ProcessHost
+from ...actors.process.process_host import WorkerPlace
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
 from ..protocol import LifePort, Live, ToHome
-from .recorded_hosts import LocalHome, RecordedProcessHost, RemoteLife, TaskHost, records_of
+from .journal_home import JournalHome
+from .life_here import LifeHere, LocalHome
+from .life_ports import RemoteLife, records_of
 from .switch import Switch
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
+    from ...actors.kernel.address_host import AddressHost
     from ...actors.kernel.envelope import Item
     from ...actors.process.resource_limits import Limits
-    from ...actors.process.worker_pool import Workers
+    from ...actors.process.worker_pool import Worker
 
 
 def leaving(cell: Cell, ignored: tuple[str, ...] = ()) -> Leaving:
@@ -41,15 +44,13 @@ def leaving(cell: Cell, ignored: tuple[str, ...] = ()) -> Leaving:
     Raises:
         CannotMove: its process has ended.
     """
-    host = cell.host
-    if isinstance(host, TaskHost):
-        return FromRecordedHere(host, ignored)
-    if not isinstance(host, ProcessHost):
-        return FromHere(ignored)
-    worker = host.worker_of(cell)
+    home, place = cell.host.home, cell.host.place
+    if not isinstance(place, WorkerPlace):
+        return FromRecordedHere(home, ignored) if isinstance(home, JournalHome) else FromHere(ignored)
+    worker = place.process(cell)
     if worker is None:
         raise CannotMove(cell.path, "its process has ended")
-    return FromRecordedWorker(worker) if isinstance(host, RecordedProcessHost) else FromWorker(worker)
+    return FromRecordedWorker(worker, home) if isinstance(home, JournalHome) else FromWorker(worker)
 
 
 class Detached:
@@ -94,22 +95,24 @@ def refuse_unsaved(cell: Cell, home: Switch | None) -> None:
 class FromRecordedHere(FromHere):
     """A recorded life in this process comes to rest."""
 
-    def __init__(self, host: TaskHost, ignored: tuple[str, ...] = ()) -> None:
+    def __init__(self, home: JournalHome, ignored: tuple[str, ...] = ()) -> None:
         super().__init__(ignored)
-        self._host = host
-        self._home: Detached | None = None
+        self._home = home
+        self._detached: Detached | None = None
         self._life: Life | None = None
 
     async def quiesce(self) -> None:
         await super().quiesce()
-        refuse_unsaved(self.cell, self._host.switch)
+        refuse_unsaved(self.cell, self._home.switch)
 
     def pack(self, actor: Actor, state: bytes) -> None:
-        assert self._host.switch is not None
-        self._home = Detached(self._host.switch)
+        assert self._home.switch is not None
+        self._detached = Detached(self._home.switch)
 
     def part(self) -> list[Item]:
-        life = self._life = self._host.life
+        place = self.cell.host.place
+        assert isinstance(place, LifeHere)
+        life = self._life = place.life
         assert life is not None
         life.port.shut()  # type: ignore[attr-defined]  # in this process it is a LocalHome
         old = self._old = part(self.cell)
@@ -122,49 +125,50 @@ class FromRecordedHere(FromHere):
         return StopRecorded(self._life, self.move.reason())
 
     def take_back(self, transit: Transit) -> None:
-        assert self._home is not None
-        self._home.attach_again(transit)
+        assert self._detached is not None
+        self._detached.attach_again(transit)
 
 
 class FromRecordedWorker(FromOwnWorker):
     """A recorded life leaves the process of its own."""
 
-    _home: Detached | None = None
+    def __init__(self, worker: Worker, home: JournalHome) -> None:
+        super().__init__(worker)
+        self._home = home
+        self._detached: Detached | None = None
 
     async def quiesce(self) -> None:
         await super().quiesce()
-        refuse_unsaved(self.cell, self._old().switch)
-
-    def _old(self) -> RecordedProcessHost:
-        transit = self.move.transit
-        assert transit is not None
-        assert isinstance(transit.old, RecordedProcessHost)
-        return transit.old
+        refuse_unsaved(self.cell, self._home.switch)
 
     def left(self) -> None:
-        switch = self._old().switch
-        assert switch is not None
-        self._home = Detached(switch)
+        assert self._home.switch is not None
+        self._detached = Detached(self._home.switch)
         self.taken.set_result(None)
 
     def part(self) -> list[Item]:
         return []
 
     def resume(self) -> None:
-        cell, worker, transit, home = self.cell, self.worker, self.move.transit, self._home
-        if self.dead is None:
+        cell, worker, transit, detached, dead = self.cell, self.worker, self.move.transit, self._detached, self.dead
+        if dead is None:
             self.move.say_now(worker, "back")
-        if transit is None or home is None:
+        if transit is None or detached is None:
             return
-        old = self._old()
-        home.attach_again(transit)
-        if self.dead is None:
-            worker.on_death(old.died)
+        old = transit.old
+        detached.attach_again(transit)
+        if dead is None:
+            worker.on_death(self.place.died)
             transit.over(cell, old)
             return
         cell.host = old
-        old.over(cell, -1, str(self.dead), ordered=False, noticed=worker.noticed_at, reason=self.dead)
-        lifecycle.ended(cell, self.dead)
+
+        def over(recovers: bool | None) -> None:
+            self._home.over(
+                cell, -1, str(dead), ordered=False, noticed=worker.noticed_at, reason=dead, recovers=recovers
+            )  # fmt: skip
+
+        old.parent.life_over(cell, dead, over)
         transit.over(cell, old)
 
 
@@ -220,36 +224,37 @@ class Beginning:
 class ToRecordedWorker(ToWorker):
     """A recorded life begins in a process of its own."""
 
-    def __init__(self, host: RecordedProcessHost, workers: Workers, limits: Limits | None) -> None:
-        super().__init__(host, workers, limits)
-        self._recorded = host
+    def __init__(self, host: AddressHost, limits: Limits | None) -> None:
+        super().__init__(host, limits)
+        assert isinstance(host.home, JournalHome)
+        self._home = host.home
 
     async def begin(self) -> None:
-        cell, luggage, worker = self.cell, self.move.luggage, self.worker
+        cell, luggage, worker, home = self.cell, self.move.luggage, self.worker, self._home
         assert worker is not None
-        switch, live, _ = self._recorded.open(cell)
+        switch, live, _ = home.open(cell)
         beginning = self._beginning = Beginning(self.move, switch)
         take = records_of(worker, beginning.from_life)
         worker.record_taker = lambda path: take
         port = RemoteLife(cell.path, worker)
         for record in switch.restore_records():
             port.to_life(record)
-        recorded = {"method": self._recorded.method.data(), "turn": switch.state_turn, "stash": switch.stash}
         kept = {"suspended": luggage.suspended, "trap_exits": luggage.traps}
-        await self.launch(worker, {"recorded": {**recorded, **kept}})
+        await self.launch(worker, {"recorded": {**home.launch_data(), **kept}})
         switch.attach(port)
         beginning.follow(live)
         await beginning.is_live()
 
     def take_over(self) -> list[Item]:
         assert self.worker is not None
-        self.worker.adopt(self.cell, None, self._recorded.died)
+        self.worker.adopt(self.cell, None, self.place.died)
         return []
 
     def go_on(self) -> None:
         assert self.worker is not None
         self._beginning.go_on()
-        self._recorded.is_live(self.cell)
+        self._home.clock = None
+        self.place.settled(self.cell)
         self.worker.connection.flush()
 
     async def went_on(self) -> None:
@@ -261,13 +266,14 @@ class ToRecordedHere(Entering):
 
     to = "to a task"
 
-    def __init__(self, host: TaskHost) -> None:
-        self.host = self._recorded = host
+    def __init__(self, host: AddressHost) -> None:
+        assert isinstance(host.place, LifeHere)
+        self.host, self._place = host, host.place
         self._arrival: RecordedArrival | None = None
 
     async def begin(self) -> None:
         luggage = self.move.luggage
-        arrival = self._arrival = RecordedArrival(self.cell, self._recorded)
+        arrival = self._arrival = RecordedArrival(self.cell, self._place)
         await arrival.is_up(self.move, arrival.begin_recorded(suspended=luggage.suspended, trap_exits=luggage.traps))
 
     def take_over(self) -> list[Item]:
@@ -288,23 +294,23 @@ class ToRecordedHere(Entering):
 class RecordedArrival(Arrival):
     """A recorded life that begins as a task beside its address, from its last snapshot and what is behind it."""
 
-    def __init__(self, cell: Cell, host: TaskHost) -> None:
+    def __init__(self, cell: Cell, place: LifeHere) -> None:
         super().__init__(cell)
-        self._host = host
+        self._place = place
         self.other.life -= 1  # Counted up by the life that begins; it is no other one.
         self._life: Life | None = None
         self._home: ArrivingHome | None = None
 
     def begin_recorded(self, *, suspended: bool, trap_exits: bool = False) -> asyncio.Future[None]:
         """Restore and replay; the future ends when the life is live."""
-        cell, host, start = self.cell, self._host, self.cell.extra().start
+        cell, owner, start = self.cell, self._place.home, self.cell.extra().start
         assert start is not None
         self.other.extra().trap_exits = trap_exits
-        switch, live, _ = host.open(cell)
+        switch, live, _ = owner.open(cell)
         up: asyncio.Future[None] = cell.node.loop.create_future()
-        home = self._home = ArrivingHome(host, cell, self.other, up)
-        host.page = host.homes.page(switch)
-        life = self._life = Life(self.other, home, host.method, host.page)
+        home = self._home = ArrivingHome(owner, cell, self.other, up)
+        owner.page = owner.homes.page(switch)
+        life = self._life = Life(self.other, home, owner.method, owner.page)
         life.begins_suspended = suspended
         for record in switch.restore_records():
             life.to_life(record)
@@ -316,11 +322,11 @@ class RecordedArrival(Arrival):
 
     def take_place(self) -> None:
         """From here on the new life is the one."""
-        life, host = self._life, self._host
+        life, place = self._life, self._place
         assert life is not None
         settle_with_queue(self.other, self.cell)
         life.cell = self.cell
-        host.life, host.clock = life, None
+        place.life, place.home.clock = life, None
 
     def go_on(self) -> None:
         """Now it is live: its home feeds it what waits."""
@@ -332,8 +338,8 @@ class RecordedArrival(Arrival):
 class ArrivingHome(LocalHome):
     """The way home of a life that is not the one yet: its home hears that it is live when it is."""
 
-    def __init__(self, host: TaskHost, cell: Cell, other: Cell, settled: asyncio.Future[None]) -> None:
-        super().__init__(host, cell)
+    def __init__(self, home: JournalHome, cell: Cell, other: Cell, settled: asyncio.Future[None]) -> None:
+        super().__init__(home, cell)
         self._other, self._settled = other, settled
         self._held: list[ToHome] | None = None
         self._is_arriving = True

@@ -502,8 +502,8 @@ class Life:
         self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.
 
 
-class LifeHost(lifecycle.LocalHost):
-    """The host of a recorded actor whose turns run in this process."""
+class LifePlace(lifecycle.HerePlace):
+    """The event loop of this process, for a recorded actor: its home feeds its turns."""
 
     def __init__(self, life: Life | None = None) -> None:
         self.life = life
@@ -512,8 +512,12 @@ class LifeHost(lifecycle.LocalHost):
         if cell.state is RUNNING and self.life is not None:
             cell.urge(StopRecorded(self.life, reason))
 
+
+class FedHome(lifecycle.MailboxHome):
+    """What the actor's home at the root has fed to the life in this process."""
+
     def recovers(self, reason: ExitReason) -> bool:
         return not reason.is_clean
 
-    def retired(self, cell: Cell) -> None:
-        cell.node.here.retired(cell)
+
+FED = FedHome()

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Any, cast
 import msgspec
 
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
-from ...actors.kernel import links
-from ...actors.kernel.cell import DOWN, Cell, Host
-from ...actors.kernel.envelope import Item
+from ...actors.exit_reasons import ExitReason
+from ...actors.kernel.address_host import AddressHost
+from ...actors.kernel.cell import DOWN, RUNNING, Cell
+from ...actors.kernel.lifecycle import HERE, NEAR
 from ...actors.persistence import child_key
 from ...actors.process.wire import frames
-from ...actors.process.wire.peer import send_signal
 from ..method import Method
 from ..protocol import (
     Begin,
@@ -26,10 +26,12 @@ from ..protocol import (
     ToHome,
     ToLife,
 )
-from .child_stub import ChildStub
-from .recorded_life import Life, LifeHost
+from .child_stub import ChildPlace, RootHome
+from .recorded_inbox import StopRecorded
+from .recorded_life import FED, Life, LifePlace
 
 if TYPE_CHECKING:
+    from ...actors.control.orders_lane import Call
     from ...actors.process.worker_node import Guest
 
 FROM_HOME: msgspec.msgpack.Decoder[ToLife] = msgspec.msgpack.Decoder(ToLife)
@@ -71,17 +73,19 @@ class RecordedGuest:
         """
         port = self.port_of(cell.path)
         life = Life(cell, port, Method.of(options["method"]), self._guest.page, may_fork=True)
-        cell.host = LifeHost(life)
+        cell.host = AddressHost(FED, LifePlace(life), self._guest.parent)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
         life.begins_suspended = bool(options.get("suspended"))
         port.begin(life, int(options["turn"]), list(options["stash"]))
 
-    def host_for(self, spec: Any) -> Host:
+    def host_for(self, spec: Any) -> AddressHost:
         """Where a child below this process's supervisor is lived: here; if it is recorded, its home is at the root."""
         if spec.recovery is not None and spec.recovery.records:
-            return InnerLifeHost(self._guest, spec.recovery, self.port_of)
-        return self._guest.node.here
+            place = child_here(self._guest, spec.recovery)
+            return AddressHost(place.home, place, NEAR)
+        here: AddressHost = self._guest.node.here
+        return here
 
 
 class GuestKeeper:
@@ -146,7 +150,7 @@ class Port:
         self._guest, self._path = guest, path
         self.life: Life | None = None
         self._state: list[Restore] = []
-        self.stub: ChildStub | None = None  # of a child: it hears of its lives
+        self.place: ChildPlace | None = None  # of a child: it hears of its lives
 
     def take(self, frame: frames.Record) -> None:
         """A record from home."""
@@ -155,15 +159,15 @@ class Port:
             case Restore():
                 self._state.append(record)
             case Begin():
-                if self.stub is not None:  # Else its address has gone meanwhile.
-                    self.stub.begin_here(record)
+                if self.place is not None:  # Else its address has gone meanwhile.
+                    self.place.begin_here(record)
                 self._state.clear()
             case Started():
-                if self.stub is not None:
-                    self.stub.started(record)
+                if self.place is not None:
+                    self.place.started(record)
             case Over() | Respec():
-                if self.stub is not None:
-                    self.stub.told_by_group(record)
+                if self.place is not None:
+                    self.place.told_by_root(record)
             case _:
                 if self.life is not None:
                     self.life.to_life(record)
@@ -191,26 +195,22 @@ class Port:
 
     def closed(self) -> None:
         self.life = None
-        if self.stub is not None:
-            self.stub.closed_here()
+        if self.place is not None:
+            self.place.closed_here()
 
 
-class InnerLifeHost(ChildStub, LifeHost):
-    """The host of a recorded child of a supervisor in this process, whose lives are lived here."""
+class ChildHere(ChildPlace):
+    """The event loop of the supervisor's process."""
+
+    is_here = True
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the home to bring the actor back."""
         return self.ask_for_life(cell, self._with_ports(cell))
 
-    def progress(self, cell: Cell) -> object:
-        life = self.life
-        if life is None or (life.feed is None and not cell.queue):
-            return object()  # It waits for its home.
-        return life.turn
-
     def let_go(self) -> Life:
         """The life that is lived here, which is at rest, is not the address's any more; its home hears no more."""
-        life, self.life = self.life, None
+        life, self.home.life = self.home.life, None
         assert life is not None
         assert self._port is not None
         self._port.life = None
@@ -230,7 +230,7 @@ class InnerLifeHost(ChildStub, LifeHost):
             return
         assert port is not None
         cell.life = record.life - 1
-        page = self._guest.page[record.slot : record.slot + 1]
+        page = self.home.guest.page[record.slot : record.slot + 1]
         life = Life(cell, port, self._method, page, may_fork=True)
         try:
             port.begin(life, record.turn, record.stash)
@@ -239,42 +239,47 @@ class InnerLifeHost(ChildStub, LifeHost):
             self.fail(error)
             self.say_closed(cell, cell.extra().reason)
         else:
-            self.life = life
+            self.home.life = life
 
     def started(self, record: Started) -> None:
         cell = self.cell
         if not self.is_starting(record.number):
             return
         if not record.problem:
-            self._came_up()
+            self.came_up()
         elif cell.state is DOWN:
             self.fail(StartFailed(cell.path, record.problem))
         else:  # Its replay diverged: the next life begins when this one is over.
             cell.ended().add_done_callback(lambda _: self.fail(StartFailed(cell.path, record.problem)))
             cell.kill()
 
-    def _came_up(self) -> None:
-        if self._up is not None and not self._up.done():
-            self._up.set_result(None)
-
     def closed_here(self) -> None:
-        life, cell, self.life = self.life, self.cell, None
+        life, cell, self.home.life = self.home.life, self.cell, None
         if life is None:
             return  # It has not begun yet, or is not the address's any more.
         self.say_closed(cell, cell.extra().reason)
         if life.ignored_why is not None:
             self.fail(StartIgnored(cell.path, life.ignored_why))
         elif life.is_live:
-            self._came_up()  # It was up, and has ended in a turn before its home could say so.
+            self.came_up()  # It was up, and has ended in a turn before its home could say so.
         else:
             self.fail(StartFailed(cell.path, str(cell.extra().reason)))
 
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        if cell.state is RUNNING and self.home.life is not None:
+            cell.urge(StopRecorded(self.home.life, reason))
+
     def kill(self, cell: Cell) -> None:
         if not self.gave_up_start(cell):
-            super().kill(cell)
+            HERE.kill(cell)
 
-    def push(self, cell: Cell, item: Item) -> None:
-        if isinstance(item, (links.Exit, links.Down)):
-            send_signal(self._guest, cell.path, item)
-        else:
-            super().push(cell, item)
+    def control(self, cell: Cell, call: Call) -> None:
+        HERE.control(cell, call)
+
+    def is_up(self, cell: Cell) -> bool:
+        return HERE.is_up(cell)
+
+
+def child_here(guest: Guest, method: Method) -> ChildHere:
+    """The place of a recorded child of a supervisor in this process, whose lives are lived here."""
+    return ChildHere(RootHome(guest), method, guest.recovery.port_of)

@@ -18,7 +18,7 @@ from ...actors.kernel.codec import Parcel
 from ...actors.kernel.lifecycle import LOCAL
 from ...actors.kernel.node import cell_kind
 from ...actors.safe_state import SafeStateChange
-from ..home.outputs import switch_of
+from ..home.recorded_home import switch_of
 from ..recovery_settings import SafeState
 
 if TYPE_CHECKING:

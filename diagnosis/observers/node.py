@@ -10,7 +10,7 @@ from ...actors.control.orders import Status, status_of
 from ...actors.control.orders_lane import ask_status
 from ...actors.errors import HoldfastError, SpecError
 from ...actors.kernel.cell import RUNNING, Cell
-from ...actors.process.process_host import ProcessHost
+from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost, Peer
 from ...supervision.intensity import admit_restart
 from ..literals import Literal, running
@@ -95,7 +95,7 @@ class NodeObserver(Observer):
             return self._answers(host.peer, cell, PATIENCE if self._hung_after is None else self._hung_after)
         if cell.state is not RUNNING or not host.is_up(cell):
             return False
-        worker = host.worker_of(cell) if isinstance(host, ProcessHost) else None
+        worker = host.place.process(cell) if isinstance(host.place, WorkerPlace) else None
         if worker is None or self._hung_after is None:
             return self._judged(status_of(cell))
         return self._answers(worker, cell, self._hung_after)

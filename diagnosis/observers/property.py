@@ -19,7 +19,7 @@ from ...actors.control.orders_lane import ask_status, order
 from ...actors.control.tracing import Statistics
 from ...actors.errors import HoldfastError
 from ...actors.kernel.cell import Cell
-from ...actors.process.process_host import ProcessHost
+from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
 from ..literals import Literal
 from ..messages import Grace
@@ -150,8 +150,8 @@ class PropertyObserver(Observer):
         """Its status; how long the answer takes is how late its loop comes."""
         host = cell.host
         peer = host.peer if isinstance(host, OutsideHost) else None
-        if isinstance(host, ProcessHost):
-            peer = host.worker_of(cell)
+        if isinstance(host.place, WorkerPlace):
+            peer = host.place.process(cell)
             if peer is None:
                 return None
         began = time.monotonic()

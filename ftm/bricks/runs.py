@@ -18,8 +18,10 @@ from ...actors.errors import HoldfastError, type_name
 from ...actors.exit_reasons import SHUTDOWN, ExitReason
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, Start
+from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import Cell
 from ...actors.values import decode_value, state_digest
+from ...checkpoint.life.recorded_life import FED
 from ...checkpoint.protocol import AWAITED, CRASH, DROPPED, FAILED, Answer, Outcome, TurnEnd
 from ...supervision.spec import child
 from ..replica.protected_actor import Server
@@ -230,7 +232,7 @@ class Shadow(Server):
         assert main is not None
         assert main.parent is not None
         name = f"shadow-{next(_NUMBERS)}"
-        cell = node.cell_below(main.parent, name, self)
+        cell = node.cell_below(main.parent, name, AddressHost(FED, self, node.here.parent))
         self.standing.shadows.add(self)
         cell.spec = child(name, self._recipe)
         cell.extra().start = self._recipe

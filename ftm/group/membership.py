@@ -15,7 +15,6 @@ from ...actors.errors import HoldfastError
 from ...actors.exit_reasons import Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.message import Message
-from ...actors.process.process_host import ProcessHost
 from ...actors.process.process_watchdog import waited_for_processor
 from ..events import ReplicaLost, WrongSuspicion
 from .securing import Securing
@@ -122,7 +121,7 @@ class Members(Securing):
     def worker_of(self, name: str) -> Worker | None:
         """The process of a replica, if it has one now."""
         cell = self.cell_of(name)
-        return cell.host.worker_of(cell) if cell is not None and isinstance(cell.host, ProcessHost) else None
+        return None if cell is None else cell.host.place.process(cell)
 
     def bind_proxy(self) -> None:
         """Show who leads: the proxy is bound to its RequestProtocol."""

@@ -42,16 +42,16 @@ class ProtectionStatus:
 
 def protection_of(cell: Cell) -> ProtectionStatus:
     """What the root knows of the protection of an address."""
-    from .group_host import GroupHost  # Whoever only reads an answer, in another process, needs none of it.
+    from .group_place import GroupPlace  # Whoever only reads an answer, in another process, needs none of it.
 
-    host = cell.host
-    if not isinstance(host, GroupHost):
+    place = cell.host.place
+    if not isinstance(place, GroupPlace):
         return ProtectionStatus(cell.path, (), {}, None, 0, 0, False, 0.0, False, False)
-    stack, group, probation = tuple(layer.name for layer in host.layers), host.group, host.probation
+    stack, group, probation = tuple(layer.name for layer in place.layers), place.group, place.probation
     is_new = probation is not None and not probation.is_over
     if group is None or group.is_over:  # It is being recovered.
         return ProtectionStatus(
-            cell.path, stack, {}, None, host.epoch, host.config, False, host.ended_at, False, is_new
+            cell.path, stack, {}, None, place.epoch, place.config, False, place.ended_at, False, is_new
         )
     replicas = {name: _state_of(group, name) for name in group.names}
     is_whole, since = group.whole_since()

@@ -5,10 +5,15 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ...actors.errors import AskFailed
+from ...checkpoint.home.journal_home import Entered, JournalHome
 from ...checkpoint.method import Method
 from ...checkpoint.snapshot.snapshot_record import meta_now, put
 
 if TYPE_CHECKING:
+    from ...actors.exit_reasons import ExitReason
+    from ...actors.kernel.address_host import Parent
+    from ...actors.kernel.cell import Cell
+    from ...checkpoint.home.homes import Homes
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.snapshot.snapshot_record import Meta
 
@@ -19,6 +24,36 @@ UNKEPT = Method("protected", durability="memory")
 def is_unkept(method: Method) -> bool:
     """Whether the actor has a home for as long as it is protected, and begins afresh."""
     return method.name == UNKEPT.name
+
+
+class TransientHome(JournalHome):
+    """A home that keeps nothing of what was handled: without recovery, the next life begins afresh."""
+
+    def __init__(self, homes: Homes, parent: Parent) -> None:
+        super().__init__(homes, UNKEPT, parent)
+        self.copy: Meta | None = None  # the next life begins with it, though nothing is kept otherwise
+
+    def open(self, cell: Cell) -> Entered:
+        entered = super().open(cell)
+        if not (self.copy is not None and begin_again(entered.switch, self.copy)):
+            begin_afresh(entered.switch)
+        self.copy = None
+        return entered
+
+    def over(
+        self,
+        cell: Cell,
+        running: int,
+        why: str,
+        *,
+        ordered: bool,
+        noticed: float | None = None,
+        reason: ExitReason | None = None,
+        recovers: bool | None = None,
+    ) -> None:
+        super().over(cell, running, why, ordered=ordered, noticed=noticed, reason=reason, recovers=recovers)
+        if self.switch is not None:
+            forget_later(self.switch, str(cell.extra().reason if reason is None else reason))
 
 
 def forget_ended(switch: Switch) -> None:

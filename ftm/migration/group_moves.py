@@ -23,18 +23,20 @@ from ...actors.migration.move import Entering, Leaving
 from ...actors.migration.quiesce import Transit, now
 from ...actors.overflow import Overflow
 from ...checkpoint.home.capacity import HomeBound
+from ...checkpoint.home.journal_home import JournalHome
 from ...checkpoint.home.recorded_moves import Detached, refuse_unsaved
 from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK, Live
 from ...checkpoint.snapshot.snapshot_record import meta_now
 from ..bricks.replica_orders import EXPORTED_WITHIN, Export
 from ..group.group import Group, Look
-from ..group.group_host import GroupHost
+from ..group.group_place import GroupPlace
 from ..group.steering import AGAIN_AFTER
 from ..group.trial import rehearsed
 from .unrecorded_luggage import refuse, restore_owing, save_owing
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
+    from ...actors.kernel.address_host import AddressHost
     from ...checkpoint.home.switch import Switch
 
 MADE_WITHIN = 60.0
@@ -47,21 +49,24 @@ class ToGroup(Entering):
 
     to = "into a group of replicas"
 
-    def __init__(self, host: GroupHost, switch: Switch | None) -> None:
-        self.host = self._host = host
+    def __init__(self, host: AddressHost, switch: Switch | None) -> None:
+        place, home = host.place, host.home
+        assert isinstance(place, GroupPlace)
+        assert isinstance(home, JournalHome)
+        self.host, self._place, self._home = host, place, home
         self._recorded = switch
         self._group: Group | None = None
 
     async def prepare(self) -> None:
-        cell, host, move = self.cell, self._host, self.move
+        cell, place, home, move = self.cell, self._place, self._home, self.move
         if cell.children:
             names = ", ".join(cell.children)
             raise CannotMove(cell.path, f"it has children of its own ({names}): have a supervisor start them beside it")
         self._live: asyncio.Future[Live] = move.node.loop.create_future()
         self._joined: asyncio.Future[None] = move.node.loop.create_future()
-        switch = host.switch = self._switch = self._recorded or host.homes.made(cell, host.method)
+        switch = home.switch = self._switch = self._recorded or home.homes.made(cell, home.method)
         group = self._group = await move.within(
-            host.build(cell, switch), MADE_WITHIN, lambda: "its replicas were not up"
+            place.build(cell, switch), MADE_WITHIN, lambda: "its replicas were not up"
         )
         group.on_live, group.on_joined = self._is_live, self._has_joined
         group.on_over = move.give_up
@@ -85,13 +90,13 @@ class ToGroup(Entering):
             self.move.luggage.data, self.move.luggage.owed = save_owing(actor)
 
     async def begin(self) -> None:
-        move, host, group, switch = self.move, self._host, self._group, self._switch
+        move, group, switch = self.move, self._group, self._switch
         assert group is not None
         if self._recorded is None:
             self._plant()
         live = switch.prepare()
         live.add_done_callback(self._failed)
-        leads = host.lead(group, switch, traps=move.luggage.traps)
+        leads = self._place.lead(group, switch, traps=move.luggage.traps)
         await move.within(leads, move.timeout, lambda: "its first replica did not lead")
         switch.attach(group)
         await move.within(self._live, move.timeout, lambda: "its new life was not up")
@@ -125,7 +130,7 @@ class ToGroup(Entering):
         assert group is not None
         if self._recorded is None:
             self._move_in()
-        self._host.take_over(self.cell, group)
+        self._place.take_over(self.cell, group)
         return []
 
     def _move_in(self) -> None:
@@ -147,7 +152,7 @@ class ToGroup(Entering):
                     switch.push(item)
             else:
                 switch.admit(cell, item)
-        self._host.homes.adopt(cell, switch, self._host.method)
+        self._home.homes.adopt(cell, switch, self._home.method)
         for topic in topics:
             switch.topics[topic] = None
             cell.node.topics.subscribe(topic, cell)
@@ -165,7 +170,7 @@ class ToGroup(Entering):
         assert group is not None
         if luggage.suspended:
             group.is_suspended, cell.extra().suspended = True, mailbox.BY_USER
-        self._host.attached(cell, group)
+        self._place.attached(cell, group)
         self._switch.from_life(self._live.result())  # What waits is fed.
         group.go_on()
         self.move.gone_on_at = now()
@@ -177,7 +182,7 @@ class ToGroup(Entering):
             group.on_over(group.why)
 
     def discard(self) -> None:
-        self.move.ending = asyncio.ensure_future(self._host.dismantle(self.cell))
+        self.move.ending = asyncio.ensure_future(self._place.dismantle(self.cell))
         if self._group is None:
             return
         if self._live.done() and not self._live.cancelled():
@@ -193,12 +198,13 @@ class FromRecordedGroup(Leaving):
     """A recorded life comes out of a group; `is_below`: its supervisor is in another process."""
 
     def __init__(self, cell: Cell, *, is_below: bool) -> None:
-        old = cell.host
-        if not isinstance(old, GroupHost) or old.group is None or old.switch is None:
+        old, home = cell.host.place, cell.host.home
+        assert isinstance(home, JournalHome)
+        if not isinstance(old, GroupPlace) or old.group is None or home.switch is None:
             raise CannotMove(cell.path, "it is being recovered; try again")
-        self.host, self._group, self._switch = old, old.group, old.switch
+        self._host, self._place, self._home, self._group, self._switch = cell.host, old, home, old.group, home.switch
         self._is_below = is_below
-        self._home: Detached | None = None
+        self._detached: Detached | None = None
         self._over = self._group.on_over
         self._has_fallen = False
 
@@ -254,7 +260,7 @@ class FromRecordedGroup(Leaving):
         Raises:
             CannotMove: its state could not be kept.
         """
-        self._home = Detached(self._switch)
+        self._detached = Detached(self._switch)
         refuse_unsaved(self.cell, self._switch)
 
     def part(self) -> list[Item]:
@@ -263,12 +269,12 @@ class FromRecordedGroup(Leaving):
 
     def retire(self) -> None:
         """The replicas are not needed any more."""
-        host, group = self.host, self.host.group
+        place, group = self._place, self._place.group
         if group is not None:
             group.is_over = True
-        if host.probation is not None:
-            host.probation.left()
-        self.move.ending = asyncio.ensure_future(host.dismantle(self.cell))
+        if place.probation is not None:
+            place.probation.left()
+        self.move.ending = asyncio.ensure_future(place.dismantle(self.cell))
 
     def resume(self) -> None:
         if self._is_below and self.move.is_late:
@@ -278,7 +284,7 @@ class FromRecordedGroup(Leaving):
         group.is_stopping = False
         if transit is not None:
             self.take_back(transit)
-            transit.over(self.cell, self.host)
+            transit.over(self.cell, self._host)
             group.on_over = self._over
             if self._has_fallen:
                 self._over(group.why)
@@ -286,8 +292,8 @@ class FromRecordedGroup(Leaving):
 
     def take_back(self, transit: Transit) -> None:
         """What had been given away."""
-        if self._home is not None:
-            self._home.attach_again(transit)
+        if self._detached is not None:
+            self._detached.attach_again(transit)
 
 
 class FromGroup(FromRecordedGroup):
@@ -337,7 +343,7 @@ class FromGroup(FromRecordedGroup):
         switch.later.clear()
         switch.timers.replace({})
         self._homed = homed
-        self.host.homes.released(cell.path)
+        self._home.homes.released(cell.path)
         return super().part()
 
     def retire(self) -> None:

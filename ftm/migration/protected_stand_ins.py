@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
@@ -19,17 +18,15 @@ from ...actors.errors import ControlFailed, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.cell import RUNNING, Cell
-from ...actors.kernel.envelope import Item
 from ...actors.migration.here import dispose
 from ...actors.migration.quiesce import farewell, obey_commands, part, settle_with_queue, sorted_out, twin
 from ...actors.migration.worker_moves import GuestMove
 from ...actors.process.wire.connection import BadFrame
-from ...actors.process.wire.peer import send_signal
 from ...actors.process.wire.start_codec import pack_recipe
-from ...checkpoint.life.child_stub import ChildStub
+from ...checkpoint.life.child_stub import ChildPlace, RootHome
 from ...checkpoint.life.recorded_inbox import StopRecorded
 from ...checkpoint.life.recorded_life import Life
-from ...checkpoint.life.worker_lives import InnerLifeHost, Port
+from ...checkpoint.life.worker_lives import ChildHere, child_here
 from ...checkpoint.protocol import (
     Closed,
     Over,
@@ -47,12 +44,10 @@ if TYPE_CHECKING:
     from ...supervision.spec import ChildSpec
 
 
-class InnerGroupHost(ChildStub):
-    """The host of such a child's stand-in."""
+class ChildAtRoot(ChildPlace):
+    """The root: its lives are lived there, whoever restarts it is here."""
 
-    def __init__(self, guest: Guest, spec: ChildSpec, port_of: Callable[[str], Port]) -> None:
-        recovery = spec.recovery
-        super().__init__(guest, recovery if recovery is not None and recovery.records else UNKEPT, port_of)
+    is_here = False
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         """Ask the root for replicas."""
@@ -71,10 +66,9 @@ class InnerGroupHost(ChildStub):
             return
         cell.life += 1
         cell.state = RUNNING
-        assert self._up is not None
-        self._up.set_result(None)
+        self.came_up()
 
-    def told_by_group(self, record: Over | Respec) -> None:
+    def told_by_root(self, record: Over | Respec) -> None:
         cell = self.cell
         if isinstance(record, Respec):
             respec(cell, record.layers)
@@ -85,19 +79,13 @@ class InnerGroupHost(ChildStub):
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         if cell.state is RUNNING:
-            self._guest.command(cell, "stop", {"reason": pack_exit(reason)})
+            self.home.guest.command(cell, "stop", {"reason": pack_exit(reason)})
 
     def kill(self, cell: Cell) -> None:
         if cell.state is RUNNING:
-            self._guest.command(cell, "kill", {})
+            self.home.guest.command(cell, "kill", {})
         else:
             self.gave_up_start(cell)
-
-    def progress(self, cell: Cell) -> object:
-        return object()  # It waits for the root.
-
-    def push(self, cell: Cell, item: Item) -> None:
-        send_signal(self._guest, cell.path, item)
 
     def control(self, cell: Cell, call: Call) -> None:
         why = "it is protected, and lives at the root: order it from there"
@@ -106,11 +94,12 @@ class InnerGroupHost(ChildStub):
     def is_up(self, cell: Cell) -> bool:
         return cell.state is RUNNING
 
-    def backlog(self, cell: Cell) -> int:
-        return 0  # The home has it.
 
-    def load(self, cell: Cell) -> int:
-        return 0
+def child_at_root(guest: Guest, spec: ChildSpec) -> ChildAtRoot:
+    """The place of a protected child of a supervisor in this process."""
+    recovery = spec.recovery
+    method = recovery if recovery is not None and recovery.records else UNKEPT
+    return ChildAtRoot(RootHome(guest), method, guest.recovery.port_of)
 
 
 def respec(cell: Cell, described: list[Any]) -> None:
@@ -151,15 +140,15 @@ class RecordedChild:
 
     def _leave(self, cell: Cell, told: dict[str, Any]) -> None:
         """The life that is at rest here is over; nobody hears of that but the actor itself."""
-        old_host = cell.host
-        assert isinstance(old_host, InnerLifeHost)
-        life = old_host.let_go()
+        place = cell.host.place
+        assert isinstance(place, ChildHere)
+        life = place.let_go()
         life.port = NOWHERE
         old = part(cell)
         _, commands = sorted_out(cell)  # What it was fed is at its home.
         life.cell = old
         respec(cell, told["layers"])
-        InnerGroupHost(self._guest, cell.spec, self._guest.recovery.port_of).take_up(cell, told["number"])
+        child_at_root(self._guest, cell.spec).take_up(cell, told["number"])
         obey_commands(cell, commands)
         farewell(old, StopRecorded(life, exit_reasons.Shutdown("moved into a group of replicas")))
 
@@ -174,7 +163,7 @@ class RecordedChild:
         other.extra().start, other.extra().bindings = start, cell.extra().bindings
         life = Life(other, port, recovery, guest.page[slot : slot + 1], may_fork=True)
         life.begins_suspended = told["is_suspended"]
-        self._arriving = Arriving(InnerLifeHost(guest, recovery, guest.recovery.port_of), other, life, number)
+        self._arriving = Arriving(child_here(guest, recovery), other, life, number)
 
         def ended_early(done: asyncio.Future[ExitReason]) -> None:
             if self._arriving is not None and self._arriving.other is other:
@@ -198,8 +187,8 @@ class RecordedChild:
         """From here on the new life is the one."""
         settle_with_queue(arriving.other, cell)
         arriving.life.cell = cell
-        arriving.host.life = arriving.life
-        arriving.host.take_up(cell, arriving.number)
+        arriving.place.home.life = arriving.life
+        arriving.place.take_up(cell, arriving.number)
         respec(cell, [])
         lifecycle.up(cell)
 
@@ -207,7 +196,7 @@ class RecordedChild:
 class Arriving(NamedTuple):
     """A life that was begun beside its address, and is not the one yet."""
 
-    host: InnerLifeHost
+    place: ChildHere
     other: Cell
     life: Life
     number: int

@@ -8,20 +8,19 @@ from ...actors.errors import CannotMove
 from ...actors.kernel.lifecycle import LOCAL
 from ...actors.migration.move import Move
 from ...actors.process.wire.peer import OutsideHost
-from ...checkpoint.home.recorded_hosts import RecordedProcessHost, TaskHost
+from ...checkpoint.home.far_parent import FarParent
+from ...checkpoint.home.journal_home import JournalHome
 from ...checkpoint.home.recorded_moves import leaving
-from ...checkpoint.home.subtree_homes import SubtreeHome
-from ..group.group_host import GroupHost
-from ..group.transient_homes import UNKEPT, is_unkept
+from ..group.group_place import protected_host
+from ..group.transient_homes import UNKEPT, TransientHome
 from .group_moves import FromGroup, FromRecordedGroup, ToGroup
-from .subtree_groups import SubtreeGroup
 from .subtree_moves import (
     FromRecordedSubtree,
     FromSubtree,
     ToRecordedSubtree,
     ToSubtree,
     group_for,
-    place_of,
+    parent_of,
     spec_of,
 )
 
@@ -40,20 +39,20 @@ def into_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> Move
     Raises:
         CannotMove: it lives somewhere else.
     """
-    old = cell.host
+    old, home, parent = cell.host, cell.host.home, cell.host.parent
     if old is LOCAL:
-        return Move(cell, leaving(cell, PART), ToGroup(GroupHost(homes, None, mechanism), None), timeout)
-    if isinstance(old, (TaskHost, RecordedProcessHost)):
-        group = GroupHost(homes, old.method, mechanism)
-        return Move(cell, leaving(cell, PART), ToGroup(group, old.switch), timeout)
-    if isinstance(old, SubtreeHome):
+        return Move(cell, leaving(cell, PART), ToGroup(protected_host(homes, None, mechanism), None), timeout)
+    if isinstance(home, JournalHome) and isinstance(parent, FarParent):
         spec = spec_of(cell)
-        below = group_for(old, spec, old.method, mechanism)
-        return Move(cell, FromRecordedSubtree(cell, old, spec, below), ToGroup(below, old.switch), timeout)
+        below = group_for(parent, spec, home.method, mechanism)
+        return Move(cell, FromRecordedSubtree(cell, parent, spec, below), ToGroup(below, home.switch), timeout)
+    if isinstance(home, JournalHome):
+        group = protected_host(homes, home.method, mechanism)
+        return Move(cell, leaving(cell, PART), ToGroup(group, home.switch), timeout)
     if isinstance(old, OutsideHost):
-        spec, place = spec_of(cell), place_of(cell, old)
-        below = group_for(place, spec, UNKEPT, mechanism)
-        return Move(cell, FromSubtree(cell, place, spec, below), ToGroup(below, None), timeout)
+        spec, parent = spec_of(cell), parent_of(cell, old)
+        below = group_for(parent, spec, UNKEPT, mechanism)
+        return Move(cell, FromSubtree(cell, parent, spec, below), ToGroup(below, None), timeout)
     raise CannotMove(cell.path, "only an actor that lives as a task can be given a mechanism")
 
 
@@ -63,13 +62,13 @@ def out_of_group(cell: Cell, entering: Entering, timeout: float) -> Move:
     Raises:
         CannotMove: it is being recovered.
     """
-    old = cell.host
+    parent = cell.host.parent
     from_group, to_subtree = (FromGroup, ToSubtree) if is_plain(cell) else (FromRecordedGroup, ToRecordedSubtree)
-    if isinstance(old, SubtreeGroup):
-        return Move(cell, from_group(cell, is_below=True), to_subtree(cell, old), timeout)
+    if isinstance(parent, FarParent):
+        return Move(cell, from_group(cell, is_below=True), to_subtree(cell, parent), timeout)
     return Move(cell, from_group(cell, is_below=False), entering, timeout)
 
 
 def is_plain(cell: Cell) -> bool:
     """Whether the actor has no recovery, and a home only as long as a group lives it."""
-    return isinstance(cell.host, GroupHost) and is_unkept(cell.host.method)
+    return isinstance(cell.host.home, TransientHome)

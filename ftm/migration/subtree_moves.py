@@ -10,8 +10,6 @@ from __future__ import annotations
 import asyncio
 from typing import TYPE_CHECKING, Any, cast
 
-import msgspec
-
 from ...actors.errors import CannotMove, HoldfastError, StartFailed, error_text
 from ...actors.exit_reasons import ExitReason, unpack_exit
 from ...actors.kernel.bindings import settle_claims, unclaimed
@@ -27,27 +25,27 @@ from ...actors.process.wire import frames
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.wire.start_codec import pack_recipe
 from ...actors.process.worker_pool import Worker
+from ...checkpoint.home.far_parent import FarParent
 from ...checkpoint.home.held_messages import inlet
-from ...checkpoint.home.recorded_hosts import RemoteLife
+from ...checkpoint.home.journal_home import JournalHome
+from ...checkpoint.home.life_ports import RemoteLife
 from ...checkpoint.home.recorded_moves import Beginning, Detached, refuse_unsaved
-from ...checkpoint.home.subtree_homes import SubtreeHome, SubtreeHost
+from ...checkpoint.home.subtree_place import SubtreePlace
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import Closed, Protected, ToHome, Wanted
 from ...supervision.respec import recipe_spec
+from ..group.group_place import GroupPlace, protected_host
 from ..group.transient_homes import UNKEPT
-from ..model.mechanism import compose
 from .group_moves import settle_in
-from .subtree_groups import SubtreeGroup
 from .unrecorded_luggage import pack, pack_owed, refuse, unpack, unpack_owed
 
 if TYPE_CHECKING:
+    from ...actors.kernel.address_host import AddressHost
     from ...actors.kernel.cell import Admit
     from ...supervision.spec import ChildSpec
 
 NUMBER = 0
 """Under which the supervisor there wants a life that it has not asked for: it counts its own from 1."""
-MADE_OF = Protected(b"", [])
-"""What a life is made of that is known at the root."""
 
 
 def spec_of(cell: Cell) -> ChildSpec:
@@ -59,14 +57,14 @@ def spec_of(cell: Cell) -> ChildSpec:
     return spec
 
 
-def worker_of(place: SubtreeHome, cell: Cell) -> Worker:
+def worker_of(parent: FarParent, cell: Cell) -> Worker:
     """The process of the supervisor. Raises CannotMove: it has just died."""
-    if place.worker is None:
+    if parent.worker is None:
         raise CannotMove(cell.path, "the process of its supervisor has ended; try again")
-    return place.worker
+    return parent.worker
 
 
-def place_of(cell: Cell, host: OutsideHost) -> SubtreeHome:
+def parent_of(cell: Cell, host: OutsideHost) -> FarParent:
     """Where the supervisor of such a child is heard.
 
     Raises:
@@ -74,25 +72,32 @@ def place_of(cell: Cell, host: OutsideHost) -> SubtreeHome:
     """
     worker = host.peer
     top = worker.cell if isinstance(worker, Worker) else None
-    if not isinstance(worker, Worker) or top is None or not isinstance(top.host, SubtreeHost):
+    if not isinstance(worker, Worker) or top is None or not isinstance(top.host.place, SubtreePlace):
         raise CannotMove(cell.path, "only a child of a supervisor can be given a mechanism")
     worker.record_taker(cell.path)  # From now on it is heard.
-    return top.host.at(cell.path)
+    return top.host.place.at(cell.path)
 
 
-def group_for(place: SubtreeHome, spec: ChildSpec, method: Method, mechanism: Any) -> SubtreeGroup:
+def group_for(parent: FarParent, spec: ChildSpec, method: Method, mechanism: Any) -> AddressHost:
     """The host of a life that is to be lived by a group."""
-    host = SubtreeGroup(place, method, compose(mechanism))
-    host.prepare(pack_recipe(spec.start, place.path), list(spec.start.kind._topics))
+    host = protected_host(parent.homes, method, mechanism, parent)
+    topics = list(spec.start.kind._topics)
+    parent.prepare(Protected(pack_recipe(spec.start, parent.path), layers_of(host)), topics)
     return host
+
+
+def layers_of(host: AddressHost) -> list[Any]:
+    """The mechanisms of a group, as data."""
+    assert isinstance(host.place, GroupPlace)
+    return host.place.described()
 
 
 class FromRecordedSubtree(Leaving):
     """A recorded life leaves the process of its supervisor, for a group."""
 
-    def __init__(self, cell: Cell, place: SubtreeHome, spec: ChildSpec, group: SubtreeGroup) -> None:
-        self._place, self._spec, self._group = place, spec, group
-        self._worker = worker_of(place, cell)
+    def __init__(self, cell: Cell, parent: FarParent, spec: ChildSpec, host: AddressHost) -> None:
+        self._parent, self._spec, self._host = parent, spec, host
+        self._worker = worker_of(parent, cell)
         self._home: Detached | None = None
 
     async def quiesce(self) -> None:
@@ -101,25 +106,25 @@ class FromRecordedSubtree(Leaving):
         move.hear(self._worker, self._heard)
         move.say_now(self._worker, "take")
         await move.within(self._taken, move.timeout, lambda: BUSY)
-        refuse_unsaved(self.cell, self._place.switch)
+        refuse_unsaved(self.cell, self._parent.home.switch)
 
     def _heard(self, step: str, told: dict[str, Any]) -> None:
         move = self.move
         if step == "refused":
             move.give_up(str(told["why"]))
         elif step == "taken" and not move.given_up.done():
-            assert self._place.switch is not None
+            assert self._parent.home.switch is not None
             move.rest_at = float(told["at"])
             move.luggage.suspended, move.luggage.traps = bool(told["suspended"]), bool(told["trap_exits"])
-            self._home = Detached(self._place.switch)
+            self._home = Detached(self._parent.home.switch)
             move.at_rest()
             self._taken.set_result(None)
 
     def part(self) -> list[Item]:
-        cell, host, worker = self.cell, self._group, self._worker
-        wanted = self._place.hand_over(host)
-        host.found(msgspec.structs.replace(wanted, protected=MADE_OF), RemoteLife(cell.path, worker))
-        self.move.say_now(worker, "leave", number=wanted.number, layers=host.described())
+        cell, parent = self.cell, self._parent
+        assert parent.wanted is not None
+        parent.comes_to_root(cell, self._host, parent.wanted)
+        self.move.say_now(self._worker, "leave", number=parent.number, layers=layers_of(self._host))
         cell.extra().start = self._spec.start
         return []
 
@@ -139,19 +144,19 @@ class FromRecordedSubtree(Leaving):
 class FromSubtree(Leaving):
     """A life without recovery leaves the process of its supervisor, for a group."""
 
-    def __init__(self, cell: Cell, place: SubtreeHome, spec: ChildSpec, group: SubtreeGroup) -> None:
-        self._place, self._spec, self._group = place, spec, group
-        self._worker = worker_of(place, cell)
+    def __init__(self, cell: Cell, parent: FarParent, spec: ChildSpec, host: AddressHost) -> None:
+        self._parent, self._spec, self._host = parent, spec, host
+        self._worker = worker_of(parent, cell)
         self._admit: Admit = cell.admit
         self._held: list[Any] = []  # what has been sent to it here meanwhile
         self._told: dict[str, Any] = {}
         cell.table = spec.start.kind._table
 
     async def quiesce(self) -> None:
-        move, place = self.move, self._place
+        move, parent = self.move, self._parent
         self._taken: asyncio.Future[None] = move.node.loop.create_future()
         self._left: asyncio.Future[None] = move.node.loop.create_future()
-        place.arriving, place.on_lost = lambda record: None, self._lost
+        parent.arriving, parent.on_lost = lambda record: None, self._lost
         move.hear(self._worker, self._heard)
         move.say_now(self._worker, "take")
         await move.within(self._taken, move.timeout, lambda: BUSY)
@@ -194,11 +199,11 @@ class FromSubtree(Leaving):
 
     async def let_go(self) -> None:
         self.move.is_bound = True
-        self.move.say_now(self._worker, "leave", number=NUMBER, layers=self._group.described())
+        self.move.say_now(self._worker, "leave", number=NUMBER, layers=layers_of(self._host))
         await asyncio.shield(self._left)
 
     def part(self) -> list[Item]:
-        cell, luggage, more, told, host = self.cell, self.move.luggage, self.cell.extra(), self._told, self._group
+        cell, luggage, more, told = self.cell, self.move.luggage, self.cell.extra(), self._told
         self._quit()
         chosen = None
         if told["bound"] is not None:
@@ -209,9 +214,8 @@ class FromSubtree(Leaving):
         luggage.owed = unpack_owed(self._worker, cell, told["owed"])
         luggage.waiting, self._held = self._held, []
         kind = self._spec.start.kind
-        wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen, MADE_OF)
-        host.found(wanted, RemoteLife(cell.path, self._worker))
-        self._place.found(cell, host)
+        wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen)
+        self._parent.comes_to_root(cell, self._host, wanted)
         more.start = self._spec.start
         return []
 
@@ -226,7 +230,7 @@ class FromSubtree(Leaving):
                 refuse(cell, item, error)
 
     def _quit(self) -> None:
-        self._place.arriving = self._place.on_lost = None
+        self._parent.arriving = self._parent.on_lost = None
 
     def _lost(self, reason: ExitReason) -> None:
         """The process has died: so has the child."""
@@ -262,18 +266,20 @@ class IntoSubtree(Entering):
 
     to = "to the process of its supervisor"
 
-    def __init__(self, cell: Cell, group: SubtreeGroup) -> None:
-        self._group, self.place = group, group.place
-        self.worker = worker_of(group.place, cell)
+    def __init__(self, cell: Cell, parent: FarParent) -> None:
+        home = cell.host.home
+        assert isinstance(home, JournalHome)
+        self.parent, self._from = parent, home
+        self.worker = worker_of(parent, cell)
 
     async def prepare(self) -> None:
         """Wait until the supervisor knows of the life that is to come: it would not heed what is said of it."""
-        starting = self._group.starting
+        starting = self.parent.starting
         if starting is not None:
             await self.move.within(asyncio.wait((starting,)), self.move.timeout, lambda: "its start was not over")
 
     def discard(self) -> None:
-        self.place.arriving = None
+        self.parent.arriving = None
         if self.move.transit is not None:
             self.move.say_now(self.worker, "stay")
 
@@ -281,22 +287,22 @@ class IntoSubtree(Entering):
 class ToRecordedSubtree(IntoSubtree):
     """A recorded life enters it."""
 
-    def __init__(self, cell: Cell, group: SubtreeGroup) -> None:
-        super().__init__(cell, group)
-        self.host = self.place
-        if not self.place.slot:
+    def __init__(self, cell: Cell, parent: FarParent) -> None:
+        super().__init__(cell, parent)
+        self.host = parent.below
+        if not parent.slot:
             raise CannotMove(cell.path, "its process holds as many recorded actors as it can")
 
     async def begin(self) -> None:
-        cell, move, place = self.cell, self.move, self.place
-        place.method = self._group.method
-        switch, live, _ = place.open(cell)
+        cell, move, parent = self.cell, self.move, self.parent
+        parent.home.method = self._from.method
+        switch, live, _ = parent.home.open(cell)
         beginning = self._beginning = Beginning(move, switch)
-        place.arriving = self._said
+        parent.arriving = self._said
         port = RemoteLife(cell.path, self.worker)
         for record in switch.restore_records():
             port.to_life(record)
-        told = {"number": self._group.number, "turn": switch.state_turn, "stash": switch.stash, "slot": place.slot}
+        told = {"number": parent.number, "turn": switch.state_turn, "stash": switch.stash, "slot": parent.slot}
         move.say_now(self.worker, "come", is_suspended=move.luggage.suspended, **told)
         switch.attach(port)
         beginning.follow(live)
@@ -310,18 +316,17 @@ class ToRecordedSubtree(IntoSubtree):
             self._beginning.from_life(record)
 
     def take_over(self) -> list[Item]:
-        self.place.arriving = None
-        self._wanted = msgspec.structs.replace(self._group.hand_over(), protected=None)
+        self.parent.arriving = None
         self.move.say_now(self.worker, "settle")
         return []
 
     def go_on(self) -> None:
         for port, target in unclaimed(self.cell).items():
-            self.place.told(self.cell, "bind", {"port": port, "target": target.path})
+            self.host.told(self.cell, "bind", {"port": port, "target": target.path})
         self._beginning.go_on()
 
     def settled(self) -> None:
-        self.place.take_back(self.cell, self._wanted)
+        self.parent.goes_back(self.cell)
 
 
 class ToSubtree(IntoSubtree):
@@ -330,10 +335,10 @@ class ToSubtree(IntoSubtree):
     async def begin(self) -> None:
         move, luggage = self.move, self.move.luggage
         self._up: asyncio.Future[None] = move.node.loop.create_future()
-        self.place.arriving = self._said
+        self.parent.arriving = self._said
         move.hear(self.worker, self._heard)
-        assert self._group.switch is not None
-        owed = [number for number, ask in self._group.switch.later.items() if not ask.is_done]
+        assert self._from.switch is not None
+        owed = [number for number, ask in self._from.switch.later.items() if not ask.is_done]
         move.say_now(self.worker, "come", state=luggage.data, traps=luggage.traps, owed=owed)
         await move.within(self._up, move.timeout, lambda: "its new life was not up")
 
@@ -359,10 +364,10 @@ class ToSubtree(IntoSubtree):
     def take_over(self) -> list[Item]:
         """What waits at the home goes there, with all that ties the actor to others."""
         cell, move, luggage, more, worker = self.cell, self.move, self.move.luggage, self.cell.extra(), self.worker
-        switch, node = self._group.switch, cell.node
+        switch, node = self._from.switch, cell.node
         assert switch is not None
-        self.place.arriving = None
-        topics = dict.fromkeys([*self._group.topics(cell), *switch.topics])
+        self.parent.arriving = None
+        topics = dict.fromkeys([*self.parent.topics(cell), *switch.topics])
         for topic in topics:
             node.topics.unsubscribe(topic, inlet(switch, topic))
             node.topics.subscribe(topic, cell)
@@ -380,8 +385,7 @@ class ToSubtree(IntoSubtree):
         for watch in list(more.watching):
             watch.cancel()  # It begins to watch again, there.
         move.say_now(worker, "settle", **told)
-        self._group.hand_over()
-        self.place.forget()
+        self.parent.goes_for_good()
         more.outlet, more.suspended = None, 0
         self.host = worker.inner.lived_there(cell)
         return []

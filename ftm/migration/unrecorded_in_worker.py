@@ -24,7 +24,7 @@ from ...actors.migration.luggage import check_sendable, pack_rest
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
 from ...actors.process.wire.connection import BadFrame
-from .protected_stand_ins import InnerGroupHost, respec
+from .protected_stand_ins import ChildAtRoot, child_at_root, respec
 from .unrecorded_luggage import EarlyAsk, pack, pack_owed, refuse, restore_owing, save_owing, unpack
 
 if TYPE_CHECKING:
@@ -112,10 +112,10 @@ class PlainChild:
         self._say("left", queue=queue, bound=room, owed=pack_owed(guest, self._owed))
         respec(cell, told["layers"])
         guest.recovery.begins(cell.path)
-        host = InnerGroupHost(guest, cell.spec, guest.recovery.port_of)
-        host.bound = None if bound is None else Bounded(bound.capacity, bound.overflow)
+        place = child_at_root(guest, cell.spec)
+        place.home.bound = None if bound is None else Bounded(bound.capacity, bound.overflow)
         more.bound = None
-        host.take_up(cell, told["number"])
+        place.take_up(cell, told["number"])
         if bound is not None:
             bound.release()
         obey_commands(cell, commands)
@@ -138,7 +138,7 @@ class PlainChild:
     def _come(self, told: dict[str, Any]) -> None:
         """Begin the life beside its address; it handles nothing yet."""
         cell = self._guest.node.find(self._path)
-        if cell is None or cell.state is not RUNNING or not isinstance(cell.host, InnerGroupHost):
+        if cell is None or cell.state is not RUNNING or not isinstance(cell.host.place, ChildAtRoot):
             self._say("failed", why="its life has ended")
             return
         start = cell.extra().start
@@ -186,10 +186,10 @@ class PlainChild:
         self._arrival = self._held = None
         if arrival is not None:
             arrival.discard()
-        if cell is None or not isinstance(cell.host, InnerGroupHost):
+        if cell is None or not isinstance(cell.host.place, ChildAtRoot):
             return
         if cell.admit == self._hold:
-            cell.admit = cell.host.way_home
+            cell.admit = cell.host.place.home.way_home
         for item in held:
             cell.admit(cell, item)
 
@@ -199,12 +199,13 @@ class PlainChild:
         self._arrival = self._held = None
         assert cell is not None
         assert arrival is not None
-        host = cell.host
-        assert isinstance(host, InnerGroupHost)
+        place = cell.host.place
+        assert isinstance(place, ChildAtRoot)
+        chosen = place.home.bound
         has_ended = arrival.other.state is not RUNNING  # by its background work
-        guest.recovery.port_of(self._path).stub = None
+        guest.recovery.port_of(self._path).place = None
         cell.host = guest.node.here
-        bound = None if host.bound is None else Bound(host.bound.capacity, host.bound.overflow)
+        bound = None if chosen is None else Bound(chosen.capacity, chosen.overflow)
         queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])
         commands = arrival.take_over(queue, stash, bound, suspended=bool(told["is_suspended"]))
         for number, key, _ in told["owed"]:

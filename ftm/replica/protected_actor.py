@@ -51,7 +51,7 @@ MOST_CRASHES: Final = 8
 
 
 class Server(Reports):
-    """The host of the protected actor, and its port home."""
+    """The place of the protected actor, and its port home."""
 
     # -- as the host of its cell ------------------------------------------------------------------------------------
 
@@ -88,10 +88,6 @@ class Server(Reports):
 
     def retired(self, cell: Cell) -> None:
         self._is_stopping = True
-        cell.node.here.retired(cell)
-
-    def recovers(self, reason: ExitReason) -> bool:
-        return not reason.is_clean
 
     def _life_ended(self, life: ServerLife, reason: ExitReason) -> None:
         """The life is over, and nobody here has ended it."""

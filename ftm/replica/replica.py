@@ -18,10 +18,12 @@ from ...actors.errors import HoldfastError, StartFailed, StartIgnored, remote_cr
 from ...actors.events import ActorStarted
 from ...actors.exit_reasons import SHUTDOWN, ExitReason, Shutdown
 from ...actors.kernel.actor import Start, on, start
+from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, message_of
 from ...actors.process.wire.start_codec import unpack_recipe
+from ...checkpoint.life.recorded_life import FED
 from ...checkpoint.method import Method
 from ...supervision.children import STOPPED, UP, Child, new_cell
 from ...supervision.spec import Flags, Plan, child
@@ -207,13 +209,14 @@ class Replica(Supervisor):
             return super()._launch(one)
         if one.cell is None:
             one.cell = new_cell(self.ctx.cell, one)
-        one.cell.host = self._server
+        here = one.cell.node.here
+        one.cell.host = AddressHost(FED, self._server, here.parent)
         self._server.start(one.cell)
         return None
 
     def child_exited(self, cell: Cell, life: int, reason: ExitReason) -> Any:
         """The lives of the protected actor begin and end as the bricks want it; the end of a brick is ours."""
-        if cell.name == SERVER or isinstance(cell.host, Server):
+        if cell.name == SERVER or isinstance(cell.host.place, Server):
             return None
         return super().child_exited(cell, life, reason)
 

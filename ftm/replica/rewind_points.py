@@ -70,7 +70,7 @@ def is_blank(point: State) -> bool:
     return not point.data.size
 
 
-class Points(lifecycle.LocalHost):
+class Points(lifecycle.HerePlace):
     """The lives of the protected actor, and the points that they begin at."""
 
     def __init__(self, standing: Standing, method: Method) -> None:

@@ -12,7 +12,7 @@ from ...actors.kernel.actor import Actor, Start
 from ...supervision.spec import ChildSpec, Isolation, Strategy
 from . import living
 from .draft import Target
-from .mechanisms import Attach, Compose, Detach, DetachLayer, Isolate, OnProtection, Transition, Update
+from .mechanisms import Attach, Compose, Detach, DetachLayer, Isolate, OnProtection, Protect, Transition, Update
 from .operation import Operation, Step
 from .reparenting import Move
 from .running import StartAgain, StopChild
@@ -114,6 +114,13 @@ class Change:
         self.step(living.ReplaceCode(target, new, migrate))
 
     # -- fault tolerance ----------------------------------------------------------------------------------------------
+
+    def protect(self, target: Target, mechanism: Any) -> None:
+        """Have an actor protected by just this mechanism, or by just these, outermost first, whatever it has now.
+
+        None: by none. Its life goes on, and only the bricks that differ are touched.
+        """
+        self.step(Protect(target, mechanism))
 
     def attach(self, target: Target, mechanism: Any) -> None:
         """Protect an actor by a mechanism, or by several, outermost first; its life goes on.

@@ -11,8 +11,8 @@ from ...actors.errors import ActorRestarting, NoSuchActor
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.node import Node, cell_kind
 from ...actors.kernel.ref import ActorRef
-from ...actors.process.process_host import ProcessHost
-from ...actors.process.wire.peer import OutsideHost
+from ...actors.process.process_host import WorkerPlace
+from ...actors.process.wire.peer import OutsidePlace
 from ...supervision.admin import WhichChildren
 from ...supervision.children import Child
 from ...supervision.dynamic import DynamicSupervisor
@@ -442,7 +442,7 @@ def check_awake(place: Place) -> None:
 
 def is_elsewhere(cell: Cell) -> bool:
     """Whether an actor lives in another process than the root's."""
-    return isinstance(cell.host, (ProcessHost, OutsideHost))
+    return isinstance(cell.host.place, (WorkerPlace, OutsidePlace))
 
 
 def difference(before: list[str], after: list[str]) -> list[str]:

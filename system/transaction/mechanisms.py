@@ -86,8 +86,6 @@ class Isolate(OnPlace):
         assert place.spec is not None
         if self._to not in ("task", "process"):
             raise SpecError(self.target, f"isolation must be one of task, process, not {self._to!r}")
-        if place.spec.mechanism is not None:
-            raise wrong(place.path, "it is protected by a mechanism: detach that, and attach it again after")
         place.spec = dataclasses.replace(place.spec, isolation=self._to)
 
 
@@ -105,38 +103,54 @@ class OnProtection(OnPlace):
         return self._relocation.probation if self._relocation is not None else None
 
 
-class Attach(OnProtection):
-    """Have an actor's life lived by a group of replicas, as a mechanism says."""
+class Protect(OnProtection):
+    """Have an actor protected by just this stack of mechanisms, whatever it has now; by none if there is none."""
 
-    verb: ClassVar[str] = "attach"
+    verb: ClassVar[str] = "protect"
 
     def __init__(self, target: Target, mechanism: Any) -> None:
         super().__init__(target)
         self._mechanism = mechanism
         self._after: Any = None
 
-    def _layers(self) -> Any:
-        """As the spec has it: one alone stands there as it is."""
-        layers = rules().layers_of(self._mechanism)
-        return layers[0] if len(layers) == 1 else layers
-
     @property
     def text(self) -> str:
-        return f"attach {mechanism_text(self._after or self._mechanism)} to {self.target}"
+        if self._mechanism is None:
+            return f"protect {self.target} by no mechanism"
+        return f"protect {self.target} by {mechanism_text(self._after or self._mechanism)}"
 
     async def check(self, system: ActorSystem, draft: Draft) -> None:
         await super().check(system, draft)
         place = self._place
         assert place is not None
         assert place.spec is not None
-        if place.spec.mechanism is not None:
-            raise wrong(self.target, f"it has {mechanism_text(place.spec.mechanism)} already: detach that first")
-        self._after = self._layers()
-        check_layers(place, self._after)
-        if not place.is_planned and not getattr(place.kind, "state_access", True):
-            why = "its class says state_access = False, so its state cannot go along"
-            raise wrong(self.target, f"{why}: name the mechanism in its spec, and it begins with it")
+        self.refuse(place.spec.mechanism)
+        if self._mechanism is not None:
+            layers = rules().layers_of(self._mechanism)
+            self._after = layers[0] if len(layers) == 1 else layers
+            check_layers(place, self._after)
+            begins = place.is_planned or place.spec.mechanism is not None
+            if not begins and not getattr(place.kind, "state_access", True):
+                why = "its class says state_access = False, so its state cannot go along"
+                raise wrong(self.target, f"{why}: name the mechanism in its spec, and it begins with it")
         place.spec = dataclasses.replace(place.spec, mechanism=self._after)
+
+    def refuse(self, before: Any) -> None:
+        """Refuse what this verb does not do of an actor that has these mechanisms. Raises SpecError."""
+
+
+class Attach(Protect):
+    """The same for an actor that has no mechanism yet."""
+
+    verb: ClassVar[str] = "attach"
+
+    @property
+    def text(self) -> str:
+        return f"attach {mechanism_text(self._after or self._mechanism)} to {self.target}"
+
+    def refuse(self, before: Any) -> None:
+        if before is not None:
+            raise wrong(self.target, f"it has {mechanism_text(before)} already: detach that first, or use `protect`")
 
 
 class Detach(OnProtection):

@@ -54,9 +54,14 @@ class Relocation:
         return bool(described(self.before.mechanism) != described(self._after.mechanism))
 
     @property
-    def _moves(self) -> bool:
-        """Whether it lives elsewhere, mechanisms aside."""
+    def _is_elsewhere(self) -> bool:
+        """Whether its spec says that it lives elsewhere, mechanisms aside."""
         return self.before.isolation != self._after.isolation
+
+    @property
+    def _moves(self) -> bool:
+        """Whether it does so now; who is protected does when nobody protects it any more."""
+        return self._is_elsewhere and self._after.mechanism is None
 
     @property
     def _comes_last(self) -> bool:
@@ -127,14 +132,17 @@ class Relocation:
 
     def commit(self, system: ActorSystem) -> None:
         """From here on its spec says so."""
-        if self._place.is_planned or not (self._adapts or self._moves):
+        if self._place.is_planned or not (self._adapts or self._is_elsewhere):
             return
         cell = self._place.living(system.node)
         now = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
-        if now is not None and not self._adapts:
+        if now is not None and self._is_elsewhere and not (self._adapts and self._moves):
             replace_place(cell, dataclasses.replace(now, isolation=self._after.isolation))
-        elif now is not None and self._task is not None:
-            replace_mechanism(cell, dataclasses.replace(now, mechanism=self._after.mechanism))
+        if now is not None and self._adapts and self._task is not None:
+            isolation = now.isolation if self._moves else self._after.isolation
+            replace_mechanism(
+                cell, dataclasses.replace(now, mechanism=self._after.mechanism, isolation=isolation)
+            )  # fmt: skip
         if self._gate is not None:
             self._gate.open()
 
@@ -146,7 +154,7 @@ class Relocation:
             if self._task is None:
                 self._task = self._begin(system, None)
             await asyncio.shield(self._task)
-            if self._adapts and self._moves and self._after.mechanism is None:
+            if self._adapts and self._moves:
                 cell = self._place.living(system.node)
                 await system._moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN)
         finally:

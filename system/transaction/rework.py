@@ -19,7 +19,7 @@ from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import Cell
 from ...actors.migration.quiesce import ATTEMPTS
 from ...actors.process.wire.start_codec import unpack_recipe
-from ...checkpoint.home.outputs import switch_of
+from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.protocol import Snapshot
 from ...supervision.respec import respec
 from .arrangement import busy

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ...actors.errors import ActorStopped, NameTaken, NoSuchActor, type_name
 from ...actors.kernel.cell import RUNNING
-from ...actors.kernel.lifecycle import LocalHost
 from .draft import Draft, Place, Target
 from .operation import Operation, wrong
 from .structure import text_of
@@ -79,7 +78,7 @@ class Unbind(Operation):
             raise wrong(owner.path, f"its binding {self._port!r} points nowhere already, as far as is known here")
         if owner.spec is not None and self._port in owner.spec.bindings:
             raise wrong(owner.path, f"its spec binds {self._port!r}: a restart would bind it again")
-        if owner.cell is not None and not isinstance(owner.cell.host, LocalHost):
+        if owner.cell is not None and not owner.cell.host.place.is_here:
             raise wrong(owner.path, "it lives in another process, which keeps a binding: bind it to somebody else")
         del owner.bindings[self._port]
 

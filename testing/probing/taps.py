@@ -11,7 +11,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import Message, message_of
 from ...actors.kernel.ref import ActorRef
-from ...checkpoint.home.outputs import switch_of
+from ...checkpoint.home.recorded_home import switch_of
 from ..swaps import Swaps
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import holdfast as hf
+from holdfast.checkpoint.home.recorded_home import switch_of
 from tests.checkpoint.players import Doer, Sink, start, until
 
 E = TypeVar("E", bound=hf.Event)
@@ -52,14 +53,14 @@ def let_through(gate: Path) -> None:
     Path(f"{gate}.open").touch()
 
 
-def host_of(ref: hf.ActorRef[Any]) -> Any:
+def place_of(ref: hf.ActorRef[Any]) -> Any:
     """Where its lives are lived."""
-    return ref._cell.host
+    return ref._cell.host.place
 
 
 def home(ref: hf.ActorRef[Any]) -> Any:
     """Its home."""
-    return host_of(ref).switch
+    return switch_of(ref._cell)
 
 
 def actor_of(ref: hf.ActorRef[Any]) -> Any:
@@ -69,5 +70,5 @@ def actor_of(ref: hf.ActorRef[Any]) -> Any:
 
 async def snapshot_after(system: hf.ActorSystem, ref: hf.ActorRef[Any], turn: int) -> None:
     """Wait until a snapshot covers this turn."""
-    switch = ref._cell.host.switch  # type: ignore[attr-defined]
+    switch = ref._cell.host.home.switch  # type: ignore[attr-defined]
     await until(lambda: switch.state_turn >= turn)

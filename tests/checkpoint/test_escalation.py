@@ -42,7 +42,7 @@ async def test_the_second_time_an_older_snapshot_comes_back_and_only_to_whom_it_
         await add(system, "mine", name="other")
         assert await rolled_back(system, isolation) == []
         assert await seen(system) == ["a", "b", "c"]
-        await until(lambda: at(system)._cell.host.switch.state_turn >= 4)  # type: ignore[attr-defined]
+        await until(lambda: at(system)._cell.host.home.switch.state_turn >= 4)  # type: ignore[attr-defined]
         (event,) = await rolled_back(system, isolation)
         assert await seen(system) == ["a", "b"]
         assert event.address == "/app/top/doer"
@@ -149,7 +149,7 @@ async def test_timers_stash_and_subscriptions_are_those_of_the_older_snapshot(st
         await at(system).ask(Do(["subscribe /late", "after 3000", "add b"]))
         await snapshot(system)
         await rolled_back(system, "task")
-        switch = at(system)._cell.host.switch  # type: ignore[attr-defined]
+        switch = at(system)._cell.host.home.switch  # type: ignore[attr-defined]
         assert (list(switch.topics), len(switch.timers.saved())) == (["/early"], 1)
         await system.publish("/late", Note("x"))
         await system.publish("/early", Note("y"))

@@ -202,12 +202,12 @@ async def test_the_answer_to_an_ask_of_an_erased_life_is_not_taken_for_one_of_th
         await peer.send(Do([f"gate {gate}"]))
         await until(gate.exists)
         at(system).tell(Do(["ask old"], peer))
-        await until(lambda: "/app/top/doer" in str(peer._cell.host.switch.open))  # type: ignore[attr-defined]
+        await until(lambda: "/app/top/doer" in str(peer._cell.host.home.switch.open))  # type: ignore[attr-defined]
         await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
         await top(system).ask(hf.RestartChild("doer", fresh=True), timeout=20.0)
         let_through(gate)
         assert await peer.ask(Seen(), timeout=20.0) == ["old"]
-        switch = at(system)._cell.host.switch  # type: ignore[attr-defined]
+        switch = at(system)._cell.host.home.switch  # type: ignore[attr-defined]
         assert switch.calls.outcomes == {}
         assert "got" not in {entry[0] for _, entry in switch.journal.load(switch.path).entries}
         await at(system).ask(Do(["ask new"], peer), timeout=20.0)

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.checkpoint.recovery_file import RecoveryFile
 from tests.checkpoint.players import Do, Doer, Note, Notes, Seen, Sink, start, until
-from tests.checkpoint.strikes import NEVER, event, home, host_of, let_through, strike
+from tests.checkpoint.strikes import NEVER, event, home, let_through, place_of, strike
 
 pytestmark = pytest.mark.pairs
 
@@ -190,7 +190,7 @@ async def test_a_root_that_starts_anew_forgets_the_same_again(tmp_path: Path) ->
         await ref.ask(Note("lost too"))
         switch = home(ref)
         turn, switch.method = switch.turn, hf.fresh()  # No last snapshot: the root dies here.
-        host_of(ref).life.method = method("replay_only")
+        place_of(ref).life.method = method("replay_only")
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
         ref = await system.start(spec)
         assert await ref.ask(Seen()) == ["kept"]

@@ -47,7 +47,7 @@ async def test_a_cancelled_timer_ticks_no_more_not_even_from_the_queue(
     ref = await doer(system, isolation, interval=interval)
     await ref.ask(Do(["after 0.01"]))
     busy = ref.ask(Do([f"gate {gate}", "cancel"]), timeout=30.0)
-    switch = ref._cell.host.switch  # type: ignore[attr-defined]
+    switch = ref._cell.host.home.switch  # type: ignore[attr-defined]
     await until(lambda: any(source.kind == "tick" for source in switch.open.values()))
     let_through(gate)
     await busy
@@ -176,7 +176,7 @@ async def test_snapshots_are_taken_while_turns_are_in_flight_and_cut_the_journal
     seen = [text for text in await ref.ask(Seen(), timeout=30.0) if text != "-"]
     assert seen == [text for n in range(60) for text in (str(n), f"{n}:{2 * n + 1}")]
     assert await notes.ask(Notes()) == [text for n in range(60) for text in (str(n), f"x{n}")]
-    switch: Any = ref._cell.host.switch  # type: ignore[attr-defined]
+    switch: Any = ref._cell.host.home.switch  # type: ignore[attr-defined]
     await snapshot_after(system, ref, switch.turn)
     assert not switch.turns
     assert not switch.calls.outcomes

@@ -100,7 +100,7 @@ async def test_a_tick_that_had_come_when_the_actor_was_stopped_is_handled_by_the
     await ref.ask(Do(["add kept", "after 0.05"]))
     await system.suspend(ref)
     cell: Any = ref._cell
-    await until(lambda: any(source.kind == "tick" for source in cell.host.switch.open.values()))
+    await until(lambda: any(source.kind == "tick" for source in cell.host.home.switch.open.values()))
     for _ in range(2):
         await house.ask(TerminateChild("doer"))
         again = await house.ask(RestartChild("doer"))

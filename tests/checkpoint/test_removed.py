@@ -291,7 +291,7 @@ CHECKS = {
         "test_tells_beyond_the_capacity and task",
     ),
     "S3: the life begins when the hooks before it are done": Check(
-        "checkpoint/home/homes.py",
+        "checkpoint/home/journal_home.py",
         "                await asyncio.shield(wait)",
         "                pass",
         "tests/checkpoint/test_controller_phases.py",
@@ -312,9 +312,9 @@ CHECKS = {
         "test_a_controller_that_does_not_come and task",
     ),
     "S4: the release waits for the hooks before it": Check(
-        "checkpoint/home/homes.py",
-        '            switch.waits_for_release = recoveries.needs(self.recovery, "release")',
-        "            switch.waits_for_release = False",
+        "checkpoint/home/journal_home.py",
+        '            entered.switch.waits_for_release = recoveries.needs(self.recovery, "release")',
+        "            entered.switch.waits_for_release = False",
         "tests/checkpoint/test_controller_phases.py",
         "test_hooks_are_called_in_order and task",
     ),

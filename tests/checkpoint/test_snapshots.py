@@ -74,7 +74,7 @@ async def test_a_snapshot_is_in_the_store_when_checkpoint_returns(store: str | N
         ref = await canvas(system, isolation)
         await ref.ask(Paint(3, 5))
         await system.checkpoint(ref, timeout=20.0)
-        switch: Any = ref._cell.host.switch  # type: ignore[attr-defined]
+        switch: Any = ref._cell.host.home.switch  # type: ignore[attr-defined]
         saved = system.homes.journal.load(ref.path)
         assert saved.turn == switch.turn
         assert not saved.entries

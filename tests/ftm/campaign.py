@@ -22,7 +22,7 @@ import holdfast as hf
 from holdfast.ftm.alarms import Diverged, Masked, Objected, Outvoted, ProtectionLost
 from holdfast.ftm.bricks.sealed_frames import FrameRefused
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
-from holdfast.ftm.group import group_host
+from holdfast.ftm.group import group_place
 from holdfast.ftm.group.detector import Detection
 from holdfast.ftm.group.group import Group, Look
 from holdfast.ftm.model.mechanism import Mechanism
@@ -130,20 +130,20 @@ def injecting(detection: Detection = QUICK) -> Generator[Page, None, None]:
     """Replicas that start in this block are struck by what is armed in the page."""
     with tempfile.TemporaryDirectory() as folder:
         page = Page.new(Path(folder) / "page")
-        saved, before = wrap_root(page), group_host.replica
-        group_host.replica = recipe(page)
+        saved, before = wrap_root(page), group_place.replica
+        group_place.replica = recipe(page)
         try:
             with detecting(detection):
                 yield page
         finally:
-            group_host.replica = before
+            group_place.replica = before
             unwrap(saved)
 
 
 @contextlib.contextmanager
 def detecting(detection: Detection) -> Generator[None, None, None]:
     """Groups that start in this block watch their replicas so."""
-    known: Any = group_host
+    known: Any = group_place
     before, known.Detection = known.Detection, lambda: detection
     try:
         yield
@@ -158,8 +158,8 @@ async def running() -> AsyncGenerator[hf.ActorSystem, None]:
 
 
 def group_of(ref: hf.ActorRef[Any]) -> Group | None:
-    found = ref._cell.host
-    return found.group if isinstance(found, group_host.GroupHost) else None
+    found = ref._cell.host.place
+    return found.group if isinstance(found, group_place.GroupPlace) else None
 
 
 async def whole(ref: hf.ActorRef[Any]) -> None:

@@ -155,7 +155,7 @@ class StruckReplica(Replica):
 
 
 def recipe(page: Page) -> Any:
-    """What stands in for `holdfast.ftm.group.group_host.replica`."""
+    """What stands in for `holdfast.ftm.group.group_place.replica`."""
 
     def replica(setting: Any, start: Start[Any], layers: tuple[Any, ...]) -> Start[Any]:
         return Start(StruckReplica, (setting, start, layers, page.path))

@@ -72,7 +72,7 @@ class Changes:
         stack = STACKS[name]("counter")
         if group is None:
             return {f"attach {name}": lambda change: change.attach(ref, stack)}
-        found: Any = ref._cell.host
+        found: Any = ref._cell.host.place
         names = [one.name for one in found.layers]
         choices: dict[str, Any] = {
             "detach": lambda change: change.detach(ref),

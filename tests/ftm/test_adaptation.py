@@ -76,7 +76,7 @@ def stack(ref: hf.ActorRef[Any]) -> tuple[str, ...]:
     """What its spec and its replicas say."""
     layers = ref._cell.spec.mechanism
     layers = layers if isinstance(layers, tuple) else (layers,)
-    assert layers == ref._cell.host.layers  # type: ignore[attr-defined]
+    assert layers == ref._cell.host.place.layers  # type: ignore[attr-defined]
     return tuple(layer.name for layer in layers)
 
 
@@ -272,7 +272,7 @@ async def test_two_at_a_time_are_done_one_after_the_other(system: hf.ActorSystem
     load = Load(ref)
     await asyncio.gather(transition(system, ref, LFR()), transition(system, ref, (PBR(), TR())))
     assert stack(ref) == ("pbr", "tr")
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     first = asyncio.ensure_future(host.adapt(ref._cell, PBR(), lambda: None))
     with pytest.raises(CannotAdapt, match="being changed"):
         await asyncio.gather(host.adapt(ref._cell, LFR(), lambda: None), first)

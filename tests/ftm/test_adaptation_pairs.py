@@ -148,7 +148,7 @@ async def come_and_go(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load,
     file.chmod(0o600)
     async with system.transaction(timeout=30) as change:
         change.update(ref, part, file, mechanism=first.name, role=role)
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     assert [brick.__name__ for brick in host.layers[0].exchanged.values()] == ["Newer"]
     await load.reached(3)
 
@@ -206,7 +206,7 @@ async def given_up(system: hf.ActorSystem, ref: hf.ActorRef[Any], step: str) -> 
         elif name == "abort" and seen.count("abort") == 1:
             fails()
 
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     host.on_step = on_step
     with pytest.raises(asyncio.CancelledError):
         await change
@@ -217,7 +217,7 @@ async def given_up(system: hf.ActorSystem, ref: hf.ActorRef[Any], step: str) -> 
 async def all_again(ref: hf.ActorRef[Any]) -> Stack:
     """The stack, when all replicas are there and have the same."""
     await two_again(ref)
-    group, host = group_of(ref), ref._cell.host
+    group, host = group_of(ref), ref._cell.host.place
     assert (group.config, group.change) == (host.config, None)  # type: ignore[attr-defined]
     assert not group.is_resting
     assert not group.is_changing

@@ -40,7 +40,7 @@ def struck(ref: hf.ActorRef[Any], step: str, strike: Any) -> list[str]:
         if name == step and seen.count(step) == 1:
             strike()
 
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     host.on_step = on_step
     return seen
 
@@ -53,7 +53,7 @@ async def consistent(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> tuple[str
     """The stack, when all replicas have the same."""
     found = stack(ref)
     await two_again(ref)
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     assert group_of(ref).config == host.config
     assert group_of(ref).change is None
     assert not group_of(ref).is_resting

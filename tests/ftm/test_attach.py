@@ -13,13 +13,13 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.events import Moved
-from holdfast.actors.process.process_host import ProcessHost
+from holdfast.actors.process.process_host import WorkerPlace
 from holdfast.checkpoint.protocol import Snapshot
 from holdfast.ftm.bricks.brick_messages import Done, Work
 from holdfast.ftm.bricks.bricks import After, Before
 from holdfast.ftm.events import MechanismAttached, MechanismDetached
 from holdfast.ftm.group.failover import FailoverManager
-from holdfast.ftm.group.group_host import GroupHost
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.model.mechanism import Mechanism, MechanismRefused, Role
@@ -59,10 +59,10 @@ async def test_attached_and_detached_under_load_nothing_is_lost(
     for _ in range(2):
         await load.reached(30)
         await attach(system, ref)
-        assert isinstance(ref._cell.host, GroupHost)
+        assert isinstance(ref._cell.host.place, GroupPlace)
         await load.reached(30)
         await detach(system, ref)
-        assert isinstance(ref._cell.host, ProcessHost) is (isolation == "process")
+        assert isinstance(ref._cell.host.place, WorkerPlace) is (isolation == "process")
         assert not [path for path in system.tree() if path.startswith(f"{ref.path}/ftm")] or await gone(system, ref)
     await load.reached(30)
     await load.stop()
@@ -290,12 +290,12 @@ async def test_its_next_lives_are_protected_too_and_not_after_a_detach(system: h
         while ref._cell.life < 2:
             await asyncio.sleep(0.005)
     assert await ref.ask(Add(1), timeout=30) == 2
-    assert isinstance(ref._cell.host, GroupHost)
+    assert isinstance(ref._cell.host.place, GroupPlace)
     await two_again(ref)
     await detach(system, ref)
     await system.terminate(ref)
     assert await ref.ask(Add(2), timeout=30) == 3
-    assert not isinstance(ref._cell.host, GroupHost)
+    assert not isinstance(ref._cell.host.place, GroupPlace)
 
 
 async def test_timers_come_along(system: hf.ActorSystem, recovery: Any) -> None:
@@ -320,7 +320,7 @@ async def test_a_transaction_that_fails_behind_it_detaches_it_again(system: hf.A
         async with system.transaction(timeout=30) as change:
             change.attach(ref, PBR())
             change.add("/app", hf.child("bad", hf.start(Failing)))
-    assert not isinstance(ref._cell.host, GroupHost)
+    assert not isinstance(ref._cell.host.place, GroupPlace)
     assert ref._cell.spec.mechanism is None
     await load.reached(10)
     await load.stop()
@@ -349,7 +349,7 @@ async def test_an_actor_that_cannot_leave_goes_on_as_it_was(system: hf.ActorSyst
     await load.reached(10)
     await load.stop()
     load.check(await ref.ask(Tags()))
-    assert not isinstance(ref._cell.host, GroupHost)
+    assert not isinstance(ref._cell.host.place, GroupPlace)
 
 
 async def test_what_a_mechanism_needs_is_checked_before_anything_is_done(system: hf.ActorSystem) -> None:
@@ -373,7 +373,7 @@ async def test_attached_twice_is_refused_and_a_dry_run_changes_nothing(system: h
     async with system.transaction(dry_run=True) as change:
         change.attach(ref, PBR())
     assert "attach PBR to /app/alice" in change.describe()
-    assert not isinstance(ref._cell.host, GroupHost)
+    assert not isinstance(ref._cell.host.place, GroupPlace)
     await attach(system, ref)
     with pytest.raises(hf.TransactionRefused, match="already"):
         await attach(system, ref)
@@ -390,7 +390,7 @@ async def test_if_the_new_life_cannot_begin_the_old_one_goes_on(
     veto.touch()
     with pytest.raises(hf.TransactionFailed):
         await attach(system, ref)
-    assert not isinstance(ref._cell.host, GroupHost)
+    assert not isinstance(ref._cell.host.place, GroupPlace)
     await load.reached(10)
     veto.unlink()
     await attach(system, ref)
@@ -398,7 +398,7 @@ async def test_if_the_new_life_cannot_begin_the_old_one_goes_on(
     veto.touch()
     with pytest.raises(hf.TransactionFailed, match="could not begin"):
         await detach(system, ref)
-    assert isinstance(ref._cell.host, GroupHost)
+    assert isinstance(ref._cell.host.place, GroupPlace)
     await load.reached(10)
     veto.unlink()
     await detach(system, ref)
@@ -489,7 +489,7 @@ async def test_those_that_wait_for_room_come_along(system: hf.ActorSystem, metho
     asks = [asyncio.ensure_future(ref.ask(Add(tag), timeout=30)) for tag in range(8)]
     await asyncio.sleep(0.05)
     await attach(system, ref)
-    assert isinstance(ref._cell.host, GroupHost)
+    assert isinstance(ref._cell.host.place, GroupPlace)
     await held
     assert sorted(await asyncio.gather(*asks)) == list(range(1, 9))
     assert sorted(await ref.ask(Tags())) == list(range(8))

@@ -16,7 +16,7 @@ from holdfast.checkpoint.home.switch import Switch
 from holdfast.checkpoint.protocol import PipeDone
 from holdfast.ftm.bricks.brick_messages import Done
 from holdfast.ftm.group.group import Group
-from holdfast.ftm.group.group_host import GroupHost
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import Add, Counter, Tags
@@ -125,8 +125,8 @@ async def test_it_comes_home_behind_the_turns_before_it(
         (tmp_path / name).touch()
     ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=LFR(), recovery=recovery))
     await two_again(ref)
-    group, host = group_of(ref), ref._cell.host
-    assert isinstance(host, GroupHost)
+    group, host = group_of(ref), ref._cell.host.place
+    assert isinstance(host, GroupPlace)
     assert group.primary is not None
     pid = pid_of(system, ref, group.primary)
     early = watched(group.switch)

@@ -154,7 +154,7 @@ async def test_failover_does_not_wait_for_a_change_that_hangs(system: hf.ActorSy
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
     load = Load(ref)
     await load.reached(10)
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     group, prepares = group_of(ref), asyncio.Event()
     host.on_step = lambda step: prepares.set() if step == "prepare" else None
 
@@ -182,7 +182,7 @@ async def test_a_kill_while_a_change_blocks_the_other_replica_loses_nothing(syst
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
     assert [await ref.ask(Add(tag)) for tag in range(5)] == [1, 2, 3, 4, 5]
     await two_again(ref)
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     pid = pid_of(system, ref, group_of(ref).primary or "")
     host.on_step = lambda step: os.kill(pid, signal.SIGKILL) if step == "prepare" and ref._cell.life == 1 else None
     with pytest.raises(hf.TransactionFailed, match=r"has failed when it prepared it|has ended"):

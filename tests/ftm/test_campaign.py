@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.group.group_host import GroupHost
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import Account, Add, Bank, Counter, Load, Put, Tags, Transfer
 from tests.ftm.test_attach import attach, detach
@@ -104,7 +104,7 @@ async def test_a_mechanism_comes_and_goes_while_replicas_are_struck(system: hf.A
         try:
             await detach(system, ref)
         except hf.TransactionFailed:  # It was struck in the middle of it: it stays protected, and goes on.
-            assert isinstance(ref._cell.host, GroupHost)
+            assert isinstance(ref._cell.host.place, GroupPlace)
             await load.reached(5)
             await two_again(ref)
             await detach(system, ref)

@@ -17,7 +17,7 @@ from holdfast.ftm.bricks.brick_messages import Change, Done, NotFollowing, Reply
 from holdfast.ftm.bricks.letters import Letter
 from holdfast.ftm.bricks.replica_orders import Broken
 from holdfast.ftm.bricks.reply_log import ReplyLog
-from holdfast.ftm.group.group_host import GroupHost
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.group.proxy import Settle
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
@@ -182,8 +182,8 @@ async def test_who_led_before_is_dead_when_another_one_is_told_to_lead(system: h
     ref = await system.start(hf.child("alice", hf.start(accounts.Counter), mechanism=PBR()))
     await two_again(ref)
     assert await ref.ask(accounts.Add(0)) == 1
-    group, host = group_of(ref), ref._cell.host
-    assert isinstance(host, GroupHost)
+    group, host = group_of(ref), ref._cell.host.place
+    assert isinstance(host, GroupPlace)
     assert group.primary is not None
     pid = pid_of(system, ref, group.primary)
     seen: list[tuple[str, bool]] = []

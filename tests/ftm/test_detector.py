@@ -311,7 +311,7 @@ async def test_the_outermost_mechanism_that_says_how_is_heard() -> None:
     """Also one that another stands around, and one that has come later."""
     async with hf.ActorSystem("app", log=False) as system:
         ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=QuickTR()))
-        host: Any = ref._cell.host
+        host: Any = ref._cell.host.place
         assert host.group.detection == QuickTR.detection
         for layers, said in (
             ((QuickPBR(), QuickTR()), QuickPBR.detection),

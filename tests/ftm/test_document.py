@@ -107,7 +107,7 @@ async def test_the_steps_of_a_failover(system: hf.ActorSystem) -> None:
     """A57-A59, T1."""
     ref: Any = await system.start(hf.child("c", hf.start(Counter), mechanism=hf.PBR()))
     steps: list[str] = []
-    ref._cell.host.on_step = steps.append
+    ref._cell.host.place.on_step = steps.append
     load = Load(ref)
     await load.reached(20)
     os.kill(system.pid_of(system.ref("/app/c/ftm/r1", hf.Actor)), signal.SIGKILL)

@@ -14,7 +14,7 @@ import pytest
 import holdfast as hf
 from holdfast.ftm.events import FailedOver, ReplicaJoined, WrongSuspicion
 from holdfast.ftm.group.group import Group
-from holdfast.ftm.group.group_host import GroupHost
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import (
     Account,
@@ -42,8 +42,8 @@ PARTS = ("proxy", "detector", "failover", "join")
 
 
 def group_of(ref: hf.ActorRef[Any]) -> Group:
-    host = ref._cell.host
-    assert isinstance(host, GroupHost)
+    host = ref._cell.host.place
+    assert isinstance(host, GroupPlace)
     assert host.group is not None
     return host.group
 
@@ -71,8 +71,8 @@ async def two_again(ref: hf.ActorRef[Any]) -> None:
 
 
 def is_complete(ref: hf.ActorRef[Any]) -> bool:
-    host = ref._cell.host
-    group = host.group if isinstance(host, GroupHost) else None
+    host = ref._cell.host.place
+    group = host.group if isinstance(host, GroupPlace) else None
     return group is not None and group.primary is not None and all(map(group.is_well, group.names))
 
 
@@ -244,8 +244,8 @@ async def test_the_failover_manager_may_die_at_each_step(system: hf.ActorSystem,
             hit.append(name)
             raise RuntimeError(f"struck at {name}")
 
-    host = ref._cell.host
-    assert isinstance(host, GroupHost)
+    host = ref._cell.host.place
+    assert isinstance(host, GroupPlace)
     host.on_step = strike
     await load.reached(30)
     group = group_of(ref)
@@ -316,7 +316,7 @@ async def test_a_silent_successor_that_is_all_there_is_is_waited_for(
 ) -> None:
     """It may be building the actor from a large state, which nobody else has any more."""
     ref = await started(system)
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     group = group_of(ref)
     assert await ref.ask(Add(0)) == 1
     first, heir, stopped = group.primary, other(group), list[int]()

@@ -115,7 +115,7 @@ def at_step(ref: hf.ActorRef[Any], step: str, act: Callable[[], Any]) -> list[An
             made.append(None)
             made[0] = act()
 
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     host.on_step = on_step
     return made
 
@@ -191,7 +191,7 @@ async def test_a_manager_that_dies_in_the_middle_keeps_the_actor(system: hf.Acto
     load = Load(ref)
     await load.reached(10)
     at_step(ref, "kill", dies)
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     strike, held = host.on_step, []
 
     def on_step(name: str) -> None:
@@ -250,7 +250,7 @@ async def test_a_failover_in_the_middle_of_an_adaptation_does_not_let_repair_in(
     ref = await protected(system)
     load, repair = Load(ref), Repair(system, restart())
     await load.reached(10)
-    host: Any = ref._cell.host
+    host: Any = ref._cell.host.place
     made: list[Any] = []
 
     def on_step(name: str) -> None:
@@ -362,7 +362,7 @@ async def test_a_supervisor_restart_in_the_middle_of_a_failover_comes_behind_it(
     alice, bob = system.ref("/app/s/alice", Counter), system.ref("/app/s/bob", Counter)
     load, steps, judge = Load(alice), list[str](), arbiter_of(system.node)
     await load.reached(10)
-    host: Any = alice._cell.host
+    host: Any = alice._cell.host.place
 
     def on_step(name: str) -> None:
         if name == "lead" and "lead" not in steps:

@@ -42,14 +42,14 @@ async def test_a_timer_of_on_start_is_there_once_after_failovers(recovery: hf.Me
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
         spec = hf.child("ticking", hf.start(Ticking), recovery=recovery, mechanism=hf.PBR())
         ref = await system.start(spec)
-        host: Any = ref._cell.host
+        host: Any = ref._cell.host.place
         assert await ref.ask(Count(), timeout=30.0) == 1
         for count in (2, 3, 4):
             await until(lambda: len(host.group.members) > 1)
             primary = host.group.primary
             os.kill(system.pid_of(system.ref(f"/app/ticking/ftm/{primary}", hf.Actor)), signal.SIGKILL)
             assert await ref.ask(Count(), timeout=60.0) == count
-            assert [interval for *_, interval in host.switch.timers.saved().values()] == [3600.0]
+            assert [interval for *_, interval in host.home.switch.timers.saved().values()] == [3600.0]
 
 
 class Halt(hf.Message[None]): ...
@@ -77,14 +77,14 @@ async def test_a_handle_of_on_start_is_good_after_a_failover_and_a_restart_of_th
     spec = hf.child("it", hf.start(Holding), recovery=hf.hybrid(interval=3600.0), mechanism=hf.PBR())
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
         ref = await system.start(spec)
-        host: Any = ref._cell.host
+        host: Any = ref._cell.host.place
         assert await ref.ask(Count(), timeout=30.0) == 1
         await until(lambda: len(host.group.members) > 1)
         os.kill(system.pid_of(system.ref(f"/app/it/ftm/{host.group.primary}", hf.Actor)), signal.SIGKILL)
         assert await ref.ask(Count(), timeout=60.0) == 2
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
         ref = await system.start(spec)
-        host = ref._cell.host
-        assert len(host.switch.timers.saved()) == 1
+        home: Any = ref._cell.host.home
+        assert len(home.switch.timers.saved()) == 1
         await ref.ask(Halt(), timeout=60.0)
-        assert host.switch.timers.saved() == {}
+        assert home.switch.timers.saved() == {}

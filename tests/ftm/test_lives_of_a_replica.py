@@ -9,7 +9,10 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.address_host import AddressHost
+from holdfast.actors.kernel.lifecycle import NEAR
 from holdfast.actors.kernel.message import message_name
+from holdfast.checkpoint.life.recorded_life import FED
 from holdfast.checkpoint.protocol import MESSAGE, Feed, TurnEnd
 from holdfast.ftm.bricks.brick_messages import Request
 from holdfast.ftm.bricks.standing import Standing
@@ -41,7 +44,7 @@ async def server(system: hf.ActorSystem) -> Any:
     node = system.node
     standing = Standing(node, "/app/x", "/app/x/ftm/r1", 1, (LFR(),))
     made = standing.server = Server(standing, hf.hybrid())
-    cell = node.cell_below(node.root, "x", made)
+    cell = node.cell_below(node.root, "x", AddressHost(FED, made, NEAR))
     cell.spec, cell.extra().start = hf.child("x", hf.start(Slow)), hf.start(Slow)
     made.start(cell)
     await made.ensure()

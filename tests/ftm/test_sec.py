@@ -41,7 +41,7 @@ CA = "/app/ca"
 
 
 def group_of(ref: Any) -> Any:
-    return ref._cell.host.group
+    return ref._cell.host.place.group
 
 
 async def joined(ref: Any, count: int = 2) -> None:

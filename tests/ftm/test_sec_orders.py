@@ -26,7 +26,7 @@ async def begun(secured: hf.ActorSystem) -> Any:
 
 
 def names(ref: Any) -> list[str]:
-    return [layer.name for layer in ref._cell.host.layers]
+    return [layer.name for layer in ref._cell.host.place.layers]
 
 
 async def test_a_change_is_made_though_its_orders_are_held_back_altered_and_replayed(

@@ -16,9 +16,11 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.exit_reasons import KILLED, pack_exit
+from holdfast.checkpoint.home.far_parent import FarParent
 from holdfast.checkpoint.protocol import Closed
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.migration.subtree_groups import SubtreeGroup, known
+from holdfast.ftm.migration.subtree_groups import known
 from holdfast.ftm.model.mechanism import Code, Description, MechanismRefused
 from tests.ftm.accounts import Account, Add, Counter, Load, Pay, Purse, Tags
 from tests.ftm.test_failover import METHODS, SEED, group_of, pid_of, two_again
@@ -51,7 +53,7 @@ async def test_its_replicas_are_processes_of_the_root(system: hf.ActorSystem) ->
     for name in ("alice", "inner/deep"):
         ref = at(system, name)
         assert [await ref.ask(Add(tag)) for tag in range(3)] == [1, 2, 3]
-        assert isinstance(ref._cell.host, SubtreeGroup)
+        assert isinstance(ref._cell.host.place, GroupPlace)
         assert len({bank_pid(system), os.getpid(), *(pid_of(system, ref, one) for one in ("r1", "r2"))}) == 4
         assert f"/app/bank/{name}/ftm/r2/server" in system.tree()
     children = await system.ref("/app/bank", hf.Supervisor).ask(hf.WhichChildren())
@@ -301,9 +303,10 @@ async def test_a_start_that_is_given_up_just_as_it_ends_leaves_nothing(system: h
     """What both sides say may cross: the life is up, and nobody wants it."""
     await system.start(bank(protected("alice")))
     alice = at(system, "alice")
-    host, pids = alice._cell.host, pids_of(system, alice)
-    assert isinstance(host, SubtreeGroup)
-    host.closed(Closed(host.number, pack_exit(KILLED)))
+    parent, pids = alice._cell.host.parent, pids_of(system, alice)
+    assert isinstance(parent, FarParent)
+    assert parent.worker is not None
+    parent.hear(parent.worker, Closed(parent.number, pack_exit(KILLED)))
     await ended(pids)
     os.kill(bank_pid(system), signal.SIGKILL)  # The supervisor there has not said so.
     assert await alice.ask(Add(0), timeout=30.0) == 1

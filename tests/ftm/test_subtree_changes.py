@@ -13,12 +13,11 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.checkpoint.home.subtree_homes import SubtreeHome
-from holdfast.ftm.group.group_host import GroupHost
+from holdfast.checkpoint.home.far_parent import SlotPlace
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.ftm.migration.subtree_groups import SubtreeGroup
 from tests.ftm.accounts import Add, Boom, Counter, Load, Tags
 from tests.ftm.test_adaptation_trouble import fails, struck
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
@@ -29,8 +28,8 @@ from tests.ftm.test_subtree import at, bank, bank_pid, protected
 
 
 def names_of(ref: hf.ActorRef[Any]) -> list[str]:
-    assert isinstance(ref._cell.host, GroupHost)
-    return [layer.name for layer in ref._cell.host.layers]
+    assert isinstance(ref._cell.host.place, GroupPlace)
+    return [layer.name for layer in ref._cell.host.place.layers]
 
 
 async def test_its_mechanism_is_changed_under_load(system: hf.ActorSystem) -> None:
@@ -117,14 +116,14 @@ async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.Actor
     for _ in range(2):
         await load.reached(30)
         await attach(system, alice)
-        assert isinstance(alice._cell.host, SubtreeGroup)
+        assert isinstance(alice._cell.host.place, GroupPlace)
         await load.reached(30)
         await two_again(alice)
         os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
         await load.reached(30)
         await two_again(alice)
         await detach(system, alice)
-        assert isinstance(alice._cell.host, SubtreeHome)
+        assert isinstance(alice._cell.host.place, SlotPlace)
         assert not [path for path in system.tree() if path.startswith("/app/bank/alice/ftm")]
     await load.reached(30)
     await load.stop()
@@ -159,7 +158,7 @@ async def test_what_was_attached_or_detached_holds_over_restarts(system: hf.Acto
     assert system.pid_of(ref) == bank_pid(system)
     await kill_subtree(system)
     assert await ref.ask(Tags(), timeout=30.0) == [0, 1, 2, 3]
-    assert isinstance(ref._cell.host, SubtreeHome)
+    assert isinstance(ref._cell.host.place, SlotPlace)
 
 
 @pytest.mark.parametrize("victim", ["subtree", "replica"])
@@ -196,7 +195,7 @@ async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSy
             change.attach(alice, LFR())
             change.detach(bob)
             change.add("/app/bank", hf.child("bad", hf.start(Bad)))
-    assert isinstance(alice._cell.host, SubtreeHome)
+    assert isinstance(alice._cell.host.place, SlotPlace)
     assert names_of(bob) == ["pbr"]
     await two_again(bob)
     os.kill(pid_of(system, bob, group_of(bob).primary or ""), signal.SIGKILL)
@@ -302,7 +301,7 @@ async def test_with_a_store_the_stack_is_there_again(tmp_path: Path) -> None:
             change.detach(alice)
     async with hf.ActorSystem("app", store=store, log=False) as system:
         await system.start(spec)
-        assert isinstance(at(system, "alice")._cell.host, SubtreeHome)
+        assert isinstance(at(system, "alice")._cell.host.place, SlotPlace)
         assert await at(system, "alice").ask(Tags()) == [0, 1]
 
 

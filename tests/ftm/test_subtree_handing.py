@@ -18,10 +18,10 @@ import pytest
 import holdfast as hf
 from holdfast.actors.migration.move import Move
 from holdfast.actors.process.wire.peer import OutsideHost
-from holdfast.checkpoint.home.subtree_homes import SubtreeHost
+from holdfast.checkpoint.home.subtree_place import SubtreePlace
+from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
-from holdfast.ftm.migration.subtree_groups import SubtreeGroup
 from tests.ftm.accounts import Add, Boom, Counter, Later, Load, Tags
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
 from tests.ftm.test_subtree import Heard, Watch, Watcher, at, bank, bank_pid
@@ -76,7 +76,7 @@ async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.Actor
     for _ in range(2):
         await load.reached(30)
         await attach(system, alice)
-        assert isinstance(alice._cell.host, SubtreeGroup)
+        assert isinstance(alice._cell.host.place, GroupPlace)
         await load.reached(30)
         await two_again(alice)
         os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
@@ -99,10 +99,10 @@ async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.Actor
 
 def is_to_rest(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> bool:
     """Whether whoever lives there has been told to come to rest."""
-    if isinstance(ref._cell.host, SubtreeGroup):
+    if isinstance(ref._cell.host.place, GroupPlace):
         return group_of(ref).is_stopping
-    top = system.node.cell_at("/app/bank").host
-    assert isinstance(top, SubtreeHost)
+    top = system.node.cell_at("/app/bank").host.place
+    assert isinstance(top, SubtreePlace)
     return top.at(ref.path).arriving is not None
 
 
@@ -314,7 +314,7 @@ async def test_whatever_dies_while_it_is_handed_over_it_is_there_again(system: h
         tag += 5
         with contextlib.suppress(hf.TransactionRefused):  # Then it is as it should be already.
             await change(system, alice)
-        assert isinstance(alice._cell.host, SubtreeGroup) is (change is attach)
+        assert isinstance(alice._cell.host.place, GroupPlace) is (change is attach)
 
 
 @pytest.mark.parametrize("step", ["take", "leave", "come", "settle"])
@@ -346,7 +346,7 @@ async def test_the_process_dies_at_a_step_and_the_child_begins_afresh(
     tags = await alice.ask(Tags())
     assert tags in ([], [1], [2], [1, 2])
     monkeypatch.undo()
-    if not isinstance(alice._cell.host, SubtreeGroup):  # Each step is done, or is not.
+    if not isinstance(alice._cell.host.place, GroupPlace):  # Each step is done, or is not.
         async with asyncio.timeout(20):
             while [path for path in system._workers.processes() if path.startswith("/app/bank/alice/ftm")]:
                 await asyncio.sleep(0.01)

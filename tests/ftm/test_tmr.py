@@ -159,7 +159,7 @@ async def three_again(ref: hf.ActorRef[Any]) -> None:
     async with asyncio.timeout(60):
         while (
             ref._cell.state != "running"
-            or getattr(ref._cell.host, "group", None) is None
+            or getattr(ref._cell.host.place, "group", None) is None
             or len(group_of(ref).members) < 3
         ):
             await asyncio.sleep(0.005)

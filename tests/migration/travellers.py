@@ -161,7 +161,7 @@ async def take(system: hf.ActorSystem, ref: hf.ActorRef[Any], step: str) -> None
             await system.set_isolation(ref, step, timeout=60.0)
         case "protect":
             async with system.transaction(timeout=60.0) as change:
-                change.attach(ref, hf.PBR())
+                change.protect(ref, hf.PBR())
         case "unprotect":
             async with system.transaction(timeout=60.0) as change:
                 change.detach(ref)

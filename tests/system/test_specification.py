@@ -60,7 +60,7 @@ def shape(system: hf.ActorSystem) -> dict[str, Any]:
             waiting += (cell.children or {}).values()
         else:
             bindings = {} if cell.more is None else {port: to.path for port, to in cell.more.bindings.items()}
-            found[cell.path] = (type(actor), cell.host.__class__, bindings)
+            found[cell.path] = (type(actor), type(cell.host.place), bindings)
     return found
 
 

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any, cast
 from ...errors import AskDeadlock, BadMessage, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
-from ...kernel.cell import Cell, Host
+from ...kernel.address_host import AddressHost, Home, Place
+from ...kernel.cell import Cell
 from ...kernel.codec import Codec, Parcel, Raw
 from ...kernel.envelope import Ask, Envelope, Item
+from ...kernel.lifecycle import NEAR
 from ...kernel.message import Message, message_name
 from . import frames
 from .connection import BadFrame, Connection
@@ -363,10 +365,37 @@ class RelayedAsk(Ask, eq=False):
             self.page = [0, 0]  # The real one counts in the order of arrival: a late number would undo later ones.
 
 
-class OutsideHost(Host):
-    """The host of stand-ins for actors in other processes: everything goes over the connection."""
+class RemoteHome(Home):
+    """The home of an address is in another process: everything goes over the connection."""
 
     takes_parcels = True
+
+    def __init__(self, peer: Peer) -> None:
+        self.peer = peer
+
+    def push(self, cell: Cell, item: Item) -> None:
+        send_signal(self.peer, cell.path, item)
+
+    def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
+        if isinstance(item, Envelope):
+            return self.peer.offer(cell.path, item.message, item.sender)
+        return self.peer.offer(cell.path, item, None)
+
+    def backlog(self, cell: Cell, running: int) -> int:
+        return 0
+
+    def load(self, cell: Cell) -> int:
+        return 0
+
+    def admit(self, cell: Cell, item: Any) -> None:
+        """Stands in `cell.admit` of the stand-ins."""
+        self.peer.send_item(cell, cell.path, item, 0)
+
+
+class OutsidePlace(Place):
+    """Wherever the process at the other end has an actor."""
+
+    is_here = False
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
@@ -382,38 +411,24 @@ class OutsideHost(Host):
         self.peer.require_granted(cell.path, "kill")
         self.told(cell, "kill", {})
 
-    def retired(self, cell: Cell) -> None:
-        pass
-
-    def push(self, cell: Cell, item: Item) -> None:
-        send_signal(self.peer, cell.path, item)
-
-    def offer(self, cell: Cell, item: Any) -> asyncio.Future[None]:
-        if isinstance(item, Envelope):
-            return self.peer.offer(cell.path, item.message, item.sender)
-        return self.peer.offer(cell.path, item, None)
-
     def control(self, cell: Cell, call: Call) -> None:
         from ...control.orders_lane import send_call
 
         send_call(self.peer, cell.path, call)
 
-    def is_up(self, cell: Cell) -> bool:
-        return True  # As far as is known on this side.
-
-    def backlog(self, cell: Cell) -> int:
-        return 0
-
-    def load(self, cell: Cell) -> int:
-        return 0
-
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         connection = self.peer.connection
         connection.send(frames.Command(connection.name_out(cell.path), verb, data))
 
-    def admit(self, cell: Cell, item: Any) -> None:
-        """Stands in `cell.admit` of the stand-ins."""
-        self.peer.send_item(cell, cell.path, item, 0)
+
+class OutsideHost(AddressHost):
+    """The host of stand-ins for actors in another process."""
+
+    home: RemoteHome
+
+    def __init__(self, peer: Peer) -> None:
+        super().__init__(RemoteHome(peer), OutsidePlace(peer), NEAR)
+        self.peer = peer
 
 
 def send_signal(peer: Peer, path: str, item: Item) -> None:

@@ -18,6 +18,7 @@ import holdfast as hf
 from holdfast.actors.events import DeadLetter
 from holdfast.actors.kernel.mailbox import Bound
 from holdfast.checkpoint.home.capacity import HomeBound
+from holdfast.checkpoint.home.recorded_home import switch_of
 from tests.actors.process.observers import Observer, Publish, Send
 from tests.actors.process.players import Add, Block, Note, Notes, Slow, Total, Worker
 from tests.actors.process.waiting import until
@@ -60,8 +61,8 @@ def busy(system: hf.ActorSystem, isolation: str, gate: Path) -> Busy:
 
 
 def bound_of(ref: hf.ActorRef[Any]) -> Bound | HomeBound:
-    home = getattr(ref._cell.host, "switch", None)
-    bound = home.bound if home is not None else ref._cell.extra().bound
+    home = switch_of(ref._cell)
+    bound: Any = home.bound if home is not None else ref._cell.extra().bound
     assert bound is not None
     return bound
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 import holdfast as hf
-from holdfast.actors.process.process_host import ProcessHost
+from holdfast.actors.process.process_host import WorkerPlace
 
 SECONDS = 60.0
 
@@ -43,9 +43,9 @@ async def in_turn(system: hf.ActorSystem, ref: hf.ActorRef[Any], number: int) ->
 
 async def stop_read(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     """Wait until an actor's process has read the order to stop."""
-    worker, host = system._workers.of(ref._cell), ref._cell.host
+    worker, host = system._workers.of(ref._cell), ref._cell.host.place
     assert worker is not None
-    assert isinstance(host, ProcessHost)
+    assert isinstance(host, WorkerPlace)
     connection, transport = worker.connection, worker.connection._transport
     assert transport is not None
     file = transport.get_extra_info("socket").fileno()

@@ -12,7 +12,7 @@ import holdfast as hf
 from holdfast.actors.kernel.message import message_name
 from holdfast.actors.process.wire import frames as f
 from holdfast.checkpoint.protocol import Protected, Wanted
-from holdfast.ftm.group.group_host import GroupHost
+from holdfast.ftm.group.group_place import GroupPlace
 from tests.actors.process.hostile.forging import command, frame, raw
 from tests.actors.process.hostile.players import Add, Evil, House, Kill, Ping, Terminate, Victim, Write
 from tests.actors.process.waiting import next_event, until
@@ -112,7 +112,7 @@ async def test_a_claim_that_moves_with_its_actor_is_still_one(town: Town, recove
     assert evil.path + "/ftm" in town.system.tree()
     assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
     await town.refused(evil, Kill(VICTIM))
-    await until(lambda: not isinstance(evil._cell.host, GroupHost))  # It was on probation.
+    await until(lambda: not isinstance(evil._cell.host.place, GroupPlace))  # It was on probation.
     assert [cell.path for cell in evil._cell.extra().bindings.values()] == [SUP]
     await town.refused(evil, Kill(VICTIM))
 

@@ -1,4 +1,4 @@
-"""The host of a protected actor: the life at its address is lived by a group of replicas.
+"""The place of a protected actor: the life at its address is lived by a group of replicas.
 
 Its home feeds, holds, journals and answers as for any recorded actor. An actor without recovery has a home as long as
 it is protected: nothing is kept of what it has handled, and when no replica is left it begins afresh.
@@ -12,13 +12,18 @@ import time
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+import msgspec
+
 from ...actors.errors import HoldfastError, StartFailed
 from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Start
+from ...actors.kernel.address_host import AddressHost, Parent, Place
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
+from ...actors.kernel.lifecycle import NEAR
 from ...actors.migration.move import Gate
-from ...checkpoint.home.homes import HomeHost, Homes
+from ...checkpoint.home.homes import Homes
+from ...checkpoint.home.journal_home import Entered, JournalHome
 from ...checkpoint.method import Method
 from ...checkpoint.protocol import Restore
 from ...supervision.backoff import Backoff
@@ -47,13 +52,12 @@ from .reconfiguration import (
     names_for,
 )
 from .steering import bind, bind_again, give_order
-from .transient_homes import UNKEPT, begin_afresh, begin_again, forget_later, is_unkept
+from .transient_homes import UNKEPT, TransientHome, is_unkept
 
 if TYPE_CHECKING:
     from ...actors.control.orders_lane import Call
     from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import TurnEnd
-    from ...checkpoint.snapshot.snapshot_record import Meta
     from ..model.mechanism import Mechanism
 
 LED_WITHIN = 60.0
@@ -71,11 +75,13 @@ BRICKS_INTENSITY = 100
 BRICKS_PERIOD = 5.0
 
 
-class GroupHost(HomeHost):
-    """Lives that are lived by replicas, each in a process of its own."""
+class GroupPlace(Place):
+    """Replicas, each in a process of its own."""
 
-    def __init__(self, homes: Homes, method: Method | None, mechanism: Any) -> None:
-        super().__init__(homes, method or UNKEPT)
+    is_here = False
+
+    def __init__(self, home: JournalHome, parent: Parent, mechanism: Any) -> None:
+        self.home, self.parent = home, parent
         self.layers = compose(mechanism)
         self.group: Group | None = None
         self.epoch = 0
@@ -86,10 +92,10 @@ class GroupHost(HomeHost):
         self.on_switched: Callable[[], None] = lambda: None
         self.ended_at = time.time()  # when the last group ended, by the system's clock
         self.probation: Probation | None = None  # of the stack that there is, if it is not trusted yet
+        self._starting: asyncio.Task[None] | None = None
         self._ending: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
         self._careful: set[int] = set()
-        self._copy: Meta | None = None  # the next life begins with it, though nothing is kept otherwise
         self._joined: asyncio.Future[None] | None = None
 
     @property
@@ -102,33 +108,27 @@ class GroupHost(HomeHost):
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
         start = cell.extra().start
-        assert start is not None
-        cell.table = start.kind._table
+        if start is not None:
+            cell.table = start.kind._table
         self._stop_wanted = None
-        self._starting = lifecycle.outside_turn(cell, self._recover(cell, *self.enter(cell)))
+        entered = self.home.enter(cell)  # Now: from here on what is sent is admitted by the home.
+        self._starting = lifecycle.outside_turn(cell, self._recover(cell, entered))
         return self._starting
 
-    def open(self, cell: Cell) -> tuple[Switch, asyncio.Future[float], bool]:
-        opened = super().open(cell)
-        switch = opened[0]
-        if is_unkept(self.method) and not (self._copy is not None and begin_again(switch, self._copy)):
-            begin_afresh(switch)
-        self._copy = None
-        return opened
-
-    async def _recover(self, cell: Cell, switch: Switch, live: asyncio.Future[float], recovering: bool) -> None:
-        await self.gate("restart")
-        if not self.is_gated:
-            self.isolated()
+    async def _recover(self, cell: Cell, entered: Entered) -> None:
+        home, switch = self.home, entered.switch
+        await home.gate("restart")
+        if not home.is_gated:
+            home.isolated()
         if cell.state is not DOWN:
             raise StartFailed(cell.path, "it was stopped while it started")
         cell.life += 1
         cell.state = RUNNING
         try:
             group = await self.build(cell, switch)
-            self.subscribe(cell)
+            home.subscribe(cell, self.parent.topics(cell))
             await self.lead(group, switch)
-            await self.replay(cell, group, live, recovering)
+            await home.replay(cell, group, entered)
             await self.protected(group)
         except BaseException as error:
             if isinstance(error, asyncio.CancelledError):
@@ -138,7 +138,7 @@ class GroupHost(HomeHost):
             if not isinstance(error, HoldfastError):
                 raise
             raise failed from error
-        self.clock = None
+        home.clock = None
         if self._stop_wanted is not None:
             self.stop(cell, self._stop_wanted)
 
@@ -216,14 +216,10 @@ class GroupHost(HomeHost):
         more = cell.extra()
         bindings = {port: target.path for port, target in more.bindings.items()}
         interval, watch_turns = self.detection.interval, self.detection.watch_turns or 0.0
-        setting = Setting(cell.path, name, config, self.method.data(), bindings, interval, watch_turns, more.claimed)
-        return self.replica(setting, self.recipe(cell), tuple(layer.describe() for layer in layers))
-
-    def recipe(self, cell: Cell) -> Start[Any] | bytes:
-        """How the protected actor begins, or that as bytes."""
-        start = cell.extra().start
-        assert start is not None
-        return start
+        setting = Setting(
+            cell.path, name, config, self.home.method.data(), bindings, interval, watch_turns, more.claimed
+        )
+        return self.replica(setting, self.parent.recipe(cell), tuple(layer.describe() for layer in layers))
 
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
@@ -309,6 +305,11 @@ class GroupHost(HomeHost):
     def respecified(self, cell: Cell) -> None:
         """The next lives have the stack that there is now."""
         replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=as_spec(self.layers)))
+        self.parent.respecified(cell, self.described())
+
+    def described(self) -> list[Any]:
+        """The mechanisms as data."""
+        return [msgspec.to_builtins(layer.describe()) for layer in self.layers]
 
     def _back_to(self, group: Group) -> Reconfiguration | None:
         """What whoever leads next has to be brought to first."""
@@ -371,6 +372,7 @@ class GroupHost(HomeHost):
         if not change.is_back:
             self._put_on_probation(cell, group, before, change)
             self.on_switched()
+            self.parent.respecified(cell, self.described())
         elif probation is not None:
             self.respecified(cell)
             group.send_again()  # What the bricks have let fall; they are at rest.
@@ -435,7 +437,7 @@ class GroupHost(HomeHost):
         error = (
             cell.node.codec.decode_error(end.answer.kind, end.answer.name, end.answer.body) if end.answer.kind else ""
         )
-        switch = self.switch
+        switch = self.home.switch
         if switch is not None and switch.live is not None and not switch.live.done():
             switch.live.set_exception(
                 StartFailed(cell.path, f"on_start raised {error}" if error else "on_start raised")
@@ -445,7 +447,7 @@ class GroupHost(HomeHost):
 
     def _fell(self, cell: Cell, group: Group) -> None:
         """No replica is left that could lead: the life is over, and whose fault it was may be known."""
-        if cell.host is not self:
+        if cell.host.place is not self:
             return  # It has never been its life: another one goes on.
         self._has_joined()
         suspect = group.only_suspect_input()
@@ -457,7 +459,7 @@ class GroupHost(HomeHost):
             if one is not None and one.more is not None and not one.more.reason.is_clean:
                 reason = one.more.reason
         if self._starting is not None and not self._starting.done() and not group.is_live:
-            switch = self.switch
+            switch = self.home.switch
             if switch is not None and switch.live is not None and not switch.live.done():
                 switch.live.set_exception(StartFailed(cell.path, group.why))
                 switch.live.exception()  # Nobody may look: the start may have failed before it waited.
@@ -522,8 +524,21 @@ class GroupHost(HomeHost):
                 self._ending = None
             if self._starting is not None and not self._starting.done():
                 self._starting.cancel()
-            else:
+            elif self.group is not None:  # Else it has ended already.
                 self._begin_end(cell, KILLED, -1, ordered=True)
+
+    def give_up(self, why: str) -> None:
+        if self.group is not None and self.group.change is not None:
+            self.group.change.give_up(why)
+
+    def end(self, cell: Cell, reason: ExitReason) -> None:
+        if self._starting is not None and not self._starting.done():
+            self._starting.cancel()
+        else:
+            self._begin_end(cell, reason, -1, ordered=True)
+
+    def left(self, cell: Cell) -> list[asyncio.Future[Any]]:
+        return [task for task in (self._ending, self._starting) if task is not None and not task.done()]
 
     def _begin_end(self, cell: Cell, reason: ExitReason, running: int, *, ordered: bool = False) -> None:
         if self._ending is not None and not self._ending.done():
@@ -543,20 +558,17 @@ class GroupHost(HomeHost):
         if failed is not None:
             reason = KILLED
         if not ordered:
-            self._copy = copy
+            if isinstance(self.home, TransientHome):
+                self.home.copy = copy
             self._judge(cell, fault_of(reason), f"no replica is left: {failed or reason}")
-        self.life_over(cell, reason, failed, running, noticed, ordered=ordered)
 
-    def life_over(
-        self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int, noticed: float, *, ordered: bool
-    ) -> None:
-        """All replicas have ended: the life at the address is over."""
-        self.over(
-            cell, running, str(failed or reason), ordered=ordered or running < 0, noticed=noticed, reason=reason
-        )  # fmt: skip
-        if is_unkept(self.method) and self.switch is not None:
-            forget_later(self.switch, str(reason))
-        lifecycle.ended(cell, reason)
+        def over(recovers: bool | None) -> None:
+            self.home.over(
+                cell, running, str(failed or reason), ordered=ordered or running < 0, noticed=noticed, reason=reason,
+                recovers=recovers,
+            )  # fmt: skip
+
+        self.parent.life_over(cell, reason, over)
 
     async def dismantle(self, cell: Cell) -> None:
         """End the mechanism; returns when all of its processes have been reaped."""
@@ -591,12 +603,11 @@ class GroupHost(HomeHost):
             ftm.kill()
         if self.probation is not None:
             self.probation.end(is_kept=True)
-        self.give_up(cell)
 
     # -- what else a host does --------------------------------------------------------------------------------------
 
     def control(self, cell: Cell, call: Call) -> None:
-        give_order(self.group if self.is_up(cell) else None, cell, call)
+        give_order(self.group if cell.host.is_up(cell) else None, cell, call)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """Links and monitors are the home's; a binding is that of the actor in each replica."""
@@ -605,7 +616,7 @@ class GroupHost(HomeHost):
                 bind(self.group, name, data)
 
     def is_up(self, cell: Cell) -> bool:
-        return super().is_up(cell) and self.group is not None and not self.group.is_over
+        return self.group is not None and not self.group.is_over
 
     def running(self, cell: Cell) -> int:
         return -1 if self.group is None else self.group.only_suspect_input()
@@ -621,3 +632,10 @@ def replica(setting: Setting, start: Start[Any] | bytes, layers: tuple[Any, ...]
     from ..replica.replica import Replica
 
     return Start(Replica, (setting, start, layers))
+
+
+def protected_host(homes: Homes, method: Method | None, mechanism: Any, parent: Parent = NEAR) -> AddressHost:
+    """The host of an actor that a mechanism protects; `method`: None if it has no recovery."""
+    is_kept = method is not None and not is_unkept(method)
+    home = JournalHome(homes, method or UNKEPT, parent) if is_kept else TransientHome(homes, parent)
+    return AddressHost(home, GroupPlace(home, parent, mechanism), parent)

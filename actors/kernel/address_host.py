@@ -1,0 +1,208 @@
+"""How an address lives: what it has accepted (its home), where its turns run (its place), and whom its ends concern.
+
+A home outlives every life at its address, and a place can be exchanged for another while the actor works. Any home
+that hands its messages over goes with any place that takes them, so a new home is one class, and so is a new place.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ..control.orders_lane import Call as Call
+    from ..exit_reasons import ExitReason
+    from .actor import Start
+    from .cell import Cell
+    from .envelope import Ask, Item
+
+
+class Home:
+    """What is accepted at an address, and in which order."""
+
+    takes_parcels: bool
+    """Whether messages that came encoded are passed on as they are."""
+
+    def push(self, cell: Cell, item: Item) -> None:
+        """Put an item of the runtime's own in its place behind the messages."""
+        raise NotImplementedError
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        """Admit a message for a sender that waits until it is accepted. None: it is."""
+        cell.admit(cell, item)
+        return None
+
+    def is_open(self, cell: Cell) -> bool:
+        """Whether it lets messages through to the life at the address."""
+        return True
+
+    def backlog(self, cell: Cell, running: int) -> int:
+        """Messages that wait, as far as is known here; `running` is the input in hand, -1 if none is known."""
+        raise NotImplementedError
+
+    def load(self, cell: Cell) -> int:
+        """Messages that wait and those in hand; cheap, for it may be a guess."""
+        raise NotImplementedError
+
+    def progress(self, cell: Cell) -> object:
+        """How far the start that is under way has come, as `Host.progress` says."""
+        return None
+
+    def recovers(self, reason: ExitReason) -> bool:
+        """Whether a life that ended for this reason is brought back with its state."""
+        return False
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        """Whether the turn of an ask may have begun whose deadline is over, and which was handed on with a number."""
+        return True
+
+    def retired(self, cell: Cell) -> None:
+        """The address is gone for good; called before its queue is drained."""
+
+
+class Place:
+    """Where the turns of an address run, life after life."""
+
+    is_here: bool
+    """Whether that is this process."""
+
+    def start(self, cell: Cell) -> asyncio.Future[None] | None:
+        """Begin a life. None: it is up already. Raises, or fails the future, with StartFailed."""
+        raise NotImplementedError
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        """Ask the life to end in good order."""
+        raise NotImplementedError
+
+    def kill(self, cell: Cell) -> None:
+        """End the life at once."""
+        raise NotImplementedError
+
+    def control(self, cell: Cell, call: Call) -> None:
+        """Have an order carried out between two turns of the actor, ahead of all messages."""
+        raise NotImplementedError
+
+    def is_up(self, cell: Cell) -> bool:
+        """Whether a life can take messages here."""
+        return True
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        """A link, monitor or binding at this cell has changed: whoever lives its life has to know."""
+
+    def running(self, cell: Cell) -> int:
+        """The number of the input in hand, -1 if none is known."""
+        return -1
+
+    def process(self, cell: Cell) -> Any:
+        """The process besides this one that the present life is lived in, if there is one now."""
+        return None
+
+    def give_up(self, why: str) -> None:
+        """A change of the place itself is under way, and not wanted any more: it ends soon, undone."""
+
+    def end(self, cell: Cell, reason: ExitReason) -> None:
+        """Nobody wants the life any more, or the start that is under way: end it."""
+        self.kill(cell)
+
+    def left(self, cell: Cell) -> list[asyncio.Future[Any]]:
+        """What has to come to its end before another life may begin."""
+        return []
+
+    def retired(self, cell: Cell) -> None:
+        """The address is gone for good: what is under way there is not wanted any more."""
+
+
+class Parent:
+    """The supervisor of an address, as those who live its lives speak of it."""
+
+    def life_over(self, cell: Cell, reason: ExitReason, over: Callable[[bool | None], None]) -> None:
+        """A life has ended. Its supervisor decides what follows; `over` is called as soon as that is known.
+
+        Args:
+            cell: the address.
+            reason: of the end.
+            over: takes whether the actor is brought back with its state; None: as its spec says.
+        """
+        raise NotImplementedError
+
+    def recipe(self, cell: Cell) -> Start[Any] | bytes:
+        """How a life at the address begins, or that as bytes."""
+        raise NotImplementedError
+
+    def topics(self, cell: Cell) -> Iterable[str]:
+        """The topics that the class at the address subscribes to."""
+        raise NotImplementedError
+
+    def is_restarting(self, cell: Cell) -> bool:
+        """Whether a retired address may have its supervisor, and so itself, started again."""
+        raise NotImplementedError
+
+    def retired(self, cell: Cell) -> None:
+        """The address is gone for good."""
+
+    def leaves(self, *, is_restarting: bool) -> None:
+        """The supervisor gives up the address; it may have been started again by its own (`is_restarting`)."""
+
+    def respecified(self, cell: Cell, layers: list[Any]) -> None:
+        """The next lives there have other mechanisms than the last: these layers, as data."""
+
+
+class AddressHost:
+    """The host of an address: a home, a place, and a parent."""
+
+    __slots__ = ("home", "parent", "place", "takes_parcels")
+
+    def __init__(self, home: Home, place: Place, parent: Parent) -> None:
+        self.home, self.place, self.parent = home, place, parent
+        self.takes_parcels = home.takes_parcels
+
+    # -- the home's -------------------------------------------------------------------------------------------------
+
+    def push(self, cell: Cell, item: Item) -> None:
+        self.home.push(cell, item)
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        return self.home.offer(cell, item)
+
+    def backlog(self, cell: Cell) -> int:
+        return self.home.backlog(cell, self.place.running(cell))
+
+    def load(self, cell: Cell) -> int:
+        return self.home.load(cell)
+
+    def progress(self, cell: Cell) -> object:
+        return self.home.progress(cell)
+
+    def recovers(self, reason: ExitReason) -> bool:
+        return self.home.recovers(reason)
+
+    def may_have_begun(self, cell: Cell, ask: Ask) -> bool:
+        return self.home.may_have_begun(cell, ask)
+
+    # -- the place's ------------------------------------------------------------------------------------------------
+
+    def start(self, cell: Cell) -> asyncio.Future[None] | None:
+        return self.place.start(cell)
+
+    def stop(self, cell: Cell, reason: ExitReason) -> None:
+        self.place.stop(cell, reason)
+
+    def kill(self, cell: Cell) -> None:
+        self.place.kill(cell)
+
+    def control(self, cell: Cell, call: Call) -> None:
+        self.place.control(cell, call)
+
+    def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
+        self.place.told(cell, verb, data)
+
+    # -- both -------------------------------------------------------------------------------------------------------
+
+    def is_up(self, cell: Cell) -> bool:
+        return self.home.is_open(cell) and self.place.is_up(cell)
+
+    def retired(self, cell: Cell) -> None:
+        self.place.retired(cell)
+        self.home.retired(cell)
+        self.parent.retired(cell)

@@ -1,0 +1,327 @@
+"""The home of a recorded actor, as the host of its address has it: it keeps, feeds, holds and answers, life after life.
+
+A recovery goes through its phases here (detect, isolate, restart, restore, replay, release), wherever the new life is
+lived; each phase is timed and told.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import time
+from collections.abc import Awaitable, Callable, Iterable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from ...actors.errors import HoldfastError, StartFailed, StartIgnored
+from ...actors.events import ActorStarted, Recovered, RecoveryFailed
+from ...actors.exit_reasons import KILLED, ExitReason
+from ...actors.kernel import links
+from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel.lifecycle import MAILBOX
+from ..method import Method
+from ..protocol import LifePort
+from ..recovery.recoveries import Recovery
+from ..snapshot.unreplayed import forget_turns
+from .admission import Admission
+from .held_messages import hold, inlet, let_go
+from .homes import ENDED, Homes
+from .life_ports import RemoteLife, own_records
+from .recorded_home import RecordedHome
+from .switch import Switch
+
+if TYPE_CHECKING:
+    from ...actors.kernel.address_host import Parent
+    from ...actors.kernel.envelope import Item
+    from ...actors.process.worker_pool import Worker
+
+
+class Clock:
+    """The phases of one recovery. (Clocks of loops are too coarse for this.)"""
+
+    __slots__ = ("_marks",)
+
+    def __init__(self) -> None:
+        self._marks: dict[str, float] = {}
+
+    def mark(self, phase: str, when: float | None = None) -> None:
+        """This phase is over now."""
+        self._marks[phase] = time.monotonic() if when is None else when
+
+    def when(self, phase: str) -> float:
+        """The end of a phase."""
+        return self._marks[phase]
+
+    def phases(self, restore_seconds: float) -> dict[str, float]:
+        """Seconds by phase."""
+        spans: dict[str, float] = {}
+        before = self._marks.get("noticed")
+        for phase in ("detect", "isolate", "restart", "replay", "release"):
+            after = self._marks.get(phase)
+            if after is None:
+                continue
+            spans[phase] = max(0.0, after - before) if before is not None else 0.0
+            before = after
+        spans["restart"] = max(0.0, spans.get("restart", 0.0) - restore_seconds)
+        spans["restore"] = restore_seconds
+        return spans
+
+
+class Entered(NamedTuple):
+    """A life is to begin: its home, when it is live, and whether it recovers."""
+
+    switch: Switch
+    live: asyncio.Future[float]
+    recovering: bool
+
+
+class JournalHome(RecordedHome):
+    """A home that numbers what it accepts, journals it, and feeds it; and the clock of the recovery at hand."""
+
+    takes_parcels = True
+
+    def __init__(self, homes: Homes, method: Method, parent: Parent) -> None:
+        self.homes, self.method, self.parent = homes, method, parent
+        self.switch: Switch | None = None
+        self.clock: Clock | None = None
+        self.recovery: Recovery | None = None  # that of the life which is begun now
+        self.page: memoryview | None = None  # of a life in this process: which input it has in hand
+
+    def enter(self, cell: Cell) -> Entered:
+        """As `open`, and it is a recovery if anything comes back, or if one is not over."""
+        entered = self.open(cell)
+        recoveries = self.homes.recoveries
+        self.recovery = None
+        if entered.recovering or recoveries.of(cell.path) is not None:
+            self.recovery = recoveries.starts(cell.path, self.method)
+            hold(entered.switch)
+            entered.switch.waits_for_release = recoveries.needs(self.recovery, "release")
+        return entered
+
+    @property
+    def is_gated(self) -> bool:
+        """Whether the recovery of the life at hand waits for somebody on its way."""
+        return self.recovery is not None and self.homes.recoveries.is_gated(self.recovery)
+
+    async def gate(self, stage: str) -> None:
+        """Wait until the recovery may go on to this stage; not for long."""
+        recovery = self.recovery
+        if recovery is not None:
+            wait = self.homes.recoveries.gate(recovery, stage)
+            if wait is not None:
+                await asyncio.shield(wait)
+            if stage == "restart":
+                self.isolated()
+
+    def isolated(self) -> None:
+        """S2 is over: nothing reaches the actor, and nothing of its old life gets out."""
+        if self.recovery is not None:
+            self.homes.recoveries.phase(self.recovery, "isolate", time.monotonic())
+
+    def open(self, cell: Cell) -> Entered:
+        """A life is to begin: its home holds what comes."""
+        switch = self.switch = self.homes.of(cell, self.method)
+        if not self.method.replays:
+            forget_turns(switch)
+        self.clock = self.clock or Clock()
+        self.clock.mark("isolate")
+        return Entered(switch, switch.prepare(), not switch.is_new)
+
+    def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
+        """Have the home admit what is published, also between two lives."""
+        assert self.switch is not None
+        for topic in (*topics, *self.switch.topics):
+            cell.node.topics.subscribe(topic, inlet(self.switch, topic))
+
+    def over(
+        self,
+        cell: Cell,
+        running: int,
+        why: str,
+        *,
+        ordered: bool,
+        noticed: float | None = None,
+        reason: ExitReason | None = None,
+        recovers: bool | None = None,
+    ) -> None:
+        """A life has ended; the home keeps everything.
+
+        Args:
+            cell: its address.
+            running: the input in hand, -1 if none.
+            why: in words.
+            ordered: we have killed it.
+            noticed: when its end was noticed, if before now.
+            reason: why it has ended; that of the cell if left out.
+            recovers: whether it is brought back; judged by its spec if left out.
+        """
+        switch = self.switch
+        if switch is None:
+            return
+        if self.page is not None:
+            self.page[0] = 0
+        self.clock = Clock()
+        self.clock.mark("noticed", noticed)
+        self.clock.mark("detect")
+        switch.died(running, ordered=ordered)
+        if recovers is None:
+            end = cell.extra().reason if reason is None else reason
+            recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
+        if recovers:
+            hold(switch, running)
+            self.homes.recoveries.crashed(cell.path, self.method, noticed)
+        cell.extra().topics.clear()  # These would be unsubscribed with the life.
+        if switch.live is not None and not switch.live.done():
+            switch.live.set_exception(StartFailed(cell.path, why))
+            switch.live.exception()  # Nobody may be left to look.
+
+    def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
+        """Admit a message for a sender that waits until it counts."""
+        commits = self.homes.journal
+        before = commits.submitted
+        cell.admit(cell, item)
+        last = commits.last if commits.submitted != before else None
+        return last.accepted() if isinstance(last, Admission) else None
+
+    def progress(self, cell: Cell) -> object:
+        """How far the replay has come."""
+        return None if self.switch is None else self.switch.progress
+
+    def recovers(self, reason: ExitReason) -> bool:
+        """Whether an end for this reason is followed by a recovery."""
+        return not reason.is_clean
+
+    def is_open(self, cell: Cell) -> bool:
+        return self.switch is not None and self.switch.is_released
+
+    def backlog(self, cell: Cell, running: int) -> int:
+        return 0 if self.switch is None else self.switch.backlog(running)
+
+    def load(self, cell: Cell) -> int:
+        """Messages that wait and those in hand; what the actor has put aside is among them."""
+        return 0 if self.switch is None else len(self.switch.open)
+
+    def push(self, cell: Cell, item: Item) -> None:
+        """What comes from others is an input; the rest is of the life in this process."""
+        if not isinstance(item, (links.Exit, links.Down)):
+            MAILBOX.push(cell, item)
+        elif self.switch is not None:
+            self.switch.push(item)
+
+    # -- lives in a process -----------------------------------------------------------------------------------------
+
+    async def let_begin(self) -> None:
+        await self.gate("restart")
+
+    def hand_to(self, cell: Cell, worker: Worker) -> dict[str, Any]:
+        switch = self.switch
+        assert switch is not None
+        worker.record_taker = functools.partial(own_records, worker, switch)
+        port = RemoteLife(cell.path, worker)
+        for record in switch.restore_records():
+            port.to_life(record)
+        return {"recorded": self.launch_data()}
+
+    def launch_data(self) -> dict[str, Any]:
+        """What a process has to know of the life that it begins."""
+        switch = self.switch
+        assert switch is not None
+        return {"method": self.method.data(), "turn": switch.state_turn, "stash": switch.stash}
+
+    async def goes_on(self, cell: Cell, worker: Worker, entered: Entered) -> None:
+        await self.replay(cell, RemoteLife(cell.path, worker), entered)
+        self.clock = None
+
+    def takes_stop(self, cell: Cell) -> bool:
+        return self.switch is not None and self.switch.is_live
+
+    def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
+        """Keep everything, and count deaths in the same turn."""
+        if worker is None or cell.state is not RUNNING:
+            return None
+        running, noticed, ordered = int(worker.page[0]) - 1, worker.noticed_at, reason == KILLED
+
+        def over(recovers: bool | None) -> None:
+            self.over(
+                cell, running, str(reason), ordered=ordered, noticed=noticed, reason=reason, recovers=recovers
+            )  # fmt: skip
+
+        return over
+
+    # -- ends -------------------------------------------------------------------------------------------------------
+
+    def retired(self, cell: Cell) -> None:
+        self.give_up(cell)
+
+    def give_up(self, cell: Cell) -> None:
+        """The address is free: it hears nothing more."""
+        if self.switch is None:
+            return
+        restarting = self.parent.is_restarting(cell)
+        for topic in (*self.parent.topics(cell), *self.switch.topics):
+            cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
+        self.switch.ends.drop_all("it has stopped", keep_tells=restarting)
+        let_go(self.switch)
+        why = "its supervisor has ended" if restarting else "it is not started again"
+        self.homes.recoveries.given_up(cell.path, why)
+
+    async def replay(self, cell: Cell, port: LifePort, entered: Entered) -> None:
+        """The rest of S3, what a life that has begun has handled since; then S4.
+
+        Raises:
+            StartFailed: it did not come so far.
+        """
+        assert self.clock is not None
+        assert self.switch is not None
+        self.clock.mark("restart")
+        await self.gate("replay")
+        if not entered.live.done():  # Else it has ended meanwhile.
+            self.switch.attach(port)
+        await self.until_live(cell, entered)
+
+    async def until_live(self, cell: Cell, entered: Entered) -> None:
+        """Wait until a life has caught up, and tell of it.
+
+        Raises:
+            StartFailed: it did not.
+        """
+        node, clock, switch = cell.node, self.clock, self.switch
+        assert clock is not None
+        assert switch is not None
+        try:
+            restore_seconds = await entered.live
+            if switch.port is None:  # It was over before anybody came to look.
+                if switch.waits_for_release:
+                    raise StartFailed(cell.path, ENDED)
+                return  # It was up, and has ended in a turn: that is told by its end, and no start has failed.
+            clock.mark("replay", switch.live_at)
+            await self._let_at(switch, clock, restore_seconds)
+        except HoldfastError as error:
+            if not isinstance(error, StartIgnored):
+                node.emit(RecoveryFailed(cell.path, str(error)))
+            raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
+        except asyncio.CancelledError:
+            raise StartFailed(cell.path, "it was stopped while it started") from None
+        if node.watched:
+            node.emit(ActorStarted(cell.path, cell.life))
+        if entered.recovering:
+            clock.mark("release")
+            if node.watched:
+                node.emit(Recovered(cell.path, cell.life, switch.replayed, clock.phases(restore_seconds)))
+        self.homes.recoveries.over(cell.path)
+
+    async def _let_at(self, switch: Switch, clock: Clock, restore_seconds: float) -> None:
+        """S4, if anybody has a say in it; else the home has done it.
+
+        Raises:
+            StartFailed: the life has ended meanwhile.
+        """
+        recovery, port = self.recovery, switch.port
+        if recovery is None:
+            return
+        self.homes.recoveries.came_up(recovery, clock.when("restart"), switch.live_at, restore_seconds)
+        if switch.waits_for_release:
+            await self.gate("release")
+            if port is None or switch.port is not port:
+                raise StartFailed(switch.path, ENDED)
+            switch.waits_for_release = False
+            switch.let_at()

@@ -1,0 +1,63 @@
+"""The way from a home to a life in another process, and back: what such a life may say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import msgspec
+
+from ...actors.process.fork.child_processes import parent_of
+from ...actors.process.wire import frames
+from ...actors.process.wire.connection import BadFrame
+from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
+
+if TYPE_CHECKING:
+    from ...actors.process.worker_pool import Worker
+    from .switch import Switch
+
+FROM_LIFE: msgspec.msgpack.Decoder[ToHome] = msgspec.msgpack.Decoder(ToHome)
+SENT = frozenset(("tell", "send", "ask", "forward", "publish"))
+"""Outputs that are messages to somebody."""
+
+
+def own_records(worker: Worker, switch: Switch, path: str) -> frames.TakeRecord:
+    """Who takes the records of a process with one recorded actor."""
+    return records_of(worker, switch.from_life)
+
+
+def records_of(worker: Worker, take: Callable[[ToHome], None]) -> frames.TakeRecord:
+    """Hand the records of a life in a process on, as far as it may say such a thing.
+
+    Raises (when one comes):
+        BadFrame: it sends what it may not send, or names the memory of another process.
+    """
+    decode, gate = FROM_LIFE.decode, worker.gate
+
+    def taken(frame: frames.Record) -> None:
+        record = decode(frame.body)
+        if isinstance(record, (TurnEnd, Released)):
+            for out in record.outs:
+                if out.verb in SENT:
+                    gate.output(out.to, out.name)
+        elif isinstance(record, Wanted):
+            gate.claims(record.bindings)
+        elif isinstance(record, Snapshot) and record.image is not None:
+            pid = record.image.pid
+            if pid != worker.pid and parent_of(pid) != worker.pid:
+                raise BadFrame(f"an image in the memory of process {pid}")
+        take(record)
+
+    return taken
+
+
+class RemoteLife:
+    """From a home to its life, in another process."""
+
+    begins = True
+
+    def __init__(self, path: str, worker: Worker) -> None:
+        self._path, self._connection = path, worker.connection
+
+    def to_life(self, record: ToLife) -> None:
+        self._connection.send(frames.Record(self._connection.name_out(self._path), record), self._path)  # type: ignore[arg-type]  # encoded in place

@@ -1,0 +1,24 @@
+"""Which addresses are recorded: those whose home has a switch."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ...actors.process.process_host import WorkerHome
+
+if TYPE_CHECKING:
+    from ...actors.kernel.cell import Cell
+    from .switch import Switch
+
+
+class RecordedHome(WorkerHome):
+    """A home with a switch, which numbers, journals and feeds what it accepts."""
+
+    switch: Switch | None
+    """There is none before the first life begins."""
+
+
+def switch_of(cell: Cell) -> Switch | None:
+    """The switch of a recorded actor's cell."""
+    home = cell.host.home
+    return home.switch if isinstance(home, RecordedHome) else None
