@@ -1,8 +1,10 @@
 """A loop whose every step is chosen: which actor has the next turn, and which task or callback of the loop runs next.
 
 What the loop promises is kept. Callbacks that are no steps of tasks are called in the order in which they were
-scheduled; a task's steps are in order among themselves; a timer comes when it is due. All else may come in any order:
-which task goes on first, which of two timers at one moment fires first, how many turns there are between two callbacks.
+scheduled, and before the steps of tasks that were scheduled after them: who awaits a future goes on after the callbacks
+that were added to it before. A task's steps are in order among themselves; a timer comes when it is due. All else may
+come in any order: which task goes on first, which of two timers at one moment fires first, how many turns there are
+between two callbacks.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from ...checkpoint.life.recorded_inbox import Fed
 from ..clock import VirtualClockLoop
 from ..swaps import Swaps
 from .disk import simulated
+from .numbered import NumberedFuture, NumberedTask
 from .strategies import ALL, Explored, Footprint
 
 if TYPE_CHECKING:
@@ -135,6 +138,7 @@ class ControlledLoop(VirtualClockLoop):
         self.due = DrawnHandles()
         self._ready = self.due
         self._own_thread = threading.get_ident()
+        self._numbers = itertools.count()  # of its tasks and futures
         self._sent: deque[asyncio.Handle] = deque()  # by threads
         self._resting: list[asyncio.Future[None]] = []
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
@@ -182,8 +186,21 @@ class ControlledLoop(VirtualClockLoop):
         wake: Callable[[], None] = getattr(self, "_write_to_self")  # noqa: B009  # asyncio's own, which no stub has
         wake()
 
+    def create_future(self) -> asyncio.Future[Any]:
+        """As every loop; the hash of the future is its number."""
+        future: NumberedFuture[Any] = NumberedFuture(loop=self)
+        future.number = next(self._numbers)
+        return future
+
     def create_task(self, coro: Any, **options: Any) -> asyncio.Task[Any]:
-        task: asyncio.Task[Any] = super().create_task(coro, **options)
+        """As every loop; the hash of the task is its number."""
+        task: asyncio.Task[Any]
+        if self.get_task_factory() is None:
+            if self.is_closed():
+                raise RuntimeError("Event loop is closed")
+            task = NumberedTask(next(self._numbers), coro, loop=self, **options)
+        else:
+            task = super().create_task(coro, **options)
         context: Context | None = options.get("context")
         place = inside.get() if context is None else context.get(inside)
         if place is not None:
@@ -444,18 +461,23 @@ class Control:
             if type(owner) is Node and owner in nodes:
                 found.append((owner, handle))
             elif isinstance(owner, asyncio.Task):
-                if owner not in tasks:
-                    tasks.add(owner)
+                # A step that is in the queue behind a callback comes after it, in production too.
+                if owner not in tasks and not (loops and self._lane(handle) in loops):
                     found.append((owner, handle))
+                tasks.add(owner)
             elif type(handle) is asyncio.TimerHandle:
                 found.append((handle, handle))
             else:
-                place = None if len(nodes) == 1 else handle._context.get(inside)
-                key = LOOP if place is None else place.lane
+                key = self._lane(handle)
                 if key not in loops:
                     loops.add(key)
                     found.append((key, handle))
         return found
+
+    def _lane(self, handle: Any) -> Hashable:
+        """What keeps a callback in order: the loop of the process in which it runs."""
+        place = None if len(self._nodes) == 1 else handle._context.get(inside)
+        return LOOP if place is None else place.lane
 
     # -- what a step touches ------------------------------------------------------------------------------------------
 

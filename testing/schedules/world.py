@@ -7,6 +7,7 @@ thread of the run. What cannot be exchanged is told: threads and sockets of the 
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 import random
 import threading
@@ -17,7 +18,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from anyio._backends._asyncio import CancelScope
+
 from ..swaps import Swaps
+from .numbered import as_completed, new_scope
 
 EPOCH = 1_700_000_000.0
 """Unix time at which each simulated run begins."""
@@ -72,6 +76,9 @@ class World:
                 self._tell(f"a file or socket is read ({_name(callback)}): its data comes when the machine brings it")
             add_reader(fd, callback, *args)
 
+        put(asyncio, "as_completed", functools.partial(as_completed, asyncio.as_completed))
+        made_scope = CancelScope.__init__
+        put(CancelScope, "__init__", lambda scope, *args, **named: new_scope(made_scope, scope, *args, **named))
         put(threading.Thread, "start", started)
         put(self._loop, "add_reader", reads)
         return self
