@@ -13,12 +13,12 @@ import os
 import selectors
 from collections import deque
 from collections.abc import Callable, Generator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple
 
 from ..actors.errors import HoldfastError
-from .threads import Threads
+from .threads import Threads, is_seen
 
 if TYPE_CHECKING:
     from .barrier import NotIdle
@@ -84,7 +84,7 @@ class _JumpingSelector(selectors.DefaultSelector):
     def __init__(self, loop: VirtualClockLoop, start: float, ticks: int, jumps: int) -> None:
         super().__init__()
         self.now = start
-        self.jobs = 0  # work of executors whose results will wake the loop
+        self.jobs = 0  # work of executors whose threads cannot be seen; its results will wake the loop
         self.ticks, self.jumps = 0, 0
         self._most_ticks, self._most_jumps = ticks, jumps
         self._loop = loop
@@ -146,7 +146,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     - Work in threads takes no virtual time: the loop really waits for it before it jumps, however the thread was
       started (`run_in_executor`, pools, anyio, `threading`), and raises `ThreadAtWork` when one does not come to
-      an end. A thread that waits for a lock is not at work, nor is one that ran before the loop was made.
+      an end. A thread that waits for a lock, or for a future, is not at work, nor is one that ran before the loop was
+      made.
     - Files and sockets are looked at, but the clock does not wait for them while a timer is set.
     - Another process has no virtual clock: actors in processes of their own, and subprocesses, are refused
       (`RealTimeNeeded`); test them on a real loop.
@@ -223,10 +224,13 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return NotIdle(why, tuple(movers([*self._ready, *sorted(self._scheduled)])))
 
     def run_in_executor(self, executor: Executor | None, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
-        """Run in a thread; the clock stands still until it is done."""
+        """Run in a thread; the clock stands still while it is at work."""
+        if isinstance(executor, ProcessPoolExecutor):
+            raise RealTimeNeeded("work in a pool of processes")
         future = super().run_in_executor(executor, func, *args)
-        self._virtual.jobs += 1
-        future.add_done_callback(self._job_done)
+        if not is_seen(executor):
+            self._virtual.jobs += 1
+            future.add_done_callback(self._job_done)
         return future
 
     def _job_done(self, _: object) -> None:

@@ -231,6 +231,27 @@ def test_what_a_thread_brings_comes_when_nothing_else_can_happen() -> None:
         assert trace.index(("the job", "done")) > max(at for at, turn in enumerate(trace) if turn[1] == "Step")
 
 
+def test_a_thread_of_a_pool_may_ask_what_takes_time() -> None:
+    class Slow(Note):
+        @hf.on(Step)
+        async def step(self, message: Step) -> None:
+            await asyncio.sleep(60.0)
+            self.got.append(message.number)
+
+    async def asks(system: GuardedSystem) -> None:
+        slow, inside = system.spawn(hf.start(Slow)), system.from_thread()
+
+        def calls() -> None:
+            inside.tell(slow, Step(1))
+            inside.ask(slow, Step(2), 300.0)
+
+        await asyncio.to_thread(calls)
+        actor: Any = slow._cell.actor
+        assert actor.got == [1, 2]
+
+    simulate(asks, seeds=20)()
+
+
 def test_a_run_that_does_not_repeat_is_an_error_of_that_run() -> None:
     seen: list[int] = []
 
