@@ -18,7 +18,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple
 
 from ..actors.errors import HoldfastError
-from .threads import Threads, is_seen
+from .threads import Threads
 
 if TYPE_CHECKING:
     from .barrier import NotIdle
@@ -84,7 +84,7 @@ class _JumpingSelector(selectors.DefaultSelector):
     def __init__(self, loop: VirtualClockLoop, start: float, ticks: int, jumps: int) -> None:
         super().__init__()
         self.now = start
-        self.jobs = 0  # work of executors whose threads cannot be seen; its results will wake the loop
+        self.jobs = 0  # work of executors whose results will wake the loop
         self.ticks, self.jumps = 0, 0
         self._most_ticks, self._most_jumps = ticks, jumps
         self._loop = loop
@@ -111,13 +111,18 @@ class _JumpingSelector(selectors.DefaultSelector):
     def _select_after_threads(self) -> list[tuple[selectors.SelectorKey, int]]:
         """What is ready once no thread is at work, or as soon as one of them wakes the loop."""
         began = monotonic()
-        while names := self._threads.at_work() or ["an executor"] * (self.jobs > self._loop.held_back()):
+        while names := self._threads.at_work() or ["an executor"] * self._has_jobs():
             ready = super().select(LOOK_AGAIN)
             if ready:
                 return ready
             if monotonic() - began > LONGEST_WORK:
                 raise ThreadAtWork(tuple(names), LONGEST_WORK)
         return super().select(0)  # What the last of them did came before this.
+
+    def _has_jobs(self) -> bool:
+        """Whether an executor has work that is not done, and does not wait for a future either."""
+        left = self.jobs - self._loop.held_back()
+        return left > 0 and left > self._threads.waiting()
 
     def _jump(self) -> list[tuple[selectors.SelectorKey, int]]:
         """Go to the next timer; without one, wait for files."""
@@ -190,7 +195,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         await asyncio.sleep(0)
 
     def held_back(self) -> int:
-        """How many callbacks of other threads are held back until nothing else can happen."""
+        """How many results of executors are held back until nothing else can happen."""
         return 0
 
     def at_rest(self) -> bool:
@@ -228,9 +233,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         if isinstance(executor, ProcessPoolExecutor):
             raise RealTimeNeeded("work in a pool of processes")
         future = super().run_in_executor(executor, func, *args)
-        if not is_seen(executor):
-            self._virtual.jobs += 1
-            future.add_done_callback(self._job_done)
+        self._virtual.jobs += 1
+        future.add_done_callback(self._job_done)
         return future
 
     def _job_done(self, _: object) -> None:

@@ -1,9 +1,9 @@
 """Threads at work: which threads of this process may yet do something by themselves.
 
 A thread that waits for a lock without a time limit (a pool's idle thread does) goes on only when another thread lets
-it. The kernel tells these from all others: they are in a futex call without a timeout. So does a thread that waits for a
-future, such as that of what it has handed to an event loop, whatever its time limit: where time is virtual, a limit of
-real time is never reached. Its stack tells.
+it. The kernel tells these from all others: they are in a futex call without a timeout. So does a thread that waits for
+a future, such as that of what it has handed to an event loop, whatever its time limit: where time is virtual, a limit
+of real time is never reached. Its stack tells.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ import platform
 import sys
 import threading
 from collections.abc import Callable
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from concurrent.futures import thread as pools
 from types import CodeType
 from typing import Final
 
-from ..actors.kernel.threads import Threads as WorkerThreads
 from ..actors.kernel.threads import wait_on_loop
 
 FUTEX = {"x86_64": 202, "aarch64": 98}.get(platform.machine(), -1)
@@ -35,11 +34,6 @@ WAITED_FOR: Final[dict[CodeType, str]] = {
 """The functions in which a thread waits for a future, and what they call it."""
 DEEPEST: Final = 6
 """How many frames are between such a function and the wait for a lock, at most."""
-
-
-def is_seen(executor: Executor | None) -> bool:
-    """Whether the threads of an executor can be told to be at work: else its jobs have to be counted."""
-    return FUTEX >= 0 and (executor is None or isinstance(executor, (ThreadPoolExecutor, WorkerThreads)))
 
 
 class Onlooker(threading.Timer):
@@ -68,6 +62,10 @@ class Threads:
         if not at_work and before:
             at_work = [thread for thread, runs in self._look().items() if runs is None or runs != before.get(thread)]
         return [thread.name for thread in at_work]
+
+    def waiting(self) -> int:
+        """How many threads wait for a future that is not done."""
+        return sum(_waits_for_a_future(thread) for thread in threading.enumerate())
 
     def _look(self) -> dict[threading.Thread, str | None]:
         """How often each of the others had run when it began to wait for a lock; None: it is at work."""

@@ -10,6 +10,7 @@ between two callbacks.
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import itertools
 import threading
 import weakref
@@ -129,8 +130,9 @@ class DrawnCells(deque[Cell]):
 class ControlledLoop(VirtualClockLoop):
     """A loop with a virtual clock whose steps are chosen as soon as a `Control` is installed.
 
-    What a thread sends (`call_soon_threadsafe`) comes when nothing else can happen at that moment of virtual time, in
-    order: not when the machine lets the thread run.
+    What a thread sends (`call_soon_threadsafe`) comes when nothing else can happen at that moment of virtual time, and
+    results of `run_in_executor` then come in the order in which the work was given: not when the machine lets the
+    thread run.
     """
 
     def __init__(self) -> None:
@@ -158,11 +160,13 @@ class ControlledLoop(VirtualClockLoop):
         self._resting.append(rest)
 
     def held_back(self) -> int:
-        return len(self._sent)
+        sent: Any = self._sent
+        return sum(_given(handle._args) >= 0 for handle in sent)
 
     def at_rest(self) -> bool:
-        sent, self._sent = self._sent, deque()
-        self.due.extend(sent)
+        sent: Any = self._sent
+        self._sent = deque()
+        self.due.extend(sorted(sent, key=lambda handle: _given(handle._args)))
         if sent:
             return True
         resting, self._resting = self._resting, []
@@ -174,8 +178,12 @@ class ControlledLoop(VirtualClockLoop):
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        """As every loop from its own thread; another thread's callback waits until nothing else can happen."""
-        if threading.get_ident() == self._own_thread or self.due.control is None:
+        """As every loop from its own thread; another thread's callback waits until nothing else can happen.
+
+        So does the result of work that a thread has done before the loop could ask to be told of it.
+        """
+        is_own = threading.get_ident() == self._own_thread and _given(args) < 0
+        if is_own or self.due.control is None:
             return super().call_soon_threadsafe(callback, *args, context=context)
         handle = asyncio.Handle(callback, args, self, context)
         self._sent.append(handle)
@@ -263,6 +271,15 @@ def is_dead(handle: Any) -> bool:
         return bool(place.is_dead)
     owner = getattr(handle._callback, "__self__", None)  # Who is called for, by the test, may be dead as well.
     return isinstance(owner, Node) and owner.wake is _never
+
+
+def _given(args: Any) -> int:
+    """When the work was given whose result a callback with these arguments brings from a thread; -1: it brings none."""
+    match args:
+        case (NumberedFuture(), concurrent.futures.Future()):
+            return int(args[0].number)
+        case _:
+            return -1
 
 
 def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:

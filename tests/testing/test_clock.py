@@ -76,9 +76,8 @@ async def test_time_passes_for_a_thread_that_waits_for_what_it_has_handed_to_the
 
 @virtual
 async def test_a_pool_of_processes_is_refused() -> None:
-    with ProcessPoolExecutor(1) as pool:
-        with pytest.raises(RealTimeNeeded, match="work in a pool of processes"):
-            asyncio.get_running_loop().run_in_executor(pool, abs, -1)
+    with ProcessPoolExecutor(1) as pool, pytest.raises(RealTimeNeeded, match="work in a pool of processes"):
+        asyncio.get_running_loop().run_in_executor(pool, abs, -1)
 
 
 @virtual
