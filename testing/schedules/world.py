@@ -57,6 +57,7 @@ class World:
         self._state: Any = None
         self._own_state: Any = None
         self._numpy_state: Any = None  # before the run
+        self._own_numpy_state: Any = None
 
     def __enter__(self) -> World:
         self._state = random.getstate()
@@ -70,10 +71,7 @@ class World:
         put(random.Random, "seed", _seeding(random.Random.seed, self._own(_nothing, lambda: self._bytes.randbytes(16))))
         seed: Any = random.seed
         put(random, "seed", functools.partial(random.Random.seed, seed.__self__))
-        numpy: Any = sys.modules.get("numpy.random")
-        if numpy is not None:
-            self._numpy_state = numpy.get_state()
-            numpy.seed(self._bytes.getrandbits(32))
+        self._put_numpy()
         for name, value in (("_generate_time_safe", None), ("_last_timestamp", None), ("_node", NODE)):
             put(uuid, name, value)  # Its first version asks the C library otherwise, and goes on from the last run.
         self._put_clocks()
@@ -100,6 +98,17 @@ class World:
         for name in ("fork", "forkpty", "posix_spawn", "posix_spawnp", "system"):
             self._tell_of(os, name, f"a process was started (os.{name})", "what it does")
         return self
+
+    def _put_numpy(self) -> None:
+        """The state of numpy's global generator, if numpy is there: nothing else may depend on whether it is."""
+        numpy: Any = sys.modules.get("numpy.random")
+        if numpy is None:
+            return
+        self._numpy_state = numpy.get_state()
+        if self._own_numpy_state is None:
+            numpy.seed(random.Random(f"numpy {self._seed}").getrandbits(32))
+        else:
+            numpy.set_state(self._own_numpy_state)
 
     def _put_clocks(self) -> None:
         clock, put = self._loop.time, self._swaps.put
@@ -155,7 +164,9 @@ class World:
         self._swaps.undo()
         random.setstate(self._state)
         if self._numpy_state is not None:
-            sys.modules["numpy.random"].set_state(self._numpy_state)
+            numpy: Any = sys.modules["numpy.random"]
+            self._own_numpy_state = numpy.get_state()
+            numpy.set_state(self._numpy_state)
 
     def _own(self, real: Callable[..., Any], simulated: Callable[..., Any]) -> Callable[..., Any]:
         """For the thread of the run the simulated function, for all others the real one."""

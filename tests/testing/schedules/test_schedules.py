@@ -204,6 +204,18 @@ def test_random_numbers_and_clocks_are_the_seeds() -> None:
     assert drawn(1)[10:] == [EPOCH + 2.5, 2.5, 2_500_000_000, EPOCH + 2.5, 2.5, 22]
 
 
+def test_what_is_drawn_depends_on_no_library_that_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[bytes] = []
+
+    async def draws(system: GuardedSystem) -> None:
+        drawn.append(os.urandom(8))
+
+    run_schedule(draws, Production(1), OWN, {})
+    monkeypatch.delitem(sys.modules, "numpy.random")
+    run_schedule(draws, Production(1), OWN, {})
+    assert drawn[0] == drawn[1]
+
+
 def test_the_world_is_as_it_was_when_the_run_is_over() -> None:
     def world() -> list[object]:
         functions = [
