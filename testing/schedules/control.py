@@ -276,8 +276,8 @@ def is_dead(handle: Any) -> bool:
 def _given(args: Any) -> int:
     """When the work was given whose result a callback with these arguments brings from a thread; -1: it brings none."""
     match args:
-        case (NumberedFuture(), concurrent.futures.Future()):
-            return int(args[0].number)
+        case (NumberedFuture(number=number), concurrent.futures.Future()):
+            return number
         case _:
             return -1
 

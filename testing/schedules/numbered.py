@@ -8,6 +8,7 @@ futures have the hash of a counter.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -51,10 +52,14 @@ class InOrder(dict[T, None]):
         del self[member]
 
 
-def new_scope(real: Any, scope: Any, *args: Any, **options: Any) -> None:
+def scope_in_order(real: Callable[..., None]) -> Callable[..., None]:
     """As the `__init__` of a cancel scope of anyio; it cancels those inside of it in the order of their entry."""
-    real(scope, *args, **options)
-    scope._child_scopes = InOrder()
+
+    def made(scope: Any, *args: Any, **options: Any) -> None:
+        real(scope, *args, **options)
+        scope._child_scopes = InOrder()
+
+    return made
 
 
 def as_completed(real: Any, awaitables: Any, *, timeout: float | None = None) -> Any:

@@ -25,7 +25,7 @@ from typing import Any
 from anyio._backends._asyncio import CancelScope
 
 from ..swaps import Swaps
-from .numbered import as_completed, new_scope
+from .numbered import as_completed, scope_in_order
 
 EPOCH = 1_700_000_000.0
 """Unix time at which each simulated run begins."""
@@ -67,8 +67,8 @@ class World:
             random.setstate(self._own_state)
         put = self._swaps.put
         for owner, name in ((os, "urandom"), (os, "getrandom"), (random, "_urandom")):
-            put(owner, name, self._own(getattr(owner, name), lambda size, flags=0: self._bytes.randbytes(size)))
-        put(random.Random, "seed", _seeding(random.Random.seed, self._own(_nothing, lambda: self._bytes.randbytes(16))))
+            put(owner, name, self._own(getattr(owner, name), self._drawn))
+        put(random.Random, "seed", _seeding(random.Random.seed, self._own(_nothing, self._drawn)))
         seed: Any = random.seed
         put(random, "seed", functools.partial(random.Random.seed, seed.__self__))
         self._put_numpy()
@@ -89,8 +89,7 @@ class World:
             return add_reader(fd, callback, *args)
 
         put(asyncio, "as_completed", functools.partial(as_completed, asyncio.as_completed))
-        made_scope = CancelScope.__init__
-        put(CancelScope, "__init__", lambda scope, *args, **named: new_scope(made_scope, scope, *args, **named))
+        put(CancelScope, "__init__", scope_in_order(CancelScope.__init__))
         put(threading.Thread, "start", started)
         put(loop, "_add_reader", reads)
         self._tell_of(socket.socket, "__init__", "a socket was opened", "what comes through it")
@@ -127,24 +126,21 @@ class World:
         def read(number: int) -> float:
             return (wall if number == time.CLOCK_REALTIME else clock)()
 
-        put(time, "clock_gettime", self._own(time.clock_gettime, read))
-        put(time, "clock_gettime_ns", self._own(time.clock_gettime_ns, lambda number: round(read(number) * 1e9)))
+        def read_ns(number: int) -> int:
+            return round(read(number) * 1e9)
+
+        for name, reading in (("clock_gettime", read), ("clock_gettime_ns", read_ns)):
+            put(time, name, self._own(getattr(time, name), reading))
         for name in ("localtime", "gmtime", "ctime"):
             real = getattr(time, name)
-            put(
-                time,
-                name,
-                self._own(real, lambda seconds=None, real=real: real(wall() if seconds is None else seconds)),
-            )
-        local = time.localtime
-        for name in ("strftime", "asctime"):
+            put(time, name, self._own(real, _given(real, 0, wall)))
+        for name, count in (("strftime", 1), ("asctime", 0)):
             real = getattr(time, name)
-            least = name == "strftime"  # It has a format, too.
-            put(
-                time,
-                name,
-                self._own(real, lambda *args, real=real, n=least: real(*args[:n], *(args[n:] or (local(),)))),
-            )
+            put(time, name, self._own(real, _given(real, count, time.localtime)))
+
+    def _drawn(self, size: int = 16, flags: int = 0) -> bytes:
+        """In place of `os.urandom` and `os.getrandom`."""
+        return self._bytes.randbytes(size)
 
     def _tell_of(self, owner: Any, name: str, what: str, comes: str) -> None:
         """Tell of each call of a function by the program."""
@@ -198,6 +194,15 @@ def _seeding(real: Any, drawn: Callable[[], Any]) -> Any:
         real(generator, drawn() if a is None else a, version)
 
     return seed
+
+
+def _given(real: Callable[..., Any], count: int, made: Callable[[], object]) -> Callable[..., Any]:
+    """As a function of `time`, whose last argument, after `count` others, is made now if it is left out or None."""
+
+    def called(*args: Any) -> Any:
+        return real(*args[:count], made() if args[count:] in ((), (None,)) else args[count])
+
+    return called
 
 
 def _nothing() -> None:

@@ -252,7 +252,7 @@ def test_a_thread_that_a_program_starts_is_told_by_name() -> None:
     [
         (lambda: socket.socket().close(), "a socket was opened"),
         (lambda: subprocess.run(["true"], check=True), "a process was started"),
-        (lambda: os.system("true"), r"a process was started \(os.system\)"),
+        (lambda: os.waitpid(os.posix_spawn("/bin/true", ["true"], {}), 0), r"a process was started \(os.posix_spawn\)"),
     ],
 )
 def test_what_another_process_or_a_socket_brings_is_told(escape: Callable[[], object], told: str) -> None:
