@@ -13,7 +13,7 @@ import os
 import selectors
 from collections import deque
 from collections.abc import Callable, Generator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from time import monotonic
 from typing import TYPE_CHECKING, Any, TypeVar, TypeVarTuple
 
@@ -111,13 +111,18 @@ class _JumpingSelector(selectors.DefaultSelector):
     def _select_after_threads(self) -> list[tuple[selectors.SelectorKey, int]]:
         """What is ready once no thread is at work, or as soon as one of them wakes the loop."""
         began = monotonic()
-        while names := self._threads.at_work() or ["an executor"] * (self.jobs > self._loop.held_back()):
+        while names := self._threads.at_work() or ["an executor"] * self._has_jobs():
             ready = super().select(LOOK_AGAIN)
             if ready:
                 return ready
             if monotonic() - began > LONGEST_WORK:
                 raise ThreadAtWork(tuple(names), LONGEST_WORK)
         return super().select(0)  # What the last of them did came before this.
+
+    def _has_jobs(self) -> bool:
+        """Whether an executor has work that is not done, and does not wait for a future either."""
+        left = self.jobs - self._loop.held_back()
+        return left > 0 and left > self._threads.waiting()
 
     def _jump(self) -> list[tuple[selectors.SelectorKey, int]]:
         """Go to the next timer; without one, wait for files."""
@@ -146,7 +151,8 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
 
     - Work in threads takes no virtual time: the loop really waits for it before it jumps, however the thread was
       started (`run_in_executor`, pools, anyio, `threading`), and raises `ThreadAtWork` when one does not come to
-      an end. A thread that waits for a lock is not at work, nor is one that ran before the loop was made.
+      an end. A thread that waits for a lock, or for a future, is not at work, nor is one that ran before the loop was
+      made.
     - Files and sockets are looked at, but the clock does not wait for them while a timer is set.
     - Another process has no virtual clock: actors in processes of their own, and subprocesses, are refused
       (`RealTimeNeeded`); test them on a real loop.
@@ -189,7 +195,7 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         await asyncio.sleep(0)
 
     def held_back(self) -> int:
-        """How many callbacks of other threads are held back until nothing else can happen."""
+        """How many results of executors are held back until nothing else can happen."""
         return 0
 
     def at_rest(self) -> bool:
@@ -223,7 +229,9 @@ class VirtualClockLoop(asyncio.SelectorEventLoop):
         return NotIdle(why, tuple(movers([*self._ready, *sorted(self._scheduled)])))
 
     def run_in_executor(self, executor: Executor | None, func: Callable[[*Ts], T], *args: *Ts) -> asyncio.Future[T]:
-        """Run in a thread; the clock stands still until it is done."""
+        """Run in a thread; the clock stands still while it is at work."""
+        if isinstance(executor, ProcessPoolExecutor):
+            raise RealTimeNeeded("work in a pool of processes")
         future = super().run_in_executor(executor, func, *args)
         self._virtual.jobs += 1
         future.add_done_callback(self._job_done)

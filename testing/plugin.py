@@ -7,6 +7,7 @@ before coverage begins to measure.
 
 from __future__ import annotations
 
+import argparse
 import asyncio
 import importlib
 import types
@@ -61,7 +62,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
     group = parser.getgroup("holdfast", "simulated tests of actors (@simulate)")
     group.addoption("--holdfast-seed", type=int, default=None, help="run only this seed")
-    group.addoption("--holdfast-seeds", type=int, default=None, help="run so many seeds, whatever a test says")
+    group.addoption("--holdfast-seeds", type=_count, default=None, help="run so many seeds, whatever a test says")
     group.addoption("--holdfast-replay", metavar="FILE", default=None, help="run only the schedule in this file")
     group.addoption(
         "--holdfast-real",
@@ -75,6 +76,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         default="ci",
         help="ci: as many seeds as a test says; nightly: 25 times as many",
     )
+
+
+def _count(text: str) -> int:
+    """How many: at least one, or the tests would pass without having run."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of seeds: it takes one or more")
+    return int(text)
 
 
 def pytest_configure(config: pytest.Config) -> None:

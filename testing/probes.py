@@ -39,11 +39,12 @@ class Unexpected(AssertionError):
 
 
 class Received(NamedTuple):
-    """A message, with who sent it and the right to answer it."""
+    """A message, with who sent it, the right to answer it, and whether the autopilot has done so."""
 
     message: Message[Any]
     sender: ActorRef[Any] | None
     handle: ReplyHandle[Any] | None
+    is_answered: bool = False
 
     def __str__(self) -> str:
         verb = "asked" if self.handle is not None else "told"
@@ -150,8 +151,8 @@ class Probe:
     def _hear(self, heard: Heard) -> None:
         self._inbox.append(heard)
         self._wake.set()
-        if self._pilot is not None and isinstance(heard, Received):
-            self._fly(self._pilot, heard)
+        if self._pilot is not None and isinstance(heard, Received) and self._fly(self._pilot, heard):
+            self._inbox[-1] = heard._replace(is_answered=True)
 
     @property
     def path(self) -> str:
@@ -237,7 +238,7 @@ class Probe:
         return left if timeout is None else min(left, timeout)
 
     def _took(self, heard: Received) -> None:
-        self._last, self._answered = heard, False
+        self._last, self._answered = heard, heard.is_answered
 
     @overload
     async def expect_event(self, wanted: type[E], *, timeout: float | None = None) -> E: ...
@@ -457,17 +458,20 @@ class Probe:
         """
         self._pilot = pilot
 
-    def _fly(self, pilot: Pilot, heard: Received) -> None:
+    def _fly(self, pilot: Pilot, heard: Received) -> bool:
+        """Whether the autopilot has answered."""
         try:
             value = _piloted(pilot, heard.message)
             if value is NotImplemented or heard.handle is None:
-                return
+                return False
             self._require_type(heard.message, value)
         except Refusal as no:
-            if heard.handle is not None:
-                heard.handle.fail(no)
+            if heard.handle is None:
+                return False
+            heard.handle.fail(no)
         else:
             heard.handle.reply(value)
+        return True
 
     def tap(self, first: ActorRef[Any], second: ActorRef[Any] | None = None) -> Tap:
         """See what goes to an address, `tap(receiver)`, or from one actor to another, `tap(sender, receiver)`.

@@ -1,13 +1,16 @@
 """A loop whose every step is chosen: which actor has the next turn, and which task or callback of the loop runs next.
 
 What the loop promises is kept. Callbacks that are no steps of tasks are called in the order in which they were
-scheduled; a task's steps are in order among themselves; a timer comes when it is due. All else may come in any order:
-which task goes on first, which of two timers at one moment fires first, how many turns there are between two callbacks.
+scheduled, and before the steps of tasks that were scheduled after them: who awaits a future goes on after the callbacks
+that were added to it before. A task's steps are in order among themselves; a timer comes when it is due. All else may
+come in any order: which task goes on first, which of two timers at one moment fires first, how many turns there are
+between two callbacks.
 """
 
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import itertools
 import threading
 import weakref
@@ -24,6 +27,7 @@ from ...checkpoint.life.recorded_inbox import Fed
 from ..clock import VirtualClockLoop
 from ..swaps import Swaps
 from .disk import simulated
+from .numbered import NumberedFuture, NumberedTask
 from .strategies import ALL, Explored, Footprint
 
 if TYPE_CHECKING:
@@ -126,8 +130,9 @@ class DrawnCells(deque[Cell]):
 class ControlledLoop(VirtualClockLoop):
     """A loop with a virtual clock whose steps are chosen as soon as a `Control` is installed.
 
-    What a thread sends (`call_soon_threadsafe`) comes when nothing else can happen at that moment of virtual time, in
-    order: not when the machine lets the thread run.
+    What a thread sends (`call_soon_threadsafe`) comes when nothing else can happen at that moment of virtual time, and
+    results of `run_in_executor` then come in the order in which the work was given: not when the machine lets the
+    thread run.
     """
 
     def __init__(self) -> None:
@@ -135,6 +140,7 @@ class ControlledLoop(VirtualClockLoop):
         self.due = DrawnHandles()
         self._ready = self.due
         self._own_thread = threading.get_ident()
+        self._numbers = itertools.count()  # of its tasks and futures
         self._sent: deque[asyncio.Handle] = deque()  # by threads
         self._resting: list[asyncio.Future[None]] = []
         self._dead: list[Any] = []  # tasks: kept, since what is collected is closed, which runs its code
@@ -154,11 +160,13 @@ class ControlledLoop(VirtualClockLoop):
         self._resting.append(rest)
 
     def held_back(self) -> int:
-        return len(self._sent)
+        sent: Any = self._sent
+        return sum(_given(handle._args) >= 0 for handle in sent)
 
     def at_rest(self) -> bool:
-        sent, self._sent = self._sent, deque()
-        self.due.extend(sent)
+        sent: Any = self._sent
+        self._sent = deque()
+        self.due.extend(sorted(sent, key=lambda handle: _given(handle._args)))
         if sent:
             return True
         resting, self._resting = self._resting, []
@@ -170,8 +178,12 @@ class ControlledLoop(VirtualClockLoop):
     def call_soon_threadsafe(
         self, callback: Callable[[*Ts], object], *args: *Ts, context: Context | None = None
     ) -> asyncio.Handle:
-        """As every loop from its own thread; another thread's callback waits until nothing else can happen."""
-        if threading.get_ident() == self._own_thread or self.due.control is None:
+        """As every loop from its own thread; another thread's callback waits until nothing else can happen.
+
+        So does the result of work that a thread has done before the loop could ask to be told of it.
+        """
+        is_own = threading.get_ident() == self._own_thread and _given(args) < 0
+        if is_own or self.due.control is None:
             return super().call_soon_threadsafe(callback, *args, context=context)
         handle = asyncio.Handle(callback, args, self, context)
         self._sent.append(handle)
@@ -182,8 +194,21 @@ class ControlledLoop(VirtualClockLoop):
         wake: Callable[[], None] = getattr(self, "_write_to_self")  # noqa: B009  # asyncio's own, which no stub has
         wake()
 
+    def create_future(self) -> asyncio.Future[Any]:
+        """As every loop; the hash of the future is its number."""
+        future: NumberedFuture[Any] = NumberedFuture(loop=self)
+        future.number = next(self._numbers)
+        return future
+
     def create_task(self, coro: Any, **options: Any) -> asyncio.Task[Any]:
-        task: asyncio.Task[Any] = super().create_task(coro, **options)
+        """As every loop; the hash of the task is its number."""
+        task: asyncio.Task[Any]
+        if self.get_task_factory() is None:
+            if self.is_closed():
+                raise RuntimeError("Event loop is closed")
+            task = NumberedTask(next(self._numbers), coro, loop=self, **options)
+        else:
+            task = super().create_task(coro, **options)
         context: Context | None = options.get("context")
         place = inside.get() if context is None else context.get(inside)
         if place is not None:
@@ -246,6 +271,15 @@ def is_dead(handle: Any) -> bool:
         return bool(place.is_dead)
     owner = getattr(handle._callback, "__self__", None)  # Who is called for, by the test, may be dead as well.
     return isinstance(owner, Node) and owner.wake is _never
+
+
+def _given(args: Any) -> int:
+    """When the work was given whose result a callback with these arguments brings from a thread; -1: it brings none."""
+    match args:
+        case (NumberedFuture(number=number), concurrent.futures.Future()):
+            return number
+        case _:
+            return -1
 
 
 def _do(done: asyncio.Future[T], work: Callable[[], T]) -> None:
@@ -444,18 +478,23 @@ class Control:
             if type(owner) is Node and owner in nodes:
                 found.append((owner, handle))
             elif isinstance(owner, asyncio.Task):
-                if owner not in tasks:
-                    tasks.add(owner)
+                # A step that is in the queue behind a callback comes after it, in production too.
+                if owner not in tasks and not (loops and self._lane(handle) in loops):
                     found.append((owner, handle))
+                tasks.add(owner)
             elif type(handle) is asyncio.TimerHandle:
                 found.append((handle, handle))
             else:
-                place = None if len(nodes) == 1 else handle._context.get(inside)
-                key = LOOP if place is None else place.lane
+                key = self._lane(handle)
                 if key not in loops:
                     loops.add(key)
                     found.append((key, handle))
         return found
+
+    def _lane(self, handle: Any) -> Hashable:
+        """What keeps a callback in order: the loop of the process in which it runs."""
+        place = None if len(self._nodes) == 1 else handle._context.get(inside)
+        return LOOP if place is None else place.lane
 
     # -- what a step touches ------------------------------------------------------------------------------------------
 

@@ -1,26 +1,36 @@
 """What a program asks the world for: random numbers and the time. In a simulated run both are the seed's.
 
-`random`, `uuid`, `secrets`, `os.urandom`, `time.time`, `time.monotonic` and `time.perf_counter` are exchanged for the
-thread of the run. What cannot be exchanged is told: threads and sockets of the program's own.
+`random`, `uuid`, `secrets`, `os.urandom`, numpy's global generator and the functions of `time` are exchanged for the
+thread of the run. What cannot be exchanged is told: threads, sockets and processes of the program's own.
 """
 
 from __future__ import annotations
 
 import asyncio
+import functools
 import os
 import random
+import socket
+import subprocess
+import sys
 import threading
 import time
+import uuid
 import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from anyio._backends._asyncio import CancelScope
+
 from ..swaps import Swaps
+from .numbered import as_completed, scope_in_order
 
 EPOCH = 1_700_000_000.0
 """Unix time at which each simulated run begins."""
+NODE = 0x010000000001
+"""The machine in a UUID of version 1."""
 OURS = str(Path(__file__).resolve().parents[2])
 """Threads of this library are waited for, and no news."""
 
@@ -46,6 +56,8 @@ class World:
         self._bytes = random.Random(f"bytes {seed}")
         self._state: Any = None
         self._own_state: Any = None
+        self._numpy_state: Any = None  # before the run
+        self._own_numpy_state: Any = None
 
     def __enter__(self) -> World:
         self._state = random.getstate()
@@ -54,27 +66,92 @@ class World:
         else:
             random.setstate(self._own_state)
         put = self._swaps.put
-        for owner, name in ((os, "urandom"), (random, "_urandom")):
-            put(owner, name, self._own(getattr(owner, name), self._bytes.randbytes))
-        clock = self._loop.time
-        for name, made in (("time", lambda: EPOCH + clock()), ("monotonic", clock), ("perf_counter", clock)):
-            put(time, name, self._own(getattr(time, name), made))
-            put(time, f"{name}_ns", self._own(getattr(time, f"{name}_ns"), _in_ns(made)))
-        start, add_reader = threading.Thread.start, self._loop.add_reader
+        for owner, name in ((os, "urandom"), (os, "getrandom"), (random, "_urandom")):
+            put(owner, name, self._own(getattr(owner, name), self._drawn))
+        put(random.Random, "seed", _seeding(random.Random.seed, self._own(_nothing, self._drawn)))
+        seed: Any = random.seed
+        put(random, "seed", functools.partial(random.Random.seed, seed.__self__))
+        self._put_numpy()
+        for name, value in (("_generate_time_safe", None), ("_last_timestamp", None), ("_node", NODE)):
+            put(uuid, name, value)  # Its first version asks the C library otherwise, and goes on from the last run.
+        self._put_clocks()
+        loop: Any = self._loop
+        start, add_reader = threading.Thread.start, loop._add_reader  # By which transports read, too.
 
         def started(thread: threading.Thread) -> None:
             if threading.get_ident() == self._thread:
                 self._look_at_thread(thread)
             start(thread)
 
-        def reads(fd: Any, callback: Any, *args: Any) -> None:
+        def reads(fd: Any, callback: Any, *args: Any) -> Any:
             if not _is_ours(callback):
                 self._tell(f"a file or socket is read ({_name(callback)}): its data comes when the machine brings it")
-            add_reader(fd, callback, *args)
+            return add_reader(fd, callback, *args)
 
+        put(asyncio, "as_completed", functools.partial(as_completed, asyncio.as_completed))
+        put(CancelScope, "__init__", scope_in_order(CancelScope.__init__))
         put(threading.Thread, "start", started)
-        put(self._loop, "add_reader", reads)
+        put(loop, "_add_reader", reads)
+        self._tell_of(socket.socket, "__init__", "a socket was opened", "what comes through it")
+        self._tell_of(subprocess.Popen, "__init__", "a process was started", "what it does")
+        for name in ("fork", "forkpty", "posix_spawn", "posix_spawnp", "system"):
+            self._tell_of(os, name, f"a process was started (os.{name})", "what it does")
         return self
+
+    def _put_numpy(self) -> None:
+        """The state of numpy's global generator, if numpy is there: nothing else may depend on whether it is."""
+        numpy: Any = sys.modules.get("numpy.random")
+        if numpy is None:
+            return
+        self._numpy_state = numpy.get_state()
+        if self._own_numpy_state is None:
+            numpy.seed(random.Random(f"numpy {self._seed}").getrandbits(32))
+        else:
+            numpy.set_state(self._own_numpy_state)
+
+    def _put_clocks(self) -> None:
+        clock, put = self._loop.time, self._swaps.put
+
+        def wall() -> float:
+            return EPOCH + clock()
+
+        clocks = [
+            ("time", wall),
+            *((name, clock) for name in ("monotonic", "perf_counter", "process_time", "thread_time")),
+        ]
+        for name, made in clocks:
+            put(time, name, self._own(getattr(time, name), made))
+            put(time, f"{name}_ns", self._own(getattr(time, f"{name}_ns"), _in_ns(made)))
+
+        def read(number: int) -> float:
+            return (wall if number == time.CLOCK_REALTIME else clock)()
+
+        def read_ns(number: int) -> int:
+            return round(read(number) * 1e9)
+
+        for name, reading in (("clock_gettime", read), ("clock_gettime_ns", read_ns)):
+            put(time, name, self._own(getattr(time, name), reading))
+        for name in ("localtime", "gmtime", "ctime"):
+            real = getattr(time, name)
+            put(time, name, self._own(real, _given(real, 0, wall)))
+        for name, count in (("strftime", 1), ("asctime", 0)):
+            real = getattr(time, name)
+            put(time, name, self._own(real, _given(real, count, time.localtime)))
+
+    def _drawn(self, size: int = 16, flags: int = 0) -> bytes:
+        """In place of `os.urandom` and `os.getrandom`."""
+        return self._bytes.randbytes(size)
+
+    def _tell_of(self, owner: Any, name: str, what: str, comes: str) -> None:
+        """Tell of each call of a function by the program."""
+        real = getattr(owner, name)
+
+        def told(*args: Any, **options: Any) -> Any:
+            if threading.get_ident() == self._thread:
+                self._tell(f"{what}: {comes} comes when the machine brings it")
+            return real(*args, **options)
+
+        self._swaps.put(owner, name, told)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -82,12 +159,16 @@ class World:
         self._own_state = random.getstate()
         self._swaps.undo()
         random.setstate(self._state)
+        if self._numpy_state is not None:
+            numpy: Any = sys.modules["numpy.random"]
+            self._own_numpy_state = numpy.get_state()
+            numpy.set_state(self._numpy_state)
 
     def _own(self, real: Callable[..., Any], simulated: Callable[..., Any]) -> Callable[..., Any]:
         """For the thread of the run the simulated function, for all others the real one."""
 
-        def chosen(*args: Any) -> Any:
-            return (simulated if threading.get_ident() == self._thread else real)(*args)
+        def chosen(*args: Any, **options: Any) -> Any:
+            return (simulated if threading.get_ident() == self._thread else real)(*args, **options)
 
         return chosen
 
@@ -104,6 +185,28 @@ class World:
         if what not in self.escaped:
             self.escaped[what] = None
             warnings.warn(f"not the seed's: {what}", EscapesSimulation, stacklevel=4)
+
+
+def _seeding(real: Any, drawn: Callable[[], Any]) -> Any:
+    """As `Random.seed`; but what is seeded with nothing is seeded with what is drawn."""
+
+    def seed(generator: random.Random, a: Any = None, version: int = 2) -> None:
+        real(generator, drawn() if a is None else a, version)
+
+    return seed
+
+
+def _given(real: Callable[..., Any], count: int, made: Callable[[], object]) -> Callable[..., Any]:
+    """As a function of `time`, whose last argument, after `count` others, is made now if it is left out or None."""
+
+    def called(*args: Any) -> Any:
+        return real(*args[:count], made() if args[count:] in ((), (None,)) else args[count])
+
+    return called
+
+
+def _nothing() -> None:
+    """What seeds a generator in a thread that is not the run's."""
 
 
 def _in_ns(made: Callable[[], float]) -> Callable[[], int]:

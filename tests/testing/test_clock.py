@@ -3,10 +3,11 @@
 import asyncio
 import threading
 import time
+from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
-from holdfast.testing.clock import NothingToWaitFor, VirtualClockLoop
+from holdfast.testing.clock import NothingToWaitFor, RealTimeNeeded, VirtualClockLoop
 from holdfast.testing.clock import virtual as virtual_loop
 from holdfast.testing.threads import Threads
 
@@ -60,6 +61,23 @@ async def test_a_thread_takes_no_virtual_time_and_its_result_comes_before_any_ti
     loop.call_soon(gate.set)
     assert await loop.run_in_executor(None, gate.wait, 10.0)
     assert (loop.time(), fired) == (0.0, [])
+
+
+@virtual
+async def test_time_passes_for_a_thread_that_waits_for_what_it_has_handed_to_the_loop() -> None:
+    loop = asyncio.get_running_loop()
+
+    def hands_over() -> None:
+        asyncio.run_coroutine_threadsafe(asyncio.sleep(3600.0), loop).result(20.0)
+
+    await asyncio.to_thread(hands_over)
+    assert loop.time() == 3600.0
+
+
+@virtual
+async def test_a_pool_of_processes_is_refused() -> None:
+    with ProcessPoolExecutor(1) as pool, pytest.raises(RealTimeNeeded, match="work in a pool of processes"):
+        asyncio.get_running_loop().run_in_executor(pool, abs, -1)
 
 
 @virtual

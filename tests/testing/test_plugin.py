@@ -515,3 +515,10 @@ def test_simulated_tests_run_on_real_processes_too(suite) -> None:
         assert seeds.read().split("\n")[3:] == ["7 True 7 True", ""]
     result = suite(REAL, "--holdfast-seeds", "2")
     result.assert_outcomes(passed=2, failed=1)
+
+
+@pytest.mark.parametrize("seeds", ["0", "-3", "many"])
+def test_no_number_of_seeds_lets_tests_pass_unrun(suite, seeds: str) -> None:
+    result = suite(REAL, "--holdfast-seeds", seeds)
+    assert result.ret == pytest.ExitCode.USAGE_ERROR
+    result.stderr.fnmatch_lines([f"*'{seeds}' is no number of seeds: it takes one or more"])

@@ -167,6 +167,15 @@ async def test_an_autopilot_answers_and_what_came_is_still_expected(probe: Probe
     assert await asked == "by hand"
 
 
+async def test_what_an_autopilot_has_answered_is_not_answered_again(probe: Probe) -> None:
+    probe.autopilot({Ping: "pong"})
+    assert await probe.ref.ask(Ping()) == "pong"
+    await probe.expect(Ping)
+    for answer in (lambda: probe.reply("two"), lambda: probe.refuse(Busy(1.0)), lambda: probe.forward(probe.ref)):
+        with pytest.raises(hf.HoldfastError, match=r"Ping\(n=0\) \(asked\) was answered or forwarded before"):
+            answer()
+
+
 async def test_an_autopilot_that_answers_wrongly_crashes_the_probe(actor_system: GuardedSystem, probe: Probe) -> None:
     actor_system.expect_crashes(1)
     probe.autopilot({Ping: 5})

@@ -3,19 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import concurrent.futures
 import datetime
 import itertools
 import os
 import random
+import socket
 import subprocess
 import sys
 import threading
 import time
 import uuid
 from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy.random
 import pytest
 
 import holdfast as hf
@@ -185,21 +189,49 @@ def test_random_numbers_and_clocks_are_the_seeds() -> None:
 
         async def draws(system: GuardedSystem) -> None:
             got.extend([random.random(), uuid.uuid4(), os.urandom(4), random.SystemRandom().random()])
+            got.extend([random.Random().random(), uuid.uuid1(), os.getrandom(4), numpy.random.random()])
+            random.seed()
+            got.extend([random.random(), numpy.random.default_rng().random()])
             await asyncio.sleep(2.5)
             got.extend([time.time(), time.monotonic(), time.perf_counter_ns()])
+            got.extend([time.clock_gettime(time.CLOCK_REALTIME), time.process_time(), time.gmtime().tm_sec])
 
         run_schedule(draws, Production(seed), OWN, {})
         return got
 
     assert drawn(1) == drawn(1)
-    assert drawn(1)[:4] != drawn(2)[:4]
-    assert drawn(1)[4:] == [EPOCH + 2.5, 2.5, 2_500_000_000]
+    assert not any(one == other for one, other in zip(drawn(1)[:10], drawn(2)[:10], strict=True))
+    assert drawn(1)[10:] == [EPOCH + 2.5, 2.5, 2_500_000_000, EPOCH + 2.5, 2.5, 22]
+
+
+def test_what_is_drawn_depends_on_no_library_that_is_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn: list[bytes] = []
+
+    async def draws(system: GuardedSystem) -> None:
+        drawn.append(os.urandom(8))
+
+    run_schedule(draws, Production(1), OWN, {})
+    monkeypatch.delitem(sys.modules, "numpy.random")
+    run_schedule(draws, Production(1), OWN, {})
+    assert drawn[0] == drawn[1]
 
 
 def test_the_world_is_as_it_was_when_the_run_is_over() -> None:
-    before = (time.time, os.urandom, threading.Thread.start, random.getstate())
+    def world() -> list[object]:
+        functions = [
+            time.time,
+            time.localtime,
+            os.urandom,
+            os.fork,
+            random.Random.seed,
+            random.seed,
+            socket.socket.__init__,
+        ]
+        return [*functions, threading.Thread.start, random.getstate(), str(numpy.random.get_state())]
+
+    before = world()
     run_schedule(restart_order, Production(0), OWN, {})
-    assert (time.time, os.urandom, threading.Thread.start, random.getstate()) == before
+    assert world() == before
     assert abs(time.time() - datetime.datetime.now().timestamp()) < 60.0
 
 
@@ -213,6 +245,33 @@ def test_a_thread_that_a_program_starts_is_told_by_name() -> None:
 
     with pytest.warns(EscapesSimulation, match="a thread was started .*watches"):
         run_schedule(starts, Production(0), OWN, {})
+
+
+@pytest.mark.parametrize(
+    ("escape", "told"),
+    [
+        (lambda: socket.socket().close(), "a socket was opened"),
+        (lambda: subprocess.run(["true"], check=True), "a process was started"),
+        (lambda: os.waitpid(os.posix_spawn("/bin/true", ["true"], {}), 0), r"a process was started \(os.posix_spawn\)"),
+    ],
+)
+def test_what_another_process_or_a_socket_brings_is_told(escape: Callable[[], object], told: str) -> None:
+    async def escapes(system: GuardedSystem) -> None:
+        escape()
+
+    with pytest.warns(EscapesSimulation, match=told):
+        run_schedule(escapes, Production(0), OWN, {})
+
+
+def test_a_server_is_told() -> None:
+    async def serves(system: GuardedSystem) -> None:
+        server = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
+        server.close()
+        await server.wait_closed()
+
+    with pytest.warns(EscapesSimulation) as told:
+        run_schedule(serves, Production(0), OWN, {})
+    assert any("a file or socket is read (asyncio." in str(one.message) for one in told)
 
 
 def test_what_a_thread_brings_comes_when_nothing_else_can_happen() -> None:
@@ -229,6 +288,74 @@ def test_what_a_thread_brings_comes_when_nothing_else_can_happen() -> None:
     for seed in range(20):
         trace = run_schedule(works, Walk(seed), {"system", "simulation"}, {}).trace
         assert trace.index(("the job", "done")) > max(at for at, turn in enumerate(trace) if turn[1] == "Step")
+
+
+def test_what_threads_of_a_pool_bring_comes_in_the_order_in_which_it_was_asked_for() -> None:
+    async def works(system: GuardedSystem) -> None:
+        note, loop = system.spawn(hf.start(Note), "note"), asyncio.get_running_loop()
+        gates = [threading.Event() for _ in range(3)]
+
+        def work(number: int) -> int:
+            gates[number].wait()
+            if number:  # The last one ends first.
+                gates[number - 1].set()
+            return number
+
+        jobs = [loop.run_in_executor(None, work, number) for number in range(3)]
+        for job in jobs:
+            job.add_done_callback(lambda done: note.tell(Step(done.result())))
+        gates[-1].set()
+        await asyncio.gather(*jobs)
+        await idle(system)
+        actor: Any = note._cell.actor
+        assert actor.got == [0, 1, 2]
+
+    simulate(works, seeds=20)()
+
+
+def test_what_a_thread_has_brought_before_it_was_awaited_comes_no_earlier() -> None:
+    class Quick(concurrent.futures.Executor):
+        def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> concurrent.futures.Future[Any]:
+            done: concurrent.futures.Future[Any] = concurrent.futures.Future()
+            done.set_result(fn(*args, **kwargs))
+            return done
+
+    async def works(system: GuardedSystem, simulation: Simulation) -> None:
+        note = system.spawn(hf.start(Note), "note")
+        job = asyncio.get_running_loop().run_in_executor(Quick(), lambda: None)
+        for number in range(20):
+            note.tell(Step(number))
+            await asyncio.sleep(0)
+        await job
+        simulation.trace.append(("the job", "done"))
+
+    for seed in range(20):
+        trace = run_schedule(works, Walk(seed), {"system", "simulation"}, {}).trace
+        assert trace.index(("the job", "done")) > max(at for at, turn in enumerate(trace) if turn[1] == "Step")
+
+
+def test_a_thread_of_a_pool_may_ask_what_takes_time() -> None:
+    class Slow(hf.Actor):
+        def __init__(self) -> None:
+            self.got: list[int] = []
+
+        @hf.on(Step)
+        async def step(self, message: Step) -> None:
+            await asyncio.sleep(60.0)
+            self.got.append(message.number)
+
+    async def asks(system: GuardedSystem) -> None:
+        slow, inside = system.spawn(hf.start(Slow)), system.from_thread()
+
+        def calls() -> None:
+            inside.tell(slow, Step(1))
+            inside.ask(slow, Step(2), 300.0)
+
+        await asyncio.to_thread(calls)
+        actor: Any = slow._cell.actor
+        assert actor.got == [1, 2]
+
+    simulate(asks, seeds=20)()
 
 
 def test_a_run_that_does_not_repeat_is_an_error_of_that_run() -> None:

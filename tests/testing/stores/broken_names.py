@@ -120,6 +120,13 @@ class EmptyNotesAreForgotten(OneFile):
         super().note(key, value or None)
 
 
+class ShortNotes(OneFile):
+    """Cuts large notes off."""
+
+    def note(self, key: str, value: bytes | None) -> None:
+        super().note(key, value and value[: 1 << 20])
+
+
 class NotesAreNeverForgotten(OneFile):
     """Keeps a forgotten note, as an empty one."""
 
