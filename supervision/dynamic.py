@@ -15,7 +15,7 @@ from ..actors import exit_reasons
 from ..actors.errors import HoldfastError, SpecError, type_name
 from ..actors.events import ChildStartFailed, StoreRefused
 from ..actors.exit_reasons import SHUTDOWN, ExitReason
-from ..actors.kernel import lifecycle, stopping
+from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Start, on
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.persistence import child_key
@@ -223,8 +223,8 @@ async def stop_together(cells: list[Cell]) -> None:
         if cell.state in (DOWN, GONE):
             lifecycle.retire(cell, "its parent has stopped")
             continue
-        waiting.append((cell, stopping.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
-        patience = stopping.PATIENCE if spec is None else spec.shutdown
+        waiting.append((cell, lifecycle.stop_and_wait(cell) if spec is None else spec.begin_stop(cell)))
+        patience = lifecycle.PATIENCE if spec is None else spec.shutdown
         if not isinstance(patience, str):
             late.setdefault(patience, []).append(cell)
     timers = [cells[0].node.loop.call_later(seconds, _kill_all, those) for seconds, those in late.items()]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..actors import turn_stacks
 from ..actors.events import StopOverdue
-from ..actors.kernel import stopping
+from ..actors.kernel import lifecycle
 from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.kernel.lifecycle import GRACE
 
@@ -41,7 +41,7 @@ def _overdue(cell: Cell, seconds: float) -> None:
 def most(cell: Cell | None, spec: ChildSpec | None) -> float:
     """Seconds after which a child that is told to stop has ended."""
     if spec is None:
-        return stopping.PATIENCE + GRACE
+        return lifecycle.PATIENCE + GRACE
     match spec.shutdown:
         case "brutal_kill":
             return GRACE

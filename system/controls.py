@@ -32,9 +32,9 @@ from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
 from ..actors.process.wire.start_codec import unpack_recipe
-from ..checkpoint.home.far_parent import SlotPlace
 from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.home.switch import Switch
+from ..checkpoint.places.far_parent import SlotPlace
 from ..supervision.respec import respec
 from ..supervision.spec import ChildSpec, Isolation
 from .live_moves import Moves, check_isolation

@@ -22,9 +22,9 @@ from ..actors.ordered import Ordered
 from ..actors.process.process_host import WorkerPlace
 from ..actors.process.resource_limits import Limits
 from ..actors.process.wire.peer import OutsideHost
-from ..checkpoint.home.far_parent import FarParent
 from ..checkpoint.home.journal_home import JournalHome
-from ..checkpoint.home.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
+from ..checkpoint.places.far_parent import FarParent
+from ..checkpoint.places.recorded_moves import ToRecordedHere, ToRecordedWorker, leaving
 from ..supervision.respec import recipe_spec, replace_mechanism, replace_place
 from ..supervision.spec import ChildSpec, Isolation
 from ..supervision.supervisor import Supervisor

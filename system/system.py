@@ -13,7 +13,7 @@ from ..actors.control.drain import drain as drain_queue
 from ..actors.errors import ActorStopped, HoldfastError, NoSuchActor, SpecError, TreeFailed
 from ..actors.events import EventStream, RecoveryTableUnused
 from ..actors.exit_reasons import SHUTDOWN, ExitReason, pack_exit
-from ..actors.kernel import lifecycle, stopping
+from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
 from ..actors.kernel.cell import Cell
@@ -26,13 +26,13 @@ from ..actors.kernel.topics import publish
 from ..actors.loop_watchdog import LoopWatch, check_limits
 from ..actors.process.process_host import WorkerPlace, in_process, on_frame
 from ..actors.process.worker_pool import Workers
-from ..checkpoint.home.far_parent import FarParent
 from ..checkpoint.home.homes import Homes
 from ..checkpoint.home.journal_home import JournalHome
-from ..checkpoint.home.life_here import recorded_here
-from ..checkpoint.home.subtree_place import subtree
 from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
+from ..checkpoint.places.far_parent import FarParent
+from ..checkpoint.places.life_here import recorded_here
+from ..checkpoint.places.subtree_place import subtree
 from ..checkpoint.protocol import Wanted
 from ..checkpoint.recovery_file import RecoveryFile, load_recovery
 from ..checkpoint.recovery_settings import RecoveryHooks
@@ -223,7 +223,7 @@ class ActorSystem(Recorded, Controls):
             raise cancelled
 
     async def _close(self, root: Cell, node: Node) -> None:
-        gone = stopping.stop_and_wait(root)
+        gone = lifecycle.stop_and_wait(root)
         end_within(root, gone)
         await gone
         if self._patience is not None:
@@ -404,7 +404,7 @@ class ActorSystem(Recorded, Controls):
             except (NoSuchChild, ActorStopped):  # It has stopped already, or was temporary: its spec went with it.
                 pass
         elif not cell.is_dead:
-            await stopping.stop_in_time(cell, reason)
+            await lifecycle.stop_in_time(cell, reason)
 
     def ref(self, path: str, kind: type[A]) -> ActorRef[A]:
         """A ref to the actor at an address.

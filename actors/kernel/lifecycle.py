@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 GRACE = 1.0
 """Seconds a killed turn may take to end after its cancellation, before its life is abandoned."""
+PATIENCE = 5.0
+"""Seconds an actor that nobody supervises may take to stop in good order before it is killed."""
 KILLED_WITHIN = 5.0
 """Seconds until a killed child is given up that has not ended; a process that was sent SIGKILL takes less."""
 
@@ -605,3 +607,22 @@ class ChildExit(Item):
 
     def undelivered(self, cell: Cell, reason: str) -> None:
         retire(self.child, "its supervisor has stopped")
+
+
+# -- ends that are asked for from outside ----------------------------------------------------------------------------
+
+
+async def stop_in_time(cell: Cell, reason: ExitReason = SHUTDOWN) -> ExitReason:
+    """Stop an actor that has no spec to say how: ask, wait, kill."""
+    timer = cell.node.loop.call_later(PATIENCE, cell.kill)
+    try:
+        return await stop_and_wait(cell, reason)
+    finally:
+        timer.cancel()
+
+
+def stop_and_wait(cell: Cell, reason: ExitReason = SHUTDOWN) -> asyncio.Future[ExitReason]:
+    """Ask for an end in good order; the future has the reason it really ended with."""
+    gone = cell.ended()
+    cell.request_stop(reason)
+    return gone

@@ -15,7 +15,7 @@ from ..errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecEr
 from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import KILLED, ExitReason
 from ..persistence import Keeper, NothingKept
-from . import lifecycle, stopping
+from . import lifecycle
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
@@ -181,7 +181,7 @@ class Node(RunLoop):
             lifecycle.retire(cell, "its parent has stopped")
             return cell.extra().reason
         stop = getattr(cell.spec, "stop", None)
-        reason: ExitReason = await (stop(cell) if stop is not None else stopping.stop_in_time(cell))
+        reason: ExitReason = await (stop(cell) if stop is not None else lifecycle.stop_in_time(cell))
         lifecycle.retire(cell, "its parent has stopped")
         return reason
 

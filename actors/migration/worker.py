@@ -12,8 +12,8 @@ from ..exit_reasons import KILLED, ExitReason
 from ..kernel import mailbox
 from ..kernel.cell import Cell
 from ..kernel.envelope import Ask, Item
+from ..kernel.lifecycle import PATIENCE
 from ..kernel.links import Monitor
-from ..kernel.stopping import PATIENCE
 from ..process.process_host import Outlet, RemoteBound, WorkerPlace, admit_remote, admit_remote_bounded, undelivered
 from ..process.wire.start_codec import pack_recipe
 from .here import let_in

@@ -24,7 +24,7 @@ from ...actors.migration.quiesce import Transit, now
 from ...actors.overflow import Overflow
 from ...checkpoint.home.capacity import HomeBound
 from ...checkpoint.home.journal_home import JournalHome
-from ...checkpoint.home.recorded_moves import Detached, refuse_unsaved
+from ...checkpoint.places.recorded_moves import Detached, refuse_unsaved
 from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK, Live
 from ...checkpoint.snapshot.snapshot_record import meta_now
 from ..bricks.replica_orders import EXPORTED_WITHIN, Export

@@ -8,9 +8,9 @@ from ...actors.errors import CannotMove
 from ...actors.kernel.lifecycle import LOCAL
 from ...actors.migration.move import Move
 from ...actors.process.wire.peer import OutsideHost
-from ...checkpoint.home.far_parent import FarParent
 from ...checkpoint.home.journal_home import JournalHome
-from ...checkpoint.home.recorded_moves import leaving
+from ...checkpoint.places.far_parent import FarParent
+from ...checkpoint.places.recorded_moves import leaving
 from ..group.group_place import protected_host
 from ..group.transient_homes import UNKEPT, TransientHome
 from .group_moves import FromGroup, FromRecordedGroup, ToGroup

@@ -24,7 +24,7 @@ from ..model.mechanism import COMMON, Code, Description, Mechanism, MechanismRef
 if TYPE_CHECKING:
     from ...actors.kernel.address_host import AddressHost
     from ...actors.kernel.cell import Cell
-    from ...checkpoint.home.far_parent import FarParent
+    from ...checkpoint.places.far_parent import FarParent
     from ...checkpoint.protocol import Wanted
 
 

@@ -25,13 +25,13 @@ from ...actors.process.wire import frames
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.wire.start_codec import pack_recipe
 from ...actors.process.worker_pool import Worker
-from ...checkpoint.home.far_parent import FarParent
 from ...checkpoint.home.held_messages import inlet
 from ...checkpoint.home.journal_home import JournalHome
 from ...checkpoint.home.life_ports import RemoteLife
-from ...checkpoint.home.recorded_moves import Beginning, Detached, refuse_unsaved
-from ...checkpoint.home.subtree_place import SubtreePlace
 from ...checkpoint.method import Method
+from ...checkpoint.places.far_parent import FarParent
+from ...checkpoint.places.recorded_moves import Beginning, Detached, refuse_unsaved
+from ...checkpoint.places.subtree_place import SubtreePlace
 from ...checkpoint.protocol import Closed, Protected, ToHome, Wanted
 from ...supervision.respec import recipe_spec
 from ..group.group_place import GroupPlace, protected_host

@@ -16,7 +16,7 @@ from holdfast.actors.migration.here import FromHere, ToHere
 from holdfast.actors.migration.move import Move
 from holdfast.actors.migration.worker import FromOwnWorker, ToWorker
 from holdfast.actors.process.worker_pool import Worker
-from holdfast.checkpoint.home.recorded_moves import (
+from holdfast.checkpoint.places.recorded_moves import (
     FromRecordedHere,
     FromRecordedWorker,
     ToRecordedHere,

@@ -359,7 +359,7 @@ CHECKS = {
         "test_an_attach_whose_replica_dies",
     ),
     "a group ends with the process of its supervisor": Check(
-        "checkpoint/home/far_parent.py",
+        "checkpoint/places/far_parent.py",
         "            self._end_unwanted(reason, recovers=True)\n",
         "            pass\n",
         SUBTREE,
@@ -373,7 +373,7 @@ CHECKS = {
         "test_the_root_loads_nothing",
     ),
     "a supervisor in a process hears what its child is protected by now": Check(
-        "checkpoint/home/far_parent.py",
+        "checkpoint/places/far_parent.py",
         "            self.port().to_life(Respec(layers))\n",
         "            pass\n",
         "tests/ftm/test_subtree_changes.py",

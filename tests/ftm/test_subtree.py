@@ -16,7 +16,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.exit_reasons import KILLED, pack_exit
-from holdfast.checkpoint.home.far_parent import FarParent
+from holdfast.checkpoint.places.far_parent import FarParent
 from holdfast.checkpoint.protocol import Closed
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.pbr import PBR

@@ -18,7 +18,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.migration.move import Move
 from holdfast.actors.process.wire.peer import OutsideHost
-from holdfast.checkpoint.home.subtree_place import SubtreePlace
+from holdfast.checkpoint.places.subtree_place import SubtreePlace
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR

@@ -26,14 +26,14 @@ CHECKS = {
         "test_a_claim_is_known_and_grants_nothing and plain",
     ),
     "what a process says of a recorded child that it wants is a claim": Check(
-        "checkpoint/home/far_parent.py",
+        "checkpoint/places/far_parent.py",
         "        claim(cell, wanted.bindings)\n",
         "        claim(cell, wanted.bindings)\n        cell.extra().claimed = frozenset()\n",
         CLAIMS,
         "test_what_it_wants_of_another_child_grants_nothing and recorded",
     ),
     "what a process says of a protected child that it wants is a claim": Check(
-        "checkpoint/home/far_parent.py",
+        "checkpoint/places/far_parent.py",
         "        claim(cell, wanted.bindings)\n",
         "        claim(cell, wanted.bindings)\n        cell.extra().claimed = frozenset()\n",
         CLAIMS,

@@ -10,11 +10,11 @@ from ...actors.kernel import lifecycle
 from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.kernel.lifecycle import NEAR
+from ..home.homes import ENDED, Homes
+from ..home.journal_home import Entered, JournalHome
 from ..life.recorded_life import Life, LifePlace
 from ..method import Method
 from ..protocol import ToHome
-from .homes import ENDED, Homes
-from .journal_home import Entered, JournalHome
 
 
 class LifeHere(LifePlace):

@@ -14,10 +14,10 @@ from ...actors.process.process_host import FLIGHT, WorkerPlace
 from ...actors.process.resource_limits import Limits
 from ...actors.process.wire import frames
 from ...actors.process.worker_pool import Worker, Workers
+from ..home.homes import Homes
+from ..home.life_ports import records_of
 from ..protocol import ToHome
 from .far_parent import FarParent, Lives
-from .homes import Homes
-from .life_ports import records_of
 
 
 class SubtreePlace(WorkerPlace):

@@ -25,11 +25,11 @@ from ...actors.kernel.mailbox import Bound
 from ...actors.process.stand_ins import know
 from ...actors.process.wire import frames
 from ...actors.process.worker_pool import Worker
+from ..home.homes import Homes
+from ..home.journal_home import Entered, JournalHome
+from ..home.life_ports import RemoteLife
 from ..method import hybrid
 from ..protocol import Begin, Closed, Over, Protected, Respec, Started, ToHome, Wanted
-from .homes import Homes
-from .journal_home import Entered, JournalHome
-from .life_ports import RemoteLife
 
 STOPPED_STARTING = "it was stopped while it started"
 

@@ -18,13 +18,13 @@ from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import Settle, Transit, now, part, settle_with_queue, sorted_out
 from ...actors.migration.worker import FromOwnWorker, FromWorker, ToWorker
 from ...actors.process.process_host import WorkerPlace
+from ..home.journal_home import JournalHome
+from ..home.life_ports import RemoteLife, records_of
+from ..home.switch import Switch
 from ..life.recorded_inbox import StopRecorded
 from ..life.recorded_life import Life
 from ..protocol import LifePort, Live, ToHome
-from .journal_home import JournalHome
 from .life_here import LifeHere, LocalHome
-from .life_ports import RemoteLife, records_of
-from .switch import Switch
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor
