@@ -419,7 +419,7 @@ class HomeHost(Host):
             cell: its address.
             running: the input in hand, -1 if none.
             why: in words.
-            ordered: we have killed it.
+            ordered: we have killed it, or another life in its process has.
             noticed: when its end was noticed, if before now.
             reason: why it has ended; that of the cell if left out.
             recovers: whether it is brought back; judged by its spec if left out.

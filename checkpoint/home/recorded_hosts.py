@@ -25,6 +25,7 @@ from ...actors.process.worker_pool import Worker, Workers
 from ..life.recorded_life import Life, LifeHost
 from ..method import Method
 from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
+from ..turn_word import input_of
 from .homes import ENDED, HomeHost, Homes
 from .switch import Switch
 
@@ -194,14 +195,14 @@ class RecordedProcessHost(HomeHost, ProcessHost):
         worker = self._workers.of(cell)
         if worker is None or cell.state is not RUNNING:
             return
-        running = int(worker.page[0]) - 1
+        running = input_of(worker.page[0])
         noticed = worker.noticed_at
         self.over(cell, running, str(reason), ordered=reason == KILLED, noticed=noticed, reason=reason)
         lifecycle.ended(cell, reason)
 
     def running(self, cell: Cell) -> int:
         worker = self._workers.of(cell)
-        return -1 if worker is None else int(worker.page[0]) - 1
+        return -1 if worker is None else input_of(worker.page[0])
 
     def retired(self, cell: Cell) -> None:
         ProcessHost.retired(self, cell)

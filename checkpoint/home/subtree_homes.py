@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from ...actors.control.orders_lane import Call, send_call
 from ...actors.errors import HoldfastError, StartFailed
-from ...actors.exit_reasons import KILLED, ExitReason, pack_exit, unpack_exit
+from ...actors.exit_reasons import KILLED, ExitReason, OutOfMemory, pack_exit, unpack_exit
 from ...actors.kernel import lifecycle
 from ...actors.kernel.bindings import claim, doubt
 from ...actors.kernel.cell import GONE, RUNNING, Cell, Host
@@ -25,6 +25,7 @@ from ...actors.process.wire import frames
 from ...actors.process.worker_pool import Worker, Workers
 from ..method import hybrid
 from ..protocol import Begin, Closed, Started, ToHome, Wanted
+from ..turn_word import blamed, input_of, is_at_work
 from .homes import HomeHost, Homes
 from .recorded_hosts import RemoteLife, records_of
 
@@ -105,8 +106,10 @@ class SubtreeHost(ProcessHost):
     def died(self, cell: Cell, reason: ExitReason) -> None:
         worker = self._workers.of(cell)
         if worker is not None:
+            is_of_one = not isinstance(reason, OutOfMemory)  # Its memory belongs to all of them.
+            one_works = is_of_one and self._slots is not None and self._slots.is_any_at_work(worker.page)
             for home in self._below.values():
-                home.lost(worker, reason)
+                home.lost(worker, reason, one_works=one_works)
         super().died(cell, reason)
 
     def retired(self, cell: Cell) -> None:
@@ -134,6 +137,10 @@ class Slots:
             if slot:
                 self._by_path[path] = slot
         return slot
+
+    def is_any_at_work(self, page: memoryview) -> bool:
+        """Whether one of the lives has a turn in hand that does not wait."""
+        return any(is_at_work(page[slot]) for slot in self._by_path.values())
 
     def give_back(self, path: str) -> None:
         """Nobody lives at an address any more."""
@@ -350,8 +357,8 @@ class SubtreeHome(HomeHost, Elsewhere):
         self.over(cell, running, str(reason), ordered=ordered, noticed=noticed, recovers=recovers)
         self.ended_below(cell, reason, recovers=recovers)
 
-    def lost(self, worker: Worker, reason: ExitReason) -> None:
-        """The process is gone, and the life with it."""
+    def lost(self, worker: Worker, reason: ExitReason, *, one_works: bool) -> None:
+        """The process is gone, and the life with it. `one_works`: there was a turn in it that did not wait."""
         if worker is self._worker:
             self._next = None
             if self.on_lost is not None:
@@ -359,7 +366,8 @@ class SubtreeHome(HomeHost, Elsewhere):
         if worker is self._worker and self._group is not None and self.cell is not None:
             self._group.lost(self.cell, reason)
         elif worker is self._worker and self._wanted is not None:
-            self._closed(reason, self.running(self.cell), ordered=reason == KILLED, noticed=worker.noticed_at)
+            is_blameless = reason == KILLED or blamed(worker.page[self._slot], one_works=one_works) < 0
+            self._closed(reason, self.running(self.cell), ordered=is_blameless, noticed=worker.noticed_at)
 
     # -- what a host does -------------------------------------------------------------------------------------------
 
@@ -367,7 +375,7 @@ class SubtreeHome(HomeHost, Elsewhere):
         return self._worker if cell.state is RUNNING else None
 
     def running(self, cell: Cell | None) -> int:
-        return -1 if self._worker is None or self._wanted is None else int(self._worker.page[self._slot]) - 1
+        return -1 if self._worker is None or self._wanted is None else input_of(self._worker.page[self._slot])
 
     def start(self, cell: Cell) -> None:
         raise HoldfastError(f"{cell.path} is started by its supervisor, which is in another process")

@@ -383,7 +383,7 @@ class Switch:
         return {turn.input.id for turn in self.turns.values() if turn.status == STASHED} | set(self.stash)
 
     def died(self, running: int, ordered: bool) -> None:
-        """The life is over. `running` is the input whose turn it died in, -1 if none; `ordered`: we killed it."""
+        """The life is over. `running` is the input in hand, -1 if none; `ordered`: it was not its doing."""
         self.port = None
         self.is_released = False
         self.replay.cancel()
