@@ -232,7 +232,7 @@ class Switch:
         return source
 
     def note_shape(self, name: str, batch: Batch | None = None) -> None:
-        """Have the fields of a type of messages stand in front of the first one that is journaled."""
+        """Have the fields of a type of messages, or of outcomes, stand in front of the first one that is journaled."""
         entry = self.shapes.entry(name)
         if entry is None:
             return
