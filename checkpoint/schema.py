@@ -8,7 +8,6 @@ are kept with what they describe, and compared before anything of it is handled 
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
@@ -17,6 +16,7 @@ from msgspec import inspect
 from ..actors.errors import HoldfastError, StartFailed, type_name
 from ..actors.kernel.actor import Actor
 from ..actors.kernel.message import Message, find_refusal, message_name, reply_type
+from ..actors.process.wire.start_codec import loaded
 from .protocol import MESSAGE, PIPE, REPLY, START, TICK, Answer
 
 if TYPE_CHECKING:
@@ -198,7 +198,7 @@ class Shapes:
             return None
         try:
             if name.startswith(REPLY_TO):
-                asked = find_message(name.removeprefix(REPLY_TO))
+                asked = loaded(name.removeprefix(REPLY_TO), Message)
                 return None if asked is None else shape_of(reply_type(asked))
             if name.startswith(REFUSAL):
                 refusal = find_refusal(name.removeprefix(REFUSAL))
@@ -213,19 +213,6 @@ def shape_name(answer: Answer) -> str:
     if answer.kind == "refusal":
         return REFUSAL + answer.name
     return REPLY_TO + answer.name if answer.kind == REPLY and answer.name else ""
-
-
-def find_message(name: str) -> type[Message[Any]] | None:
-    """The loaded message class with this wire name.
-
-    >>> find_message("holdfast.supervision.admin:DeleteChild")
-    <class 'holdfast.supervision.admin.DeleteChild'>
-    """
-    module, _, path = name.partition(":")
-    found: Any = sys.modules.get(module)
-    for part in path.split("."):
-        found = getattr(found, part, None)
-    return found if isinstance(found, type) and issubclass(found, Message) else None
 
 
 def as_shape(data: Any) -> Shape:
