@@ -36,7 +36,6 @@ from ...checkpoint.snapshot.snapshot_record import Meta, meta_now, put
 from ..bricks.background_work import Background
 from ..bricks.brick_messages import MOST_REQUESTS, Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
 from .behind import Behind
-from .detector import Detection
 from .diverged import Strays
 from .hold import Hold
 from .hung import Stuck
@@ -46,6 +45,7 @@ from .transient_homes import forget_ended, is_unkept
 
 if TYPE_CHECKING:
     from ...checkpoint.home.switch import Switch
+    from ..model.detection import Detection
     from .reconfiguration import Reconfiguration
 
 MOST_BYTES = 1_000_000

@@ -28,8 +28,9 @@ from ...supervision.supervisor import Supervisor
 from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Finish, Install, Setting
 from ..events import ReplicaLost
-from ..model.mechanism import NOTHING, compose
-from .detector import Detection, Detector
+from ..model.detection import Detection
+from ..model.mechanism import NOTHING, compose, detection_in
+from .detector import Detector
 from .failover import FailoverManager, why_ended
 from .group import Group, Look
 from .join import Joiner
@@ -95,8 +96,7 @@ class GroupHost(HomeHost):
     @property
     def detection(self) -> Detection:
         """How the replicas are watched: as the outermost mechanism says that says anything about it."""
-        said = (getattr(layer, "detection", None) for layer in self.layers)
-        return next((one for one in said if one is not None), Detection())
+        return detection_in(self.layers) or Detection()
 
     # -- beginning --------------------------------------------------------------------------------------------------
 
@@ -215,7 +215,8 @@ class GroupHost(HomeHost):
     def _replica_start(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> Start[Any]:
         more = cell.extra()
         bindings = {port: target.path for port, target in more.bindings.items()}
-        interval, watch_turns = self.detection.interval, self.detection.watch_turns or 0.0
+        usual = Detection()
+        interval, watch_turns = usual.interval, usual.watch_turns or 0.0
         setting = Setting(cell.path, name, config, self.method.data(), bindings, interval, watch_turns, more.claimed)
         return self.replica(setting, self.recipe(cell), tuple(layer.describe() for layer in layers))
 

@@ -23,7 +23,7 @@ from .securing import Securing
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
     from ...actors.process.worker_pool import Worker
-    from .detector import Detection
+    from ..model.detection import Detection
 
 
 FROM_OUTSIDE: Final = frozenset({1, 2, 3, 9, 15, 19, 20})
