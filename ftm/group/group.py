@@ -93,6 +93,7 @@ class Group(Members):
         self.change: Reconfiguration | None = None  # that is being made
         self.gone_back: Reconfiguration | None = None  # done by a failover: what is left is to tidy up
         self.is_resting = False  # nothing new goes in: the mechanism is about to be changed
+        self.joins_early = False  # others join before the first one has handled anything
         self.is_changing = False  # the replicas change it: nobody else may tell them anything
         self.is_joining = False  # a replica is catching up
         self.is_poked = False

@@ -29,7 +29,7 @@ from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Finish, Install, Setting
 from ..events import ReplicaLost
 from ..model.detection import Detection
-from ..model.mechanism import NOTHING, compose, detection_in
+from ..model.mechanism import NOTHING, compose, detection_in, has_state_access
 from .detector import Detector
 from .failover import FailoverManager, why_ended
 from .group import Group, Look
@@ -128,6 +128,10 @@ class GroupHost(HomeHost):
             group = await self.build(cell, switch)
             self.subscribe(cell)
             await self.lead(group, switch)
+            start = cell.extra().start
+            if start is not None and not has_state_access(start.kind) and not switch.turns:
+                group.joins_early = True  # Nobody can be brought to what it has when it has handled something.
+                await self.protected(group)
             await self.replay(cell, group, live, recovering)
             await self.protected(group)
         except BaseException as error:
