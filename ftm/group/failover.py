@@ -20,8 +20,8 @@ from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Commit, Peer, Prepare
 from ..bricks.sealed_frames import Refused
 from ..events import FailedOver
-from .followers import end_stuck
 from .group import Look
+from .hung import end_stuck
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -15,7 +15,7 @@ from ..bricks.brick_messages import RequestDropped
 from ..bricks.replica_orders import Computes, Doing
 from ..events import MechanismSettled
 from ..model.mechanism import NOTHING
-from .followers import ASKED_WITHIN, STUCK_AFTER, end_stuck
+from .hung import ASKED_WITHIN, STUCK_AFTER, end_stuck
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable

@@ -69,8 +69,13 @@ async def test_without_state_access_a_follower_that_has_died_is_back_with_the_ne
         assert await ref.ask(Add(2), timeout=60) == 2
         os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
         await until_event(events, TurnsLost)
-    assert await ref.ask(Add(3), timeout=60) == 1, "it begins afresh, and not alone"
+        assert await ref.ask(Add(3), timeout=60) == 1, "it begins afresh, and not alone"
+        assert is_complete(ref)
+        os.kill(pid_of(system, ref, "r2"), signal.SIGKILL)
+        await until_event(events, hf.ReplicaLost)
+    await system.ref("/app", hf.Supervisor).ask(hf.RestartChild("alice", running=True), timeout=60)
     assert is_complete(ref)
+    assert await ref.ask(Add(4), timeout=60) == 1
 
 
 @pytest.mark.parametrize(("size", "kept"), [(1_000, True), (20_000_000, False)])
