@@ -217,7 +217,6 @@ if TYPE_CHECKING:
         TurnHung,
         WrongSuspicion,
     )
-    from holdfast.ftm.group.detector import Detection
     from holdfast.ftm.group.protected import ProtectionStatus
     from holdfast.ftm.group.reconfiguration import CannotAdapt
     from holdfast.ftm.mechanisms.ad import AD
@@ -228,6 +227,7 @@ if TYPE_CHECKING:
     from holdfast.ftm.mechanisms.sec import SEC
     from holdfast.ftm.mechanisms.tmr import TMR
     from holdfast.ftm.mechanisms.tr import TR
+    from holdfast.ftm.model.detection import Detection
     from holdfast.ftm.model.mechanism import Mechanism, MechanismRefused, compose
     from holdfast.ftm.sec.authority import CertificationAuthority as CertificationAuthority  # not in `__all__`
     from holdfast.ftm.votes.voters import NoMajority
@@ -497,7 +497,7 @@ _LAZY = {
     "AD": "holdfast.ftm.mechanisms.ad",
     "CertificationAuthority": "holdfast.ftm.sec.authority",
     "BackgroundWorkLost": "holdfast.ftm.events",
-    "Detection": "holdfast.ftm.group.detector",
+    "Detection": "holdfast.ftm.model.detection",
     "Diverged": "holdfast.ftm.alarms",
     "FailedOver": "holdfast.ftm.events",
     "FrameRefused": "holdfast.ftm.bricks.sealed_frames",

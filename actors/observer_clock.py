@@ -21,6 +21,10 @@ class OwnClock:
         self._real = now
         return self._own
 
+    def look_every(self, period: float) -> None:
+        """It means to look so often from now on."""
+        self._period = period
+
     def at(self, now: float) -> float:
         """The time on this clock between two looks."""
         return self._own + min(max(0.0, now - self._real), self._period)

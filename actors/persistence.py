@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Protocol
 
 from .errors import ControlFailed
@@ -22,8 +23,11 @@ class Keeper(Protocol):
         """
         ...
 
-    def roll_back(self, path: str, why: str) -> None:
+    def roll_back(self, path: str, why: str) -> asyncio.Future[None] | None:
         """Have the next life at an address, where nobody lives now, begin with the snapshot before the newest.
+
+        Returns:
+            None: it is done. A future: it is asked of the root, and ends with what that answers.
 
         Raises:
             ControlFailed: nothing is recorded there, somebody lives there, or there is no older snapshot.

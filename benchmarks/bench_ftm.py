@@ -30,7 +30,7 @@ from limits import echo_process
 import holdfast as hf
 from holdfast.ftm.events import FailedOver
 from holdfast.ftm.group import group_place
-from holdfast.ftm.group.detector import Detection
+from holdfast.ftm.model.detection import Detection
 from holdfast.ftm.sec.authority import CertificationAuthority
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))

@@ -7,6 +7,7 @@ somebody lives at the other address again.
 from __future__ import annotations
 
 import functools
+from collections import Counter
 from typing import TYPE_CHECKING
 
 from ..actors.kernel import links
@@ -22,23 +23,23 @@ UNDONE_BY = {"demonitor": "monitor", "unwatch": "watch", "unlink": "link"}
 
 
 class Ties:
-    """The monitors and links of one home."""
+    """The monitors and links of one home. There may be several monitors of one actor, but one link."""
 
     def __init__(self, home: Switch) -> None:
         self._home = home
-        self._kept: dict[Tie, None] = {}
-        self._untied: list[Tie] = []  # as read back from the store
+        self._kept = Counter[Tie]()
+        self._untied = Counter[Tie]()  # as read back from the store
 
     def turn(self, verb: str, path: str) -> None:
         """A turn has tied or untied something."""
         if verb in UNDONE_BY:
-            self._kept.pop((UNDONE_BY[verb], path), None)
-        else:
-            self._kept[verb, path] = None
+            self.over(UNDONE_BY[verb], path)
+        elif verb != "link" or not self.has(verb, path):
+            self._kept[verb, path] += 1
 
     def over(self, verb: str, path: str) -> None:
-        """The actor is told of the other one's end, and that was the last of it."""
-        self._kept.pop((verb, path), None)
+        """One such tie is over: the actor is told of the other one's end, or has untied it."""
+        self._kept -= Counter({(verb, path): 1})
 
     def has(self, verb: str, path: str) -> bool:
         """Whether there is such a tie, or will be when the other one is there."""
@@ -48,29 +49,30 @@ class Ties:
         """These again, as a snapshot has them: what was tied since is undone, and what was untied comes back."""
         cell, node = self._home.cell, self._home.node
         undo = {verb: name for name, verb in UNDONE_BY.items()}
-        for verb, path in self._kept:
-            if cell is not None and (verb, path) not in ties and (verb, path) not in self._untied:
+        before, self._kept = self._kept, Counter(ties)
+        stand = before - self._untied
+        for verb, path in (stand - self._kept).elements():
+            if cell is not None:
                 connect(cell, node.cell_at(path), undo[verb])
-        self._untied = [one for one in ties if one in self._untied or one not in self._kept]
-        self._kept = dict.fromkeys(ties)
+        self._untied = self._kept - stand
 
     def saved(self) -> list[Tie]:
         """All of them, as a snapshot has them."""
-        return list(self._kept)
+        return list(self._kept.elements())
 
     def replace(self, ties: list[Tie]) -> None:
         """These, as a snapshot has them."""
-        self._kept = dict.fromkeys(ties)
+        self._kept = Counter(ties)
 
     def loaded(self) -> None:
         """All has been read back from the store: nothing of it is tied yet."""
-        self._untied = list(self._kept)
+        self._untied = Counter(self._kept)
 
     def tie(self) -> None:
         """The actor is live: tie what the last root had tied, now or when the other one is there."""
-        untied, self._untied = self._untied, []
+        untied, self._untied = self._untied, Counter()
         node = self._home.node
-        for verb, path in untied:
+        for verb, path in untied.elements():
             other = node.find(path)
             if other is None or other.is_dead:
                 node.awaited.setdefault(path, []).append(functools.partial(self._tie_soon, verb, path))
@@ -83,8 +85,18 @@ class Ties:
     def _tie(self, verb: str, path: str) -> None:
         home = self._home
         cell, other = home.cell, home.node.find(path)
-        if cell is not None and other is not None and not cell.is_dead and (verb, path) in self._kept:
+        if cell is None or other is None or cell.is_dead:
+            return
+        if tied(cell, other, verb) < self._kept[verb, path]:  # Else it was undone while the other one was awaited.
             connect(cell, other, verb)
+
+
+def tied(cell: Cell, other: Cell, verb: str) -> int:
+    """How many ties of a kind there are now."""
+    if verb == "link":
+        return int(cell.more is not None and other in cell.more.links)
+    watches = () if other.more is None else other.more.monitors
+    return sum(one.watcher is cell and one.for_good is (verb == "watch") for one in watches)
 
 
 def connect(cell: Cell, other: Cell, verb: str) -> None:

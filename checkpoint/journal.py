@@ -213,11 +213,14 @@ class InHand(Protocol):
     """Which inputs are in hand, as it outlives the process: what an engine may have as its attribute `in_hand`."""
 
     def begun(self, address: str) -> int:
-        """The input that was in hand at an address when the last owner of the store was killed; -1: none."""
+        """The input at an address in whose turn the last owner of the store was killed; -1: none.
+
+        A turn that waits is not meant if another was at work.
+        """
         ...
 
     def word(self, address: str) -> memoryview:
-        """A word of that address, in memory that outlives the process: 1 + the input in hand, or 0."""
+        """A word of that address, in memory that outlives the process, to be read by `turn_word.py`."""
         ...
 
 

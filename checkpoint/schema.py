@@ -1,4 +1,4 @@
-"""Which code has written what is recorded: the class of the actor, and the fields of its messages.
+"""Which code has written what is recorded: the class of the actor, and the fields of messages, replies and refusals.
 
 Messages are coded by position. What the journal holds of a type can be read by a class that has the same fields in the
 same order, and perhaps more behind them, with defaults; any other class would take one field for another. So the fields
@@ -15,8 +15,9 @@ from msgspec import inspect
 
 from ..actors.errors import HoldfastError, StartFailed, type_name
 from ..actors.kernel.actor import Actor
-from ..actors.kernel.message import message_name
-from .protocol import MESSAGE, PIPE, START, TICK
+from ..actors.kernel.message import Message, find_refusal, message_name, reply_type
+from ..actors.process.wire.start_codec import loaded
+from .protocol import MESSAGE, PIPE, REPLY, START, TICK, Answer
 
 if TYPE_CHECKING:
     from ..actors.kernel.cell import Cell
@@ -25,6 +26,9 @@ if TYPE_CHECKING:
 
 Shape: TypeAlias = "tuple[tuple[str, bool, tuple[str, ...]], ...]"
 """Where in a message a struct stands ("": the message itself), whether it is coded by position, and its fields."""
+
+REPLY_TO, REFUSAL = "the reply to ", "the refusal "
+"""How the names begin under which the fields of outcomes are kept."""
 
 
 @functools.cache
@@ -98,7 +102,7 @@ class Shapes:
 
     Attributes:
         kind: the class of the actor; "" if a holdfast of before has not said.
-        fields: by type of message, how what is recorded of it was written, newest last.
+        fields: by type of message (or `shape_name`), how what is recorded of it was written, newest last.
     """
 
     def __init__(self, home: Switch) -> None:
@@ -111,12 +115,12 @@ class Shapes:
 
     def entry(self, name: str) -> Entry | None:
         """What has to be written in front of the first message of this type; None if that stands there already."""
-        if name in self._noted:
+        if not name or name in self._noted:
             return None
         self._noted.add(name)
         shape = self._now(name)
         known = self.fields.setdefault(name, [])
-        if shape is None or (known and known[-1] == shape):
+        if shape is None or (known[-1] == shape if known else shape == ()):
             return None
         known.append(shape)
         return ("shape", name, shape)
@@ -174,7 +178,7 @@ class Shapes:
                 if problem:
                     return (
                         f"{name} is in its journal: {problem}; add new fields at the end and with a default, and give "
-                        "a changed message a new name beside the old one"
+                        "what has changed a new name beside the old one"
                     )
         return ""
 
@@ -182,7 +186,8 @@ class Shapes:
         """The types of messages that are still to be handled, or handled again."""
         home = self._home
         sources = (*home.open.values(), *(turn.input for turn in home.turns.values()))
-        waiting = {source.name for source in sources if source.kind in (MESSAGE, TICK, PIPE) and source.name}
+        waiting = {source.name for source in sources if source.kind in (MESSAGE, TICK, PIPE)}
+        waiting |= {shape_name(answer) for answer in home.calls.outcomes.values()}
         return waiting | {name for name, *_ in home.timers.saved().values()}
 
     def _now(self, name: str) -> Shape | None:
@@ -192,9 +197,22 @@ class Shapes:
         if kind is None:
             return None
         try:
+            if name.startswith(REPLY_TO):
+                asked = loaded(name.removeprefix(REPLY_TO), Message)
+                return None if asked is None else shape_of(reply_type(asked))
+            if name.startswith(REFUSAL):
+                refusal = find_refusal(name.removeprefix(REFUSAL))
+                return None if refusal is None else shape_of(refusal.schema())
             return shape_of(kind._table.kind_named(name))
-        except HoldfastError:
+        except (HoldfastError, TypeError, NameError):  # Annotations that say nothing: the codec tells.
             return None
+
+
+def shape_name(answer: Answer) -> str:
+    """Under which name the fields of an ask's outcome are kept; "" if they are not."""
+    if answer.kind == "refusal":
+        return REFUSAL + answer.name
+    return REPLY_TO + answer.name if answer.kind == REPLY and answer.name else ""
 
 
 def as_shape(data: Any) -> Shape:

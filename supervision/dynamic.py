@@ -90,39 +90,38 @@ class DynamicSupervisor(Supervisor):
         """A child as the journal has it. Raises HoldfastError if it can not be made any more."""
         what = unpack_data(data)
         if isinstance(what, ChildSpec):
-            spec = what
-        elif self._template is None:
+            return dataclasses.replace(what, id=name)
+        if self._template is None:
             raise SpecError(self.ctx.path, f"{name!r} was started from a template, and there is none now")
-        else:
-            spec = _filled(self._template, *what)
-        return dataclasses.replace(spec, id=name)
+        args, kwargs, *made_up = what
+        return dataclasses.replace(_filled(self._template, args, kwargs), id=name, made_up=made_up == [True])
 
     def _enlist(self, one: Child) -> None:
         if self._flags.journal:  # First: what is started must come back, also if we die in the middle of the start.
-            given = one.spec if self._template is None else _added(self._template.start, one.spec.start)
+            given = one.spec if self._template is None else (*_added(self._template, one.spec), one.spec.made_up)
             data = pack_data(given, f"child {one.spec.id!r}")
             self.ctx.cell.node.keeper.note(child_key(self.ctx.path, one.spec.id), data)
-        elif self._is_lost_with_us(one):
+        elif one.spec.made_up and self._is_recorded(one):
             self.ctx.cell.node.keeper.note(child_key(self.ctx.path, one.spec.id), MADE_UP)
         super()._enlist(one)
 
-    def _is_lost_with_us(self, one: Child) -> bool:
-        """Whether something is recorded of a child that nobody knows when we have been restarted."""
+    def _is_recorded(self, one: Child) -> bool:
+        """Whether something may be recorded of a child, or below it."""
         spec = complete(self.ctx.cell, one.spec)
-        return not spec.comes_back and (spec.has_home or spec.is_supervisor)
+        return spec.has_home or spec.is_supervisor
 
     def _forget(self, one: Child) -> None:
         super()._forget(one)
-        if self._is_lost_with_us(one):
+        node, key = self.ctx.cell.node, child_key(self.ctx.path, one.spec.id)
+        is_lost = one.spec.made_up and self._is_recorded(one)  # Nobody starts an id again that was made up.
+        if self._flags.journal:
+            try:
+                node.keeper.note(key, MADE_UP if is_lost else None)
+            except HoldfastError as error:  # It is over all the same, but will come back with us.
+                node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
+                return
+        if is_lost:
             self._lose(one.spec.id)
-            return
-        if not self._flags.journal:
-            return
-        node = self.ctx.cell.node
-        try:
-            node.keeper.note(child_key(self.ctx.path, one.spec.id), None)
-        except HoldfastError as error:  # It is over all the same, but will come back with us.
-            node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
 
     def _take(self, plan: Plan) -> None:
         """New flags and template; those who live now stay as they are, even if there are more than there may be."""
@@ -146,7 +145,9 @@ class DynamicSupervisor(Supervisor):
         elif isinstance(given, Start):
             spec = child(None, given)
         elif isinstance(given, ChildSpec):
-            spec = given
+            spec = dataclasses.replace(
+                given, comes_back=True, made_up=False
+            )  # As it was told of another child, perhaps.
         else:
             raise SpecError("StartChild", f"takes child(...), start(...) or supervisor(...), not {given!r}")
         check_spec("StartChild", spec, "never", nameless=True)
@@ -156,7 +157,7 @@ class DynamicSupervisor(Supervisor):
         if spec.id != NAMELESS and self._template is None:
             return spec
         # Without a journal nobody knows this id when we have been restarted: what waits for it waits for nobody.
-        return dataclasses.replace(spec, id=self._new_id(spec), comes_back=self._flags.journal)
+        return dataclasses.replace(spec, id=self._new_id(spec), comes_back=self._flags.journal, made_up=True)
 
     def _new_id(self, spec: ChildSpec) -> str:
         """An id that nobody has here: the template's or the class's name, and a number."""
@@ -260,10 +261,11 @@ def _filled(template: ChildSpec, args: tuple[Any, ...], kwargs: dict[str, Any]) 
     return dataclasses.replace(template, start=start)
 
 
-def _added(template: Start[Any], start: Start[Any]) -> tuple[tuple[Any, ...], dict[str, Any]]:
+def _added(template: ChildSpec, spec: ChildSpec) -> tuple[tuple[Any, ...], dict[str, Any]]:
     """The arguments that a start has added to those of its template."""
-    kwargs = {key: value for key, value in start.kwargs.items() if template.kwargs.get(key, start) is not value}
-    return start.args[len(template.args) :], kwargs
+    own, start = template.start, spec.start
+    kwargs = {key: value for key, value in start.kwargs.items() if own.kwargs.get(key, start) is not value}
+    return start.args[len(own.args) :], kwargs
 
 
 def check_dynamic(where: str, plan: Plan) -> None:

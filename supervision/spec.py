@@ -93,6 +93,7 @@ class ChildSpec(Generic[A_co]):
     rules: tuple[Rule, ...] = ()
     mechanism: Any = None
     comes_back: bool = True  # whether its supervisor starts it again when that has itself been restarted
+    made_up: bool = False  # whether its supervisor has made its id up
     start_timeout: StartTimeout | None = None  # None becomes what the kind of child has by default
     autostart: bool = True  # whether its supervisor starts it with the others, or only by order
 

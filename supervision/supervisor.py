@@ -608,11 +608,15 @@ class Supervisor(Inquiries):
         problem: HoldfastError | None = None
         if message.older:
             try:
-                self.ctx.cell.node.keeper.roll_back(self._path_of(one), "it was asked for")
+                rolled_back = self.ctx.cell.node.keeper.roll_back(self._path_of(one), "it was asked for")
+                if rolled_back is not None:
+                    await rolled_back
             except HoldfastError as error:
                 if not message.running:
                     raise
                 problem = error
+            if one.state != STOPPED or self._children.get(message.id) is not one:
+                raise StartFailed(self._path_of(one), "it was started or deleted by somebody else meanwhile")
 
         def undo(one: Child) -> None:
             self._give_up_address(one, "it could not be started")

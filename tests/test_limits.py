@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import os
+import re
 import signal
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,8 +15,10 @@ from typing import Any
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel import lifecycle
 from holdfast.actors.kernel.codec import Packed
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.supervision import patience
 
 # These actors are imported by other processes: by name, so the root has to be on the path.
 ROOT = str(Path(__file__).parents[1])
@@ -210,3 +216,116 @@ async def test_in_a_process_find_gives_a_ref_to_whatever_is_outside() -> None:
         task = await system.start(hf.child("two", hf.start(Busy)))
         with pytest.raises(hf.RemoteCrash, match="NoSuchActor"):
             await task.ask(Do("find"), timeout=60.0)
+
+
+class Leaves(hf.Actor):
+    """Takes its time to end, and says when it has."""
+
+    def __init__(self, file: str) -> None:
+        self.file = file
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        await asyncio.sleep(1.5)
+        Path(self.file).touch()
+
+
+class Named(hf.Supervisor):
+    """Names its child itself: the root hears of it, and not of how long it may take."""
+
+    def __init__(self, file: str) -> None:
+        self._file = file
+
+    def init(self) -> hf.Plan:
+        return hf.Plan.of(hf.Flags(), [hf.child("leaves", hf.start(Leaves, self._file), shutdown=60.0)])
+
+
+@pytest.mark.parametrize("shutdown", ["infinity", 60.0])
+async def test_how_long_unknown_children_of_a_supervisor_elsewhere_may_take_is_guessed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shutdown: Any
+) -> None:
+    """As if each had the usual five seconds, which are none here; what its own spec says is kept."""
+    for name in ("SLACK", "GRACE"):
+        monkeypatch.setattr(patience, name, 0.1)
+    monkeypatch.setattr(lifecycle, "PATIENCE", 0.1)
+    file = tmp_path / "left"
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("top", hf.start(Named, str(file)), isolation="process", shutdown=shutdown)
+        top = await system.start(spec)
+        with system.events() as events:
+            await system.stop(top)
+            overdue = [one for one in events.take() if isinstance(one, hf.StopOverdue)]
+    assert (bool(overdue), file.exists()) == ((True, False) if shutdown == "infinity" else (False, True))
+
+
+class Backtracks(hf.Actor):
+    """Its first start is in C code that does not let go of the interpreter."""
+
+    def __init__(self, file: str) -> None:
+        if not Path(file).exists():
+            Path(file).touch()
+            re.match("(a+)+$", "a" * 64 + "b")
+
+    @hf.on(Do)
+    def do(self, message: Do) -> int:
+        return 1
+
+
+async def test_c_code_that_keeps_the_interpreter_in_a_start_is_ended_by_hung_after(tmp_path: Path) -> None:
+    """Its `start_timeout` alone does nothing: no thread of that process can look."""
+    child = hf.child("slow", hf.start(Backtracks, str(tmp_path / "begun")), start_timeout=0.1)
+    limits = hf.Limits(hung_after=0.5)
+    async with hf.ActorSystem("app", log=False, intensity=10) as system:
+        with system.events() as events:
+            with contextlib.suppress(hf.StartFailed):
+                await system.start(hf.supervisor("top", children=[child], isolation="process", limits=limits))
+            reasons = [one.reason for one in events.take() if isinstance(one, hf.ProcessDied)]
+        assert [type(one) for one in reasons] == [hf.Hung]
+
+
+ASKS = """
+import asyncio, os, sys, holdfast as hf
+
+class Ask(hf.Message[str]): ...
+class Get(hf.Message[list[str]]): ...
+
+class Silent(hf.Actor):
+    @hf.on(Ask)
+    async def ask(self, message: Ask) -> str:
+        if sys.argv[2] == "kill":
+            os.kill(os.getpid(), 9)
+        return "an answer"
+
+class Asker(hf.Actor):
+    def __init__(self) -> None:
+        self.got: list[str] = []
+
+    @hf.on(Ask)
+    async def ask(self, message: Ask) -> str:
+        try:
+            self.got.append(await self.ctx.find("/app/silent", Silent).ask(Ask(), timeout=60.0))
+        except hf.AskTimeout as error:
+            self.got.append(f"no answer {error.handled}")
+        return ""
+
+    @hf.on(Get, readonly=True)
+    def get(self, message: Get) -> list[str]:
+        return self.got
+
+async def main() -> None:
+    async with hf.ActorSystem("app", store=f"sqlite:{sys.argv[1]}", log=False) as system:
+        await system.start(hf.child("silent", hf.start(Silent)))
+        asker = await system.start(hf.child("asker", hf.start(Asker), recovery=hf.hybrid()))
+        if sys.argv[2] == "kill":
+            await asker.ask(Ask(), timeout=60.0)
+        print(await asker.ask(Get(), timeout=60.0))
+
+asyncio.run(main())
+"""
+
+
+def test_what_a_turn_had_asked_of_an_actor_without_recovery_when_the_root_died_has_no_answer(tmp_path: Path) -> None:
+    """Whether it was handled is not known, and it is not asked again."""
+    for what, code, out in (("kill", -9, ""), ("end", 0, "['no answer None']\n")):
+        command = [sys.executable, "-c", ASKS, str(tmp_path / "app.db"), what]
+        done = subprocess.run(command, capture_output=True, text=True)
+        assert (done.returncode, done.stdout) == (code, out), done.stderr

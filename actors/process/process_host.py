@@ -243,6 +243,10 @@ class WorkerHome(Home):
         """Whether a life has come so far that it can be told to end in good order."""
         raise NotImplementedError
 
+    def in_hand(self, worker: Worker) -> int:
+        """The number of the input that a process has in hand, -1 if none is known."""
+        return -1
+
     def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
         """The process is gone, or the life in it has ended. Returns what is done when it is known what follows.
 
@@ -480,7 +484,7 @@ class WorkerPlace(Place):
 
     def running(self, cell: Cell) -> int:
         worker = self.workers.of(cell)
-        return -1 if worker is None else int(worker.page[0]) - 1
+        return -1 if worker is None else self.home.in_hand(worker)
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self.workers.of(cell)
@@ -545,18 +549,21 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
         case "keep":
-            keep(node, frame)
+            keep(worker, frame)
         case _:
             obey(node, cell, frame)
 
 
-def keep(node: Node, frame: frames.Command) -> None:
+def keep(worker: Worker, frame: frames.Command) -> None:
     """What the supervisors in an actor process say to the keeper, of addresses below their process's own.
+
+    Who waits for an answer gets the error; of any other the process has gone on already, and it is told as an event.
 
     Raises:
         BadFrame: there is nothing like it to be done.
     """
-    path, keeper = frame.data["path"], node.keeper
+    node, path, answer = worker.node, frame.data["path"], frame.data.get("answer")
+    keeper, problem = node.keeper, None
     try:
         match frame.data["what"]:
             case "erase":
@@ -574,5 +581,9 @@ def keep(node: Node, frame: frames.Command) -> None:
                 raise BadFrame(f"an actor process cannot have {what!r} done")
     except BadFrame:
         raise
-    except HoldfastError as error:  # The process goes on: it was not its fault, and it has gone on already.
-        node.emit(StoreRefused(path, str(error)))
+    except HoldfastError as error:  # The process goes on: it was not its fault.
+        problem = error
+    if answer is not None:
+        worker.accepted(answer, problem)
+    elif problem is not None:
+        node.emit(StoreRefused(path, str(problem)))

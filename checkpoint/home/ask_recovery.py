@@ -96,7 +96,7 @@ class Rejoin:
         ask = ask or self._of(home.path, turn, out.k)  # Its receiver's home is not open yet.
         source = home.open.get(key)
         ask.chain = ((home.path, key), *(source.chain if source is not None else ()))
-        ask.to = ask.to or home.node.cell_at(out.to)
+        ask.to, ask.asked = ask.to or home.node.cell_at(out.to), out.name
         ask.timeout, ask.deadline = out.seconds, home.node.loop.time() + out.seconds
         home.calls.asks[turn, out.k] = ask
         home.node.deadlines.add(ask)

@@ -22,6 +22,7 @@ from ..method import Method
 from ..protocol import LifePort
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
+from ..turn_word import input_of
 from .admission import Admission
 from .held_messages import hold, inlet, let_go
 from .homes import ENDED, Homes
@@ -149,7 +150,7 @@ class JournalHome(RecordedHome):
             cell: its address.
             running: the input in hand, -1 if none.
             why: in words.
-            ordered: we have killed it.
+            ordered: we have killed it, or another life in its process has.
             noticed: when its end was noticed, if before now.
             reason: why it has ended; that of the cell if left out.
             recovers: whether it is brought back; judged by its spec if left out.
@@ -234,11 +235,14 @@ class JournalHome(RecordedHome):
     def takes_stop(self, cell: Cell) -> bool:
         return self.switch is not None and self.switch.is_live
 
+    def in_hand(self, worker: Worker) -> int:
+        return input_of(worker.page[0])
+
     def lost(self, cell: Cell, worker: Worker | None, reason: ExitReason) -> Callable[[bool | None], None] | None:
         """Keep everything, and count deaths in the same turn."""
         if worker is None or cell.state is not RUNNING:
             return None
-        running, noticed, ordered = int(worker.page[0]) - 1, worker.noticed_at, reason == KILLED
+        running, noticed, ordered = self.in_hand(worker), worker.noticed_at, reason == KILLED
 
         def over(recovers: bool | None) -> None:
             self.over(

@@ -13,6 +13,7 @@ from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
 from ..inputs import Batch
 from ..protocol import REPLY, Answer, Out, Outcome
+from ..schema import shape_name
 
 if TYPE_CHECKING:
     from ...actors.kernel.codec import Codec
@@ -47,13 +48,14 @@ class SwitchAsk(RelayedAsk, eq=False):
     asker: str = ""
     turn: int = 0
     k: int = 0
+    asked: str = ""  # the type of the message, if it is known
 
     @classmethod
     def made(cls, switch: Switch, turn: int, out: Out, chain: Any, to: Cell) -> SwitchAsk:
         """The ask that was output (turn, k)."""
         deadline = switch.node.loop.time() + out.seconds
         ask = cls(Parcel(out.name, out.body), switch.cell, chain, out.seconds, deadline, None, to)
-        ask.future, ask.switch, ask.asker, ask.turn, ask.k = ask, switch, switch.path, turn, out.k
+        ask.future, ask.switch, ask.asker, ask.turn, ask.k, ask.asked = ask, switch, switch.path, turn, out.k, out.name
         return ask
 
     @property
@@ -92,6 +94,8 @@ class SwitchAsk(RelayedAsk, eq=False):
         if not self.is_over:
             self.is_over = True
             self.future = OVER  # Not itself any more: a cycle would keep the message until the next collection.
+            if answer.kind == REPLY:
+                answer = Answer(REPLY, self.asked, answer.body)
             self.switch.calls.outcome(self.turn, self.k, answer, batch)
 
 
@@ -152,6 +156,7 @@ class Calls:
         if turn > self._home.state_turn:  # Else it will not be replayed.
             self.outcomes[turn, k] = answer
             if self._home.journal.durable:
+                self._home.note_shape(shape_name(answer), own)
                 entry = ("got", turn, k, answer.kind, answer.name, answer.body)
                 own.add(self._home.path, entry, self._home.positions_of(turn))
         own.after.append(lambda: self._tell(turn, k, answer))

@@ -232,7 +232,7 @@ class Switch:
         return source
 
     def note_shape(self, name: str, batch: Batch | None = None) -> None:
-        """Have the fields of a type of messages stand in front of the first one that is journaled."""
+        """Have the fields of a type of messages, or of outcomes, stand in front of the first one that is journaled."""
         entry = self.shapes.entry(name)
         if entry is None:
             return
@@ -383,7 +383,7 @@ class Switch:
         return {turn.input.id for turn in self.turns.values() if turn.status == STASHED} | set(self.stash)
 
     def died(self, running: int, ordered: bool) -> None:
-        """The life is over. `running` is the input whose turn it died in, -1 if none; `ordered`: we killed it."""
+        """The life is over. `running` is the input in hand, -1 if none; `ordered`: it was not its doing."""
         self.port = None
         self.is_released = False
         self.replay.cancel()

@@ -53,12 +53,14 @@ class Fed(Item):
                 life.close_turn(DROPPED, life.answer_error(error))
                 return None
         try:
-            result = item.call(actor) if life.guard is None else life.guard.call(item.call, actor)
+            result: Any = item.call(actor) if life.guard is None else life.guard.call(item.call, actor)
         except Refusal as no:
             item.refuse(no)
             return None
         if type(result) is Coroutine_:
-            return item.finish(result if life.guard is None else life.guard.drive(result))
+            if life.guard is not None:
+                result = life.guard.drive(result)
+            return item.finish(result if life.page is None else life.drive(result))
         item.end_with(result)
         return None
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable
-from typing import Any, Protocol
+import types
+from collections.abc import Callable, Coroutine, Generator
+from typing import Any, Protocol, TypeVar
 
 from ...actors.errors import ActorStopped, BadMessage, ControlFailed, HoldfastError, StartFailed, remote_crash
 from ...actors.exit_reasons import ExitReason
@@ -48,11 +49,14 @@ from ..protocol import (
 )
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
+from ..turn_word import WAITS
 from .determinism_guard import Guard
 from .readonly_guard import check_readonly
 from .recorded_context import RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
 from .replay_guard import digest_of
+
+T = TypeVar("T")
 
 
 class HomePort(Protocol):
@@ -124,6 +128,8 @@ class Life:
         """
         cell = self.cell
         cell.life += 1
+        if self.page is not None:  # What stood there is the turn in which an earlier life was killed.
+            self.page[0] = 0
         self.hook = INIT
         lifecycle.build(cell, start, self._context)
         self.hook = ""
@@ -247,6 +253,34 @@ class Life:
         self.feed, self.outs, self.last_k = feed, [], 0
         if self.page is not None:
             self.page[0] = feed.id + 1
+
+    @types.coroutine
+    def drive(self, turn: Coroutine[Any, Any, T]) -> Generator[Any, Any, T]:
+        """Run a turn to its end; the page says when it waits."""
+        feed = self.feed
+        step: Callable[[Any], Any] = turn.send
+        value: Any = None
+        while True:
+            try:
+                yielded = step(value)
+            except StopIteration as done:
+                return done.value  # type: ignore[no-any-return]  # what the turn returns
+            except BaseException:
+                self._mark(feed, WAITS)  # If it was killed, nobody closes it.
+                raise
+            self._mark(feed, WAITS)
+            try:
+                step, value = turn.send, (yield yielded)
+            except GeneratorExit:
+                turn.close()
+                raise
+            except BaseException as error:
+                step, value = turn.throw, error
+            self._mark(feed)
+
+    def _mark(self, feed: Feed | None, how: int = 0) -> None:
+        if self.page is not None and feed is not None and feed is self.feed:  # Else its life was abandoned.
+            self.page[0] = feed.id + 1 | how
 
     def close_turn(self, status: str, answer: Answer) -> None:
         """A turn has ended: report it, with what it sent."""

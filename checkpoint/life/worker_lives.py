@@ -117,11 +117,13 @@ class GuestKeeper:
                 del self._notes[key]
         self._say("erase", path, below=below)
 
-    def roll_back(self, path: str, why: str) -> None:
-        """Have the root let its next life begin with an older snapshot; if there is none, the root tells that."""
+    def roll_back(self, path: str, why: str) -> asyncio.Future[None]:
+        """Have the root let its next life begin with an older snapshot."""
         if not self.knows(path):
             raise ControlFailed(path, "roll_back", "nothing was recorded of it in this run")
-        self._say("roll_back", path, why=why)
+        key, done = self._guest.acceptance()
+        self._say("roll_back", path, why=why, answer=key)
+        return done
 
     def blame(self, path: str) -> None:
         """The supervisor above this address ends because of the actor there."""

@@ -30,6 +30,7 @@ from ..home.journal_home import Entered, JournalHome
 from ..home.life_ports import RemoteLife
 from ..method import hybrid
 from ..protocol import Begin, Closed, Over, Protected, Respec, Started, ToHome, Wanted
+from ..turn_word import blamed, input_of
 
 STOPPED_STARTING = "it was stopped while it started"
 
@@ -176,8 +177,11 @@ class FarParent(Parent):
             running = self.below.place.running(self.cell)
             self._over_below(unpack_exit(record.reason), running, recovers=record.recovers)
 
-    def lost(self, worker: Worker, reason: ExitReason) -> None:
-        """The supervisor has died with its process, and the lives there too."""
+    def lost(self, worker: Worker, reason: ExitReason, *, one_works: bool) -> None:
+        """The supervisor has died with its process, and the lives there too.
+
+        `one_works`: there was a turn in one of them that did not wait.
+        """
         if worker is not self.worker:
             return
         self._next = None
@@ -189,7 +193,8 @@ class FarParent(Parent):
             self._end_unwanted(reason, recovers=True)
         else:
             running = self.below.place.running(self.cell)
-            self._over_below(reason, running, ordered=reason == KILLED, noticed=worker.noticed_at)
+            is_blameless = reason == KILLED or blamed(worker.page[self.slot], one_works=one_works) < 0
+            self._over_below(reason, running, ordered=is_blameless, noticed=worker.noticed_at)
 
     # -- the end of a life ------------------------------------------------------------------------------------------
 
@@ -403,7 +408,7 @@ class SlotPlace(Place):
 
     def running(self, cell: Cell) -> int:
         parent = self._parent
-        return -1 if parent.worker is None or parent.wanted is None else int(parent.worker.page[parent.slot]) - 1
+        return -1 if parent.worker is None or parent.wanted is None else input_of(parent.worker.page[parent.slot])
 
     def retired(self, cell: Cell) -> None:
         live = None if self._home.switch is None else self._home.switch.live

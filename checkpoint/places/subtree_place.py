@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ...actors.exit_reasons import ExitReason
+from ...actors.exit_reasons import ExitReason, OutOfMemory
 from ...actors.kernel import lifecycle
 from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import Cell
@@ -17,6 +17,7 @@ from ...actors.process.worker_pool import Worker, Workers
 from ..home.homes import Homes
 from ..home.life_ports import records_of
 from ..protocol import ToHome
+from ..turn_word import is_at_work
 from .far_parent import FarParent, Lives
 
 
@@ -73,8 +74,10 @@ class SubtreePlace(WorkerPlace):
     def died(self, cell: Cell, reason: ExitReason) -> None:
         worker = self.workers.of(cell)
         if worker is not None:
+            is_of_one = not isinstance(reason, OutOfMemory)  # Its memory belongs to all of them.
+            one_works = is_of_one and self._slots is not None and self._slots.is_any_at_work(worker.page)
             for parent in self._below.values():
-                parent.lost(worker, reason)
+                parent.lost(worker, reason, one_works=one_works)
         super().died(cell, reason)
 
     def retired(self, cell: Cell) -> None:
@@ -102,6 +105,10 @@ class Slots:
             if slot:
                 self._by_path[path] = slot
         return slot
+
+    def is_any_at_work(self, page: memoryview) -> bool:
+        """Whether one of the lives has a turn in hand that does not wait."""
+        return any(is_at_work(page[slot]) for slot in self._by_path.values())
 
     def give_back(self, path: str) -> None:
         """Nobody lives at an address any more."""

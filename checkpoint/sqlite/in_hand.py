@@ -1,11 +1,10 @@
 """Which input each recorded actor of the root has in hand, in a file that outlives the process.
 
 It is mapped into memory: to say that a turn begins or ends is no system call, and a kill of the process loses nothing.
-After one, whoever opens the store next knows in whose turns it died, and counts that against those inputs. A power loss
-may lose it: then nothing is counted.
+After one, whoever opens the store next knows in whose turns it died, and counts that against those inputs: against the
+one that was at work; if none was, against all that waited. A power loss may lose it: then nothing is counted.
 
-The file has the identity of the store, then for each actor a digest of its address and a word: the number of the input
-in hand plus one, or 0.
+The file has the identity of the store, then for each actor a digest of its address and a word (`turn_word.py`).
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ import os
 from hashlib import blake2b
 from typing import Final
 
+from ..turn_word import blamed, is_at_work
 from .snapshot_files import refuse_shared
 
 _PAGE: Final = mmap.PAGESIZE
@@ -30,6 +30,7 @@ class Hands:
         self._fd = -1
         self._pages: list[tuple[mmap.mmap, memoryview]] = []
         self._places: dict[int, int] = {}
+        self._one_worked = False
 
     def open(self, identity: bytes) -> None:
         """Take up what an earlier owner has left, if it was this store's.
@@ -45,14 +46,15 @@ class Hands:
         for _ in range(max(1, -(-os.fstat(self._fd).st_size // _PAGE))):
             self._map()
         for place in range(1, self._size):
-            digest = self._at(place)[0]
+            digest, word = self._at(place)
             if digest:
                 self._places[digest] = place
+                self._one_worked = self._one_worked or is_at_work(word)
 
     def begun(self, address: str) -> int:
-        """The input that was in hand when the last owner was killed; -1 if there was none."""
+        """The input in whose turn the last owner was killed, as far as the words say; -1: none."""
         place = self._places.get(_digest(address))
-        return -1 if place is None else self._at(place)[1] - 1
+        return -1 if place is None else blamed(self._at(place)[1], one_works=self._one_worked)
 
     def word(self, address: str) -> memoryview:
         """The word of an actor, to be set as `word[0]`."""

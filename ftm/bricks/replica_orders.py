@@ -28,9 +28,9 @@ class Setting(msgspec.Struct, array_like=True, frozen=True):
     bindings: dict[str, str]
     """Of the protected actor: port to address."""
     beat: float
-    """Seconds between two heartbeats."""
+    """Seconds between two heartbeats, if no layer says; 0: there are none."""
     watch_turns: float = 0.0
-    """Seconds that a turn may take; 0: as many as it wants."""
+    """Seconds that a turn may take, if no layer says; 0: as many as it wants."""
     claimed: frozenset[str] = frozenset()
     """Ports of which only another actor process says where they lead: these grant nothing."""
 

@@ -117,6 +117,8 @@ class Transfer(Gate):
             state = None
             if server.has_access:
                 state = server.capture() if server.point is not None or server.turn >= 0 else None
+            elif server.point is not None and server.turn == server.point.turn and not server.point.data.size:
+                state = server.point  # It has begun afresh, and so does the other one.
             elif server.turn >= 0:
                 why = "the state of the protected actor cannot be read, and it has handled requests already"
                 raise CannotJoin(path=path, why=why)

@@ -9,15 +9,14 @@ Source:
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import deque
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.errors import SpecError
 from ...actors.kernel.actor import Actor, on
 from ...actors.observer_clock import OwnClock
 from ..bricks.replica_orders import Beat, Broken
+from ..model.detection import Detection
 from .membership import is_within
 
 if TYPE_CHECKING:
@@ -31,43 +30,6 @@ HIGHEST = 1000.0
 """Phi when the silence is longer than can be told."""
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Detection:
-    """How replicas are watched.
-
-    Args:
-        interval: seconds between two heartbeats.
-        threshold: phi from which on a replica is suspected: 8 is one wrong suspicion in 10^8 looks, if delays vary as
-            they did before.
-        pause: seconds of silence that are always acceptable, besides what the heartbeats so far let expect.
-        spread: the least standard deviation that is reckoned with, in seconds.
-        hopeless: seconds after which even a replica is given up that nobody could take over from.
-        watch_turns: seconds that a turn may take, what it waits for included; None: as many as it wants.
-    """
-
-    interval: float = 0.05
-    threshold: float = 8.0
-    pause: float = 0.5
-    spread: float = 0.01
-    hopeless: float = 10.0
-    watch_turns: float | None = None
-
-    def __post_init__(self) -> None:
-        for name in ("interval", "threshold", "spread", "hopeless"):
-            value = getattr(self, name)
-            if not _number(value) or not 0 < value < math.inf:
-                raise SpecError("Detection", f"{name} must be a finite number > 0, not {value!r}")
-        turns = self.watch_turns
-        if turns is not None and (not _number(turns) or not 0 < turns < math.inf):
-            raise SpecError("Detection", f"watch_turns must be seconds > 0 or None, not {turns!r}")
-        if not _number(self.pause) or not 0 <= self.pause < math.inf:
-            raise SpecError("Detection", f"pause must be seconds >= 0, not {self.pause!r}")
-
-
-def _number(value: object) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
-
-
 class Accrual:
     """What is known of one replica's heartbeats, and how much its silence means."""
 
@@ -75,6 +37,13 @@ class Accrual:
         self._detection, self._last, self.starved = detection, now, starved
         self._gaps: deque[float] = deque(maxlen=KEPT)
         self._sum = self._squares = 0.0
+
+    def watch_as(self, detection: Detection) -> None:
+        """It is watched like this from now on."""
+        if detection.interval != self._detection.interval:  # What the heartbeats so far let expect is over.
+            self._gaps.clear()
+            self._sum = self._squares = 0.0
+        self._detection = detection
 
     @property
     def last(self) -> float:
@@ -157,7 +126,13 @@ class Detector(Actor):
         if self.ctx.closed:
             return  # This life was killed: the next one looks, and this one hears nothing any more.
         loop = self.ctx.cell.node.loop
+        detection = self._group.detection
+        if detection.interval / 2 != self._period:  # A change of mechanism has said so.
+            self._period = detection.interval / 2
+            self._clock.look_every(self._period)
         now = self._clock.tick(loop.time())
+        for known in self._known.values():
+            known.watch_as(detection)
         for name, life in self._group.watched():
             accrual = self._known.get((name, life))
             if accrual is None:  # Not heard yet by this life of ours.

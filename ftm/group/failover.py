@@ -15,11 +15,13 @@ from ...actors.errors import ActorStopped, AskFailed, AskTimeout, HoldfastError
 from ...actors.exit_reasons import KILLED
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.cell import RUNNING
+from ...actors.kernel.message import Message
 from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Commit, Peer, Prepare
 from ..bricks.sealed_frames import Refused
 from ..events import FailedOver
 from .group import Look
+from .hung import end_stuck
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -33,12 +35,18 @@ TOLD_WITHIN = 1.0
 """Seconds until the end of a replica that has said so is known with its reason."""
 BACK_WITHIN = 30.0
 """Seconds after which a replica is given up that is brought back to an earlier stack of mechanisms."""
+INSPECT_EVERY = 5.0
+"""Seconds between two looks at those that do not lead."""
 AGAIN_AFTER = 0.05
 """Seconds until something is tried again that a replica has refused."""
 
 
+class Inspect(Message):
+    """It is time to look at those that do not lead."""
+
+
 class FailoverManager(Actor):
-    """Sees to it that one replica leads, and that it waits for no dead ones."""
+    """Sees to it that one replica leads, and that it waits for no dead ones, nor for those that let nothing pass."""
 
     _is_part: ClassVar[bool] = True
 
@@ -48,10 +56,13 @@ class FailoverManager(Actor):
         self._group = group
         self._step = step or nothing
         self._timer: asyncio.TimerHandle | None = None
+        self._inspection: asyncio.Task[None] | None = None
+        self._inspected = -1  # the last turn behind which the others were looked at
 
     def on_start(self, restored: bool) -> None:
         """The last life may have died in the middle of a step."""
         self._group.tell("failover", Look())
+        self.ctx.every(INSPECT_EVERY, Inspect())
 
     def on_stop(self, reason: object) -> None:
         if self._timer is not None:
@@ -80,6 +91,24 @@ class FailoverManager(Actor):
             elif not await self._tidied():
                 break
         group.tell("join", Look())
+
+    @on(Inspect)
+    def inspect(self, message: Inspect) -> None:
+        """Look at those that do not lead, unless nothing has come to them. (On probation they are looked at anyway.)"""
+        group = self._group
+        is_idle = group.switch.turn == self._inspected and group.out is None and not group.waiting
+        is_quiet = not (group.is_over or group.is_changing or group.untrusted or self._inspection is not None)
+        if is_quiet and not is_idle and group.primary is not None and group.backups():
+            self._inspection = self.ctx.create_task(self._inspect(group.switch.turn))
+
+    async def _inspect(self, turn: int) -> None:
+        try:
+            await end_stuck(self._group)
+            self._inspected = turn
+        except HoldfastError:
+            return  # The next look is soon.
+        finally:
+            self._inspection = None
 
     def _depose(self, name: str) -> None:
         """What it says from now on does not count, and it must be dead before another one leads."""
@@ -197,7 +226,7 @@ class FailoverManager(Actor):
                 continue
             is_suspect = group.suspects.get(name) == life and group.life_of(name) == life
             if name in group.members and not group.is_well(name):
-                group.lost(name, "it is silent" if is_suspect else "its process has ended")
+                group.lost(name, group.doubts[name] if is_suspect else "its process has ended")
                 group.dropped.add(name)
                 found = True
             if is_suspect:

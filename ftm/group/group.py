@@ -36,7 +36,6 @@ from ...checkpoint.snapshot.snapshot_record import Meta, meta_now, put
 from ..bricks.background_work import Background
 from ..bricks.brick_messages import MOST_REQUESTS, Done, Ended, Inward, Outward, Request, Strayed, Work, WorkLost
 from .behind import Behind
-from .detector import Detection
 from .diverged import Strays
 from .hold import Hold
 from .hung import Stuck
@@ -46,6 +45,7 @@ from .transient_homes import forget_ended, is_unkept
 
 if TYPE_CHECKING:
     from ...checkpoint.home.switch import Switch
+    from ..model.detection import Detection
     from .reconfiguration import Reconfiguration
 
 MOST_BYTES = 1_000_000
@@ -93,6 +93,7 @@ class Group(Members):
         self.change: Reconfiguration | None = None  # that is being made
         self.gone_back: Reconfiguration | None = None  # done by a failover: what is left is to tidy up
         self.is_resting = False  # nothing new goes in: the mechanism is about to be changed
+        self.joins_early = False  # others join before the first one has handled anything
         self.is_changing = False  # the replicas change it: nobody else may tell them anything
         self.is_joining = False  # a replica is catching up
         self.is_poked = False

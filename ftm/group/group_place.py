@@ -33,8 +33,9 @@ from ...supervision.supervisor import Supervisor
 from ..bricks.brick_messages import Lead
 from ..bricks.replica_orders import Finish, Install, Setting
 from ..events import ReplicaLost
-from ..model.mechanism import NOTHING, compose
-from .detector import Detection, Detector
+from ..model.detection import Detection
+from ..model.mechanism import NOTHING, compose, detection_in, has_state_access
+from .detector import Detector
 from .failover import FailoverManager, why_ended
 from .group import Group, Look
 from .join import Joiner
@@ -101,8 +102,7 @@ class GroupPlace(Place):
     @property
     def detection(self) -> Detection:
         """How the replicas are watched: as the outermost mechanism says that says anything about it."""
-        said = (getattr(layer, "detection", None) for layer in self.layers)
-        return next((one for one in said if one is not None), Detection())
+        return detection_in(self.layers) or Detection()
 
     # -- beginning --------------------------------------------------------------------------------------------------
 
@@ -128,6 +128,10 @@ class GroupPlace(Place):
             group = await self.build(cell, switch)
             home.subscribe(cell, self.parent.topics(cell))
             await self.lead(group, switch)
+            start = cell.extra().start
+            if start is not None and not has_state_access(start.kind) and not switch.turns:
+                group.joins_early = True  # Nobody can be brought to what it has when it has handled something.
+                await self.protected(group)
             await home.replay(cell, group, entered)
             await self.protected(group)
         except BaseException as error:
@@ -215,10 +219,9 @@ class GroupPlace(Place):
     def _replica_start(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> Start[Any]:
         more = cell.extra()
         bindings = {port: target.path for port, target in more.bindings.items()}
-        interval, watch_turns = self.detection.interval, self.detection.watch_turns or 0.0
-        setting = Setting(
-            cell.path, name, config, self.home.method.data(), bindings, interval, watch_turns, more.claimed
-        )
+        usual, method = Detection(), self.home.method.data()
+        interval, watch_turns = usual.interval, usual.watch_turns or 0.0
+        setting = Setting(cell.path, name, config, method, bindings, interval, watch_turns, more.claimed)
         return self.replica(setting, self.parent.recipe(cell), tuple(layer.describe() for layer in layers))
 
     # -- other mechanisms -------------------------------------------------------------------------------------------

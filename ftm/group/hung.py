@@ -1,17 +1,17 @@
-"""Turns that do not end, though their process lives: they are tried once more, and then the message is put aside.
+"""Turns and bricks that do not end, though their process lives.
 
-Another replica tries; if there is none, the same one, from the state before.
-
+A turn is tried once more, and then its message is put aside. Another replica tries; if there is none, the same one,
+from the state before.
 Attempts are counted here, at the home's input, as deaths in the turn of a message are.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from ...actors.errors import HoldfastError
 from ...checkpoint.protocol import FAILED
-from ..bricks.replica_orders import EndTurn, Stalled
+from ..bricks.replica_orders import Computes, Doing, EndTurn, Stalled
 from ..events import TurnHung
 
 if TYPE_CHECKING:
@@ -24,6 +24,10 @@ MOST = 2
 """Attempts after which it is the message, and not who handles it."""
 ANSWERED_WITHIN = 5.0
 """Seconds after which a replica that was told to end a turn is told again."""
+STUCK_AFTER: Final = 5.0
+"""Seconds that the bricks have for what has come to them."""
+ASKED_WITHIN: Final = 2.0
+"""Seconds that a replica has, besides, to say how that went."""
 
 
 class Stuck:
@@ -92,3 +96,23 @@ class Stuck:
             return False
         self._group.switch.ends.quarantine(source)
         return True
+
+
+async def end_stuck(group: Group) -> str | None:
+    """Have a follower replaced whose bricks have let nothing pass, though its actor does nothing; its name.
+
+    Raises:
+        HoldfastError: one has not answered. If it has died, that is seen elsewhere; else it is asked once more.
+    """
+    for name in group.backups():
+        seconds, starved = STUCK_AFTER + group.at_work(name), group.starved(name)
+        life, order = group.members.get(name, 0), Computes(group.switch.turn, seconds)
+        doing: Doing = await group.protocol(name).ask(order, seconds + ASKED_WITHIN)
+        if doing.passes or doing.computes or name not in group.backups() or group.members.get(name) != life:
+            continue
+        if group.starved(name) - starved < seconds / 2:  # Else it was no fault of theirs.
+            why = f"its bricks have let nothing pass for {STUCK_AFTER:g} s"
+            group.at_fault(name, why)
+            group.suspect(name, life, why)
+            return name
+    return None

@@ -74,7 +74,13 @@ class Joiner(Actor):
             primary = group.primary
             if group.is_changing or group.is_resting or (group.change is not None and group.change.is_back):
                 return  # Whoever does that wakes us; until then it would come with the bricks that have failed.
-            if group.is_over or not group.is_live or primary is None or name == primary or name in group.members:
+            if (
+                group.is_over
+                or not (group.is_live or group.joins_early)
+                or primary is None
+                or name == primary
+                or name in group.members
+            ):
                 continue
             life = group.life_of(name)
             if not life or group.up.get(name) != life or group.suspects.get(name) == life or group.dropped:

@@ -22,7 +22,7 @@ from .securing import Securing
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
     from ...actors.process.worker_pool import Worker
-    from .detector import Detection
+    from ..model.detection import Detection
 
 
 FROM_OUTSIDE: Final = frozenset({1, 2, 3, 9, 15, 19, 20})
@@ -105,6 +105,7 @@ class Members(Securing):
         self.up: dict[str, int] = {}  # name to life, of those heard of
         self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
         self.suspects: dict[str, int] = {}  # name to life
+        self.doubts: dict[str, str] = {}  # name to why it was suspected last
         self.silences: dict[str, int] = {}  # name to life, of those suspected for their silence alone
         self.renewing: str | None = None  # the primary, if it is to lead anew, with other bricks
         self.suspected_at: dict[str, float] = {}  # on the loop's clock
@@ -206,7 +207,7 @@ class Members(Securing):
         self._suspect(name, life, why)
 
     def _suspect(self, name: str, life: int, why: str) -> None:
-        self.suspects[name] = life
+        self.suspects[name], self.doubts[name] = life, why
         self.suspected_at[name] = self.node.loop.time()
         if name in (self.primary, self.leading):
             self.why, self.noticed = why, time.monotonic()

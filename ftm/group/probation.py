@@ -15,6 +15,7 @@ from ..bricks.brick_messages import RequestDropped
 from ..bricks.replica_orders import Computes, Doing
 from ..events import MechanismSettled
 from ..model.mechanism import NOTHING
+from .hung import ASKED_WITHIN, STUCK_AFTER, end_stuck
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
@@ -30,15 +31,11 @@ TURNS: Final = 100
 """and until so many turns of theirs have ended,"""
 MOST_SECONDS: Final = 60.0
 """but no longer than this, as soon as nothing is in the bricks of which that is not known."""
-STUCK_AFTER: Final = 5.0
-"""Seconds for which a batch may be in the bricks while the protected actor does nothing."""
 LOOK_EVERY: Final = 1.0
 """Seconds between two looks at how it does."""
 LONGEST_PAUSE: Final = 60.0
 """Seconds until going back is tried again, if it could not be; doubled each time, from one second on."""
 DROPPED: Final = message_name(RequestDropped)
-ASKED_WITHIN: Final = 2.0
-"""Seconds that whoever leads has to say whether it is at work."""
 
 
 class Probation:
@@ -243,15 +240,8 @@ class Probation:
     async def _look_at_others(self, group: Group) -> None:
         """Nobody waits for the bricks of those that do not lead: it stays if they too have let pass what has come."""
         try:
-            for name in group.backups():
-                seconds = STUCK_AFTER + group.at_work(name)
-                life, order = group.members.get(name, 0), Computes(group.switch.turn, seconds)
-                doing: Doing = await group.protocol(name).ask(order, seconds + ASKED_WITHIN)
-                if not doing.passes and not doing.computes and name != group.primary and group.is_well(name):
-                    why = f"its bricks have let nothing pass for {STUCK_AFTER:g} s"
-                    group.at_fault(name, why)
-                    group.suspect(name, life, why)
-                    return
+            if await end_stuck(group) is not None:
+                return
         except HoldfastError:  # If it has died, that is seen elsewhere; else it is asked once more.
             return
         finally:

@@ -22,6 +22,7 @@ import msgspec
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.message import message_name
+from .detection import Detection
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -107,6 +108,9 @@ class Mechanism:
     """The first is that of the replica that leads, the second that of the others."""
     exchanged: ClassVar[dict[tuple[str, str], type[Brick]]] = {}
     """Bricks of this very instance that are others than its class says, by role and part (`with_brick`)."""
+
+    detection: Detection | None = dataclasses.field(default=None, kw_only=True)
+    """How its replicas are watched; None: as a mechanism inside says, or as usual."""
 
     def check(self, kind: type[Actor], where: str = "") -> None:
         """Whether it suits this class.
@@ -197,12 +201,17 @@ def find_class(code: Code) -> Any:
 
 def _plain(value: Any) -> Any:
     """A setting as it travels; a mechanism that has structs among its settings takes them back as dicts."""
-    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct) else value
+    return msgspec.to_builtins(value) if isinstance(value, msgspec.Struct | Detection) else value
 
 
 def has_state_access(kind: type[Actor]) -> bool:
     """Whether an actor's state can be saved, as far as its class says."""
     return bool(getattr(kind, "state_access", True))
+
+
+def detection_in(layers: Iterable[Mechanism]) -> Detection | None:
+    """How replicas are watched: as the outermost mechanism says that says anything about it."""
+    return next((layer.detection for layer in layers if layer.detection is not None), None)
 
 
 def compose(*layers: Mechanism | Iterable[Mechanism]) -> tuple[Mechanism, ...]:
@@ -217,6 +226,8 @@ def compose(*layers: Mechanism | Iterable[Mechanism]) -> tuple[Mechanism, ...]:
     for one in flat:
         if not isinstance(one, Mechanism):
             raise MechanismRefused("compose", f"takes mechanisms such as PBR(), not {one!r}")
+        if not isinstance(one.detection, Detection | None):
+            raise MechanismRefused(one.name, f"detection must be a Detection(...) or None, not {one.detection!r}")
     if not flat:
         raise MechanismRefused("compose", "takes at least one mechanism")
     return tuple(flat)
@@ -233,7 +244,10 @@ def revive(description: Description) -> Mechanism:
         kind = find_class(Code(name, description.file, description.sha256))
         if not (isinstance(kind, type) and issubclass(kind, Mechanism)):  # Whatever it is, it is not called.
             raise MechanismRefused(name, "it is no Mechanism")
-        made: Mechanism = kind(**description.settings)
+        settings, watched = description.settings, description.settings.get("detection")
+        if isinstance(watched, dict):
+            settings = {**settings, "detection": Detection(**watched)}
+        made: Mechanism = kind(**settings)
     except MechanismRefused:
         raise
     except Exception as error:  # Importing runs the file: anything may be raised.

@@ -11,6 +11,7 @@ from ...actors.kernel.message import Message
 from ...checkpoint.protocol import START
 from ..bricks.replica_orders import Beat, Stalled
 from ..bricks.sealed_frames import tell_over
+from ..model.mechanism import detection_in
 from .replica_life import ServerLife
 
 if TYPE_CHECKING:
@@ -35,19 +36,29 @@ class Heart(Actor):
     proxy: Binding[Actor]
 
     def __init__(self, standing: Standing, name: str, interval: float, watch_turns: float) -> None:
-        self._standing, self._name, self._interval, self._longest = standing, name, interval, watch_turns
+        self._standing, self._name, self._usual = standing, name, (interval, watch_turns)
+        self._interval, self._longest = self._usual
         self._turns: dict[Points, tuple[Turn, float]] = {}  # with the seconds that they have taken
         self._seen = 0.0
 
     def on_start(self, restored: bool) -> None:
         """Beat at once, then regularly."""
         if self._interval > 0:
+            self._take_pace()
+            self._timer = self.ctx.every(self._interval, Tick())
             self._beat(Tick())
-            self.ctx.every(self._interval, Tick())
+
+    def _take_pace(self) -> None:
+        said = detection_in(self._standing.layers)
+        self._interval, self._longest = self._usual if said is None else (said.interval, said.watch_turns or 0.0)
 
     @on(Tick)
     def _beat(self, message: Tick) -> None:
-        standing = self._standing
+        standing, before = self._standing, self._interval
+        self._take_pace()
+        if self._interval != before:  # A change of mechanism has said so.
+            self._timer.cancel()
+            self._timer = self.ctx.every(self._interval, Tick())
         try:
             self.detector.tell(Beat(self._name, standing.epoch))
             if self._longest:

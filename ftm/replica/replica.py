@@ -35,8 +35,8 @@ from ..bricks.request_protocol import InnerProtocol, RequestProtocol
 from ..bricks.sealed_frames import Opened, Refused
 from ..bricks.standing import Standing
 from ..bricks.state_transfer import Assume, Play
-from ..model.mechanism import Description, Mechanism, MechanismRefused, revive
-from .heartbeat import Heart
+from ..model.mechanism import Description, Mechanism, MechanismRefused, detection_in, revive
+from .heartbeat import Heart, Tick
 from .protected_actor import Server
 from .state_manager import StateManager
 
@@ -361,6 +361,8 @@ class Replica(Supervisor):
         standing.forget_bricks()
         self._bind_all(woven)
         self._pass_on(held)
+        if BEAT in self._children and detection_in(old.layers) != detection_in(woven.layers):
+            self._cell(BEAT).ref.tell(Tick())  # Now: the next beat as it was may be later than is waited for.
         if behind:
             self._obey(EndBricks(left), None)
         else:

@@ -17,6 +17,7 @@ from typing import Any, Final, NamedTuple
 from ...actors.errors import HoldfastError
 from ...checkpoint.journal import DamagedStore, Entry, Saved, StaleEpoch, StoreFailed
 from ...checkpoint.snapshot.shared_blocks import Segment
+from ...checkpoint.turn_word import blamed, is_at_work
 from .choices import DELAY, LEVELS, LOSS, Choices
 
 PATH: Final = "simulated"
@@ -110,7 +111,7 @@ class SimulatedDisk:
     Attributes:
         written: what whoever opens it next finds, unless the power is cut.
         epoch: of the newest opening.
-        words: by address: 1 + the input in hand, or 0.
+        words: by address: which input is in hand.
     """
 
     def __init__(self) -> None:
@@ -174,11 +175,12 @@ class Hands:
     """Which inputs are in hand, in words that outlive the root."""
 
     def __init__(self, words: dict[str, array[int]]) -> None:
-        self._begun = {address: word[0] - 1 for address, word in words.items()}
+        one_worked = any(is_at_work(word[0]) for word in words.values())
+        self._begun = {address: blamed(word[0], one_works=one_worked) for address, word in words.items()}
         self._words = words
 
     def begun(self, address: str) -> int:
-        """The input that was in hand when the store was opened; -1: none."""
+        """See `InHand`."""
         return self._begun.get(address, -1)
 
     def word(self, address: str) -> memoryview:

@@ -24,6 +24,8 @@ def load(path: str) -> Any:
 async def main(code: str, store: str, what: str) -> None:
     module = load(code)
     async with hf.ActorSystem("app", store=f"sqlite:{store}", log=False) as system:
+        for name, kind in getattr(module, "PLAIN", {}).items():
+            await system.start(hf.child(name, hf.start(kind)))
         actor = await system.start(hf.child("a", hf.start(module.A), recovery=hf.hybrid(interval=1000.0)))
         if what != "read":
             for number in range(1, 6):

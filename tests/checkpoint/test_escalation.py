@@ -256,3 +256,18 @@ async def test_a_child_is_started_with_an_older_snapshot_by_hand(store: str | No
                 event = await back(stream, hf.RolledBack)
         assert await seen(system) == ["a", "b"], "it was saved when it was stopped, and before"
         assert event.from_turn > event.to_turn > 0
+
+
+async def test_without_an_older_snapshot_nothing_is_started_by_hand(store: str | None, isolation: str) -> None:
+    """Wherever its supervisor is, whoever has asked is told; a child that ran goes on as it was."""
+    async with running(store) as system:
+        await system.start(tree(isolation, doing(isolation), doing(isolation, "new")))
+        await add(system, "a")
+        with pytest.raises(hf.ControlFailed, match="there is no older snapshot"):
+            await top(system).ask(hf.RestartChild("doer", older=True, running=True), timeout=20.0)
+        assert await seen(system) == ["a"]
+        await top(system).ask(hf.TerminateChild("new"), timeout=20.0)
+        with pytest.raises(hf.ControlFailed, match="there is no older snapshot"):
+            await top(system).ask(hf.RestartChild("new", older=True), timeout=20.0)
+        counted = await top(system).ask(hf.CountChildren())
+        assert (counted.specs, counted.active) == (2, 1), "it stays stopped"

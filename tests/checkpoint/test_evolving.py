@@ -120,6 +120,90 @@ def test_code_that_was_rolled_back_is_refused_what_it_would_drop(tmp_path: Path)
     assert run(tmp_path, added, "read").stdout == WHOLE
 
 
+ASKING = """
+import holdfast as hf
+
+
+class Pair(hf.Message):
+    n: int
+    b: int = 7
+
+
+class No(hf.Refusal):
+    m: int
+    c: int = 7
+
+
+class Add(hf.Message[int]):
+    n: int
+    b: int = 7
+
+
+class Ask(hf.Message[list[Pair]]):
+    n: int
+
+
+class Get(hf.Message[list[int]]): ...
+
+
+class Teller(hf.Actor):
+    @hf.on(Ask)
+    def tell(self, message: Ask) -> list[Pair]:
+        if message.n % 2:
+            raise No(message.n, 7)
+        return [Pair(message.n, 7)]
+
+
+class A(hf.Actor):
+    def __init__(self) -> None:
+        self.xs: list[int] = []
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> int:
+        try:
+            (pair,) = await self.ctx.find("/app/teller", Teller).ask(Ask(message.n))
+            self.xs.append(pair.n * 100 + pair.b)
+        except No as no:
+            self.xs.append(no.m * 100 + no.c)
+        return len(self.xs)
+
+    @hf.on(Get, readonly=True)
+    def read(self, message: Get) -> list[int]:
+        return self.xs
+
+
+PLAIN = {"teller": Teller}
+"""
+OUTCOMES = {
+    "swapped in the reply": (
+        "    n: int\n    b: int = 7\n\n\nclass No",
+        "    b: int\n    n: int = 7\n\n\nclass No",
+        "(n, b), now they are (b, n)",
+    ),
+    "swapped in the refusal": (
+        "    m: int\n    c: int = 7\n",
+        "    c: int\n    m: int = 7\n",
+        "(m, c), now they are (c, m)",
+    ),
+    "added": ("    c: int = 7\n", "    c: int = 7\n    why: str = ''\n", ""),
+}
+
+
+@pytest.mark.parametrize("what", ["killed", "saved", "stopped"])
+@pytest.mark.parametrize("change", OUTCOMES)
+def test_replies_and_refusals_in_the_journal_are_not_misread(tmp_path: Path, change: str, what: str) -> None:
+    assert run(tmp_path, ASKING, what).returncode == (0 if what == "stopped" else -9)
+    old, new, problem = OUTCOMES[change]
+    code = ASKING.replace(old, new)
+    assert code != ASKING
+    done = run(tmp_path, code, "read")
+    if problem and what != "stopped":
+        assert (done.returncode, done.stdout) == (1, "")
+        assert problem in done.stderr
+        done = run(tmp_path, ASKING, "read")
+    assert (done.stdout, done.stderr) == (WHOLE, "")
+
+
 class Add(hf.Message[int]):
     n: int = 1
 

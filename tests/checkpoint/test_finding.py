@@ -125,3 +125,43 @@ async def test_a_binding_that_was_changed_below_a_process_is_known_to_a_replay(w
             ["told 1", "asked 1", *(["told 3", "asked 3"] if last is one else [])],
             ["told 2", "asked 2", *(["told 3", "asked 3"] if last is two else [])],
         ]
+
+
+class Outgoing(hf.Actor):
+    out: hf.Binding[Sink]
+
+    def __init__(self) -> None:
+        self.told = 0
+
+    @hf.on(Note)
+    def note(self, message: Note) -> int:
+        self.out.tell(message)
+        self.told += 1
+        return self.told
+
+
+@pytest.mark.parametrize("saved", [False, True])
+async def test_a_binding_that_the_program_has_changed_is_met_by_no_turn_before(tmp_path: Path, saved: bool) -> None:
+    """A limit: a turn that is handled again would tell somebody else. Behind a snapshot none is."""
+    store = f"sqlite:{tmp_path / 'app.db'}"
+
+    async def begun(system: hf.ActorSystem, to: str) -> hf.ActorRef[Outgoing]:
+        for name in ("first", "second"):
+            await system.start(hf.child(name, hf.start(Sink)))
+        recovery = hf.hybrid(interval=1000.0)
+        return await system.start(hf.child("bound", hf.start(Outgoing), recovery=recovery, bindings={"out": to}))
+
+    async with running(store) as system:
+        ref = await begun(system, "/app/first")
+        assert await ref.ask(Note("one")) == 1
+        if saved:
+            await system.checkpoint(ref)
+        system.homes.journal.close()  # As if it had been killed: no snapshot at its end.
+    async with running(store) as system:
+        if not saved:
+            with pytest.raises(hf.StartFailed, match="replay"):
+                await begun(system, "/app/second")
+            return
+        ref = await begun(system, "/app/second")
+        assert await ref.ask(Note("two")) == 2
+        assert await system.ref("/app/second", Sink).ask(Notes()) == ["two"]

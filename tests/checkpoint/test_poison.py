@@ -56,3 +56,32 @@ def test_a_root_that_is_killed_between_turns_blames_nobody(tmp_path: Path) -> No
     for what, code, out in (("kill", -9, ""), ("kill", -9, ""), ("kill", -9, ""), ("end", 0, "8 0\n")):
         done = subprocess.run([sys.executable, "-c", script, str(store), what], capture_output=True, text=True, env=env)
         assert (done.returncode, done.stdout) == (code, out), done.stderr
+
+
+def test_a_turn_that_only_waits_when_another_kills_the_root_is_not_blamed(tmp_path: Path) -> None:
+    """The next root knows who was at work."""
+    script = (
+        "import asyncio, os, sys, holdfast as hf\n"
+        "from pathlib import Path\n"
+        "from tests.checkpoint.players import *\n"
+        "async def main():\n"
+        "    async with hf.ActorSystem('app', store=f'sqlite:{sys.argv[1]}/app.db', log=False) as system:\n"
+        "        recovery = hf.hybrid(interval=1000.0, max_deliveries=2)\n"
+        "        specs = [hf.child(name, hf.start(Doer), recovery=recovery) for name in ('one', 'two')]\n"
+        "        one, two = [await system.start(spec) for spec in specs]\n"
+        "        begun, what = Path(sys.argv[1], 'gate'), sys.argv[2]\n"
+        "        if what == '0': await two.send(Do([f'gate {begun}', 'add through']))\n"
+        "        if what == 'end': Path(f'{begun}.open').touch()\n"
+        "        else:\n"
+        "            await until(begun.exists)\n"
+        "            begun.unlink()\n"
+        "            await one.ask(Do([f'once {sys.argv[1]}/fuse{what}']), timeout=60.0)\n"
+        "        print(await two.ask(Seen(), timeout=60.0), len(system.quarantined()))\n"
+        "asyncio.run(main())\n"
+    )
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([PATHS, str(Path(__file__).parents[2])])}
+    for what in ("0", "1", "2", "3", "end"):
+        command = [sys.executable, "-c", script, str(tmp_path), what]
+        done = subprocess.run(command, capture_output=True, text=True, env=env)
+        expected = (0, "['through'] 0\n") if what == "end" else (-9, "")
+        assert (done.returncode, done.stdout) == expected, done.stderr

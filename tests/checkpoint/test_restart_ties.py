@@ -32,10 +32,11 @@ def test_what_was_watched_before_the_root_died_is_watched_after(tmp_path: Path, 
     assert second.returncode == 0, second.stderr
     assert sorted(json.loads(second.stdout)) == [
         "DOWN /app/monitored False",
+        "DOWN /app/monitored False",
         "DOWN /app/watched False",
         "EXIT /app/linked",
     ]
     third = run(store, order, saved, "second") if saved == "saved" else None
     if third is not None:  # They were told: nothing of it is tied any more.
         assert third.returncode == 0, third.stderr
-        assert len(json.loads(third.stdout)) == 3
+        assert len(json.loads(third.stdout)) == 4

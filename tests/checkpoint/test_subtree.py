@@ -136,6 +136,54 @@ async def test_a_message_that_kills_the_process_is_quarantined_and_its_neighbour
     assert await two.ask(Note("after"), timeout=30.0) == 2
 
 
+async def test_a_turn_that_only_waits_when_a_sibling_ends_the_process_is_not_blamed(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """However often it is in hand: who was at work is told apart from who waits."""
+    await system.start(team())
+    one, two = at(system, "one"), at(system, "two")
+    begun = tmp_path / "gate"
+    waiting = two.ask(Do([f"gate {begun}", "add through"]), timeout=60.0)
+    for death in range(7):
+        await until(begun.exists)
+        begun.unlink()
+        assert await one.ask(Do([f"once {tmp_path}/fuse{death}", f"add {death}"]), timeout=30.0) == str(death + 1)
+    Path(f"{begun}.open").touch()
+    assert await waiting == "1"
+    assert system.quarantined() == []
+
+
+async def test_turns_that_wait_are_blamed_if_nobody_was_at_work(system: hf.ActorSystem, tmp_path: Path) -> None:
+    """What they wait for may be what has ended the process: a thread, or memory."""
+    await system.start(team())
+    two, begun = at(system, "two"), tmp_path / "gate"
+    waiting = asyncio.ensure_future(two.ask(Do([f"gate {begun}"]), timeout=60.0))
+    while True:  # Five times, and once more if it hits another in the middle of its start.
+        await until(lambda: begun.exists() or waiting.done())
+        if waiting.done():
+            break
+        begun.unlink()
+        kill_process(system)
+    with pytest.raises(hf.Quarantined):
+        await waiting
+
+
+async def test_turns_that_wait_are_blamed_for_what_a_sibling_without_recovery_does(
+    system: hf.ActorSystem, tmp_path: Path
+) -> None:
+    """A limit: of an actor that has no home nobody knows whether it was at work."""
+    children = [hf.child("one", hf.start(Doer)), hf.child("two", hf.start(Doer), recovery=hf.hybrid(interval=NEVER))]
+    await system.start(hf.supervisor("team", isolation="process", intensity=1000, children=children))
+    two, begun = at(system, "two"), tmp_path / "gate"
+    waiting = two.ask(Do([f"gate {begun}"]), timeout=60.0)
+    for death in range(5):
+        await until(begun.exists)
+        begun.unlink()
+        at(system, "one").tell(Do([f"once {tmp_path}/fuse{death}"]))
+    with pytest.raises(hf.Quarantined):
+        await waiting
+
+
 async def test_the_subtree_stopped_and_started_again_has_its_state(system: hf.ActorSystem) -> None:
     await system.start(team())
     await at(system, "inner/deep").ask(Note("kept"))

@@ -47,6 +47,8 @@ class Watcher(hf.Actor):
     def tie(self, message: Tie) -> int:
         monitored, watched, linked, untied = message.others
         self.ctx.monitor(monitored)
+        self.ctx.monitor(monitored)  # Each has a DOWN of its own.
+        self.ctx.monitor(monitored).cancel()
         self.ctx.watch(watched)
         self.ctx.link(linked)
         self.ctx.monitor(untied).cancel()
@@ -88,7 +90,7 @@ async def main(store: str, order: str, saved: str, life: str) -> None:
         for other in others:
             other.tell(Crash())
         told: list[str] = []
-        while len(told) < 3:
+        while len(told) < 4:
             told = await watcher.ask(Told())
         await system.node.settled()
         print(json.dumps(await watcher.ask(Told())))

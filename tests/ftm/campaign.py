@@ -23,8 +23,8 @@ from holdfast.ftm.alarms import Diverged, Masked, Objected, Outvoted, Protection
 from holdfast.ftm.bricks.sealed_frames import FrameRefused
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group import group_place
-from holdfast.ftm.group.detector import Detection
 from holdfast.ftm.group.group import Group, Look
+from holdfast.ftm.model.detection import Detection
 from holdfast.ftm.model.mechanism import Mechanism
 from tests.ftm.faults import FRAMES, KINDS, LATE, VALUES, claims
 from tests.ftm.injection import READ, REQUEST, Fault, Page, recipe, unwrap, wrap_root

@@ -20,7 +20,7 @@ from holdfast.ftm.bricks.brick_messages import Work
 from holdfast.ftm.bricks.bricks import Before
 from holdfast.ftm.bricks.replica_orders import Computes
 from holdfast.ftm.events import MechanismSettled
-from holdfast.ftm.group import probation
+from holdfast.ftm.group import failover, hung, probation
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import Add, Counter, Load, Tags
@@ -306,3 +306,24 @@ async def test_a_change_right_after_one_was_taken_back_is_made(system: hf.ActorS
         change.transition(ref, LFR())
     assert stack(ref) == ("lfr",)
     assert await answer == 1
+
+
+@pytest.mark.parametrize(
+    "stack", [(Wrong("hang", "peer", "before", "other"), PBR()), (Wrong("hang", "message", "before", "other"), LFR())]
+)
+async def test_bricks_that_hang_in_a_replica_that_does_not_lead_are_found_without_probation_too(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, stack: tuple[Any, ...]
+) -> None:
+    """Else whoever leads would wait for ever, or nobody could take over."""
+    monkeypatch.setattr(hung, "STUCK_AFTER", 0.5)
+    monkeypatch.setattr(failover, "INSPECT_EVERY", 0.2)
+    with system.events() as events:
+        ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=stack))
+        await two_again(ref)
+        assert await ref.ask(Add(1), timeout=60) == 1
+        async with asyncio.timeout(20):
+            async for event in events:
+                if isinstance(event, hf.ReplicaLost) and "let nothing pass" in event.why:
+                    assert event.replica == "r2"
+                    break
+        assert await ref.ask(Add(2), timeout=60) == 2

@@ -18,10 +18,11 @@ import holdfast as hf
 from holdfast.actors.kernel.actor import Start
 from holdfast.actors.observer_clock import OwnClock
 from holdfast.ftm.bricks.replica_orders import Beat
-from holdfast.ftm.group.detector import HIGHEST, Accrual, Detection, Detector
+from holdfast.ftm.group.detector import HIGHEST, Accrual, Detector
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tmr import TMR
 from holdfast.ftm.mechanisms.tr import TR
+from holdfast.ftm.model.detection import Detection
 from tests.ftm.accounts import Add, Counter
 from tests.ftm.test_failover import group_of, pid_of, two_again
 
@@ -298,24 +299,19 @@ async def test_a_replica_that_goes_through_a_large_state_is_not_suspected(system
     assert (group.wrong, group.failovers, group.members) == (0, 0, {"r1": 1, "r2": 1})
 
 
-class QuickTR(TR):
-    detection = Detection(pause=0.1)
-
-
-class QuickPBR(PBR):
-    detection = Detection(pause=0.2)
+QUICK, QUICKER = Detection(pause=0.2), Detection(pause=0.1)
 
 
 @pytest.mark.asyncio(loop_factories=["uvloop"])
 async def test_the_outermost_mechanism_that_says_how_is_heard() -> None:
     """Also one that another stands around, and one that has come later."""
     async with hf.ActorSystem("app", log=False) as system:
-        ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=QuickTR()))
+        ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=TR(detection=QUICKER)))
         host: Any = ref._cell.host.place
-        assert host.group.detection == QuickTR.detection
+        assert host.group.detection == QUICKER
         for layers, said in (
-            ((QuickPBR(), QuickTR()), QuickPBR.detection),
-            ((PBR(), QuickTR()), QuickTR.detection),
+            ((PBR(detection=QUICK), TR(detection=QUICKER)), QUICK),
+            ((PBR(), TR(detection=QUICKER)), QUICKER),
             ((PBR(), TR()), Detection()),
         ):
             async with system.transaction(timeout=30) as change:
@@ -356,3 +352,24 @@ async def changed(system: hf.ActorSystem, ref: hf.ActorRef[Counter], mechanism: 
         change.transition(ref, mechanism)
     await two_again(ref)
     return group_of(ref).names
+
+
+def test_what_is_no_detection_is_refused() -> None:
+    with pytest.raises(hf.MechanismRefused, match="detection must be a Detection"):
+        hf.compose(PBR(detection=0.1))  # type: ignore[arg-type]
+
+
+def test_another_interval_is_not_judged_by_the_heartbeats_before() -> None:
+    accrual = beating(0.5)
+    accrual.watch_as(Detection(interval=0.05, pause=0.2))
+    assert accrual.is_suspect(accrual.last + 0.5)
+    accrual.watch_as(Detection(interval=2.0, pause=0.2))
+    assert not accrual.is_suspect(accrual.last + 2.0)
+
+
+def beating(interval: float) -> Accrual:
+    """A replica that has beaten regularly."""
+    accrual = Accrual(Detection(interval=interval), 0.0)
+    for beat in range(1, 50):
+        accrual.heard(beat * interval)
+    return accrual

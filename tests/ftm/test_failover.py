@@ -15,12 +15,14 @@ import holdfast as hf
 from holdfast.ftm.events import FailedOver, ReplicaJoined, WrongSuspicion
 from holdfast.ftm.group.group import Group
 from holdfast.ftm.group.group_place import GroupPlace
+from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import (
     Account,
     Add,
     Bank,
     Boom,
+    Closed,
     Counter,
     Die,
     Leave,
@@ -481,3 +483,11 @@ async def test_with_a_store_a_protected_actor_comes_back_after_a_restart_of_the_
         ref = await started(system, recovery=hf.hybrid(interval=0.05))
         assert await ref.ask(Tags()) == list(range(21))
         assert await ref.ask(Add(21)) == 22
+
+
+async def test_without_state_access_a_follower_is_there_before_the_first_request(system: hf.ActorSystem) -> None:
+    """Later nobody could be brought to what the leader has."""
+    ref = await system.start(hf.child("alice", hf.start(Closed), mechanism=LFR()))
+    assert await ref.ask(Add(1), timeout=60) == 1
+    os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
+    assert await ref.ask(Add(2), timeout=60) == 2

@@ -134,23 +134,39 @@ async def test_who_has_ended_for_good_does_not_come_back(store: str | None, isol
         assert await ids(system) == ["cleo"]
 
 
-async def test_a_made_up_id_is_not_given_twice_for_whoever_had_it_is_recorded(
-    store: str | None, isolation: Any
-) -> None:
+async def test_who_has_ended_is_restored_by_its_name_if_it_was_given_one(store: str | None, isolation: Any) -> None:
     async with running(store) as system:
         top = await system.start(school(PUPIL, isolation=isolation))
-        bob = await top.ask(hf.StartChild(args=("Bob",)))
+        bob = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
         await bob.ask(Note("secret"))
-        await top.ask(hf.TerminateChild("pupil-1"))
+        await top.ask(hf.TerminateChild("bob"))
         await restarted(system)
-        ann = await top.ask(hf.StartChild(args=("Ann",)))
-        assert await ann.ask(Seen()) == ["Ann of nowhere"]
-        assert ann.path == "/app/school/pupil-2"
-        again = await top.ask(hf.StartChild(args=("Bob",), id="pupil-1"))
-        assert await again.ask(Seen()) == ["Bob of nowhere", "secret"], "asked for by name, it is restored"
-        await top.ask(hf.TerminateChild("pupil-1"))
-        anew = await top.ask(hf.StartChild(args=("Bob",), id="pupil-1", fresh=True))
+        again = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
+        assert await again.ask(Seen()) == ["Bob of nowhere", "secret"]
+        await top.ask(hf.TerminateChild("bob"))
+        anew = await top.ask(hf.StartChild(args=("Bob",), id="bob", fresh=True))
         assert await anew.ask(Seen()) == ["Bob of nowhere"]
+
+
+@pytest.mark.parametrize("template", [PUPIL, None])
+async def test_nothing_stays_of_one_with_a_made_up_id_that_has_ended_for_good(
+    store: str | None, isolation: Any, template: hf.ChildSpec | None
+) -> None:
+    async with running(store) as system:
+        top = await system.start(school(template, isolation=isolation))
+        how = [hf.StartChild(PUPIL if template is None else None, args=()) for _ in range(3)]
+        one, two, three = [await top.ask(start) for start in how]
+        for pupil in (one, two, three):
+            await pupil.ask(Note("secret"))
+        await restarted(system)
+        assert await two.ask(Seen()) == ["nobody of nowhere", "secret"]
+        await top.ask(hf.TerminateChild(one.path.rpartition("/")[2]))
+        await system.stop(three)
+        await until(lambda: system.homes.known("/app/school") == [two.path])
+        await restarted(system)
+        assert [f"/app/school/{name}" for name in await ids(system)] == [two.path]
+        new = await top.ask(how[0])
+        assert await new.ask(Seen()) == ["nobody of nowhere"], "it is nobody else"
 
 
 async def test_what_was_recorded_of_one_that_has_ended_can_be_erased(store: str | None, isolation: Any) -> None:

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable
 from time import monotonic
 from typing import TYPE_CHECKING, Any, cast
 
+import msgspec
+
 from ...errors import AskDeadlock, BadMessage, HoldfastError, type_name
 from ...exit_reasons import ExitReason, pack_exit, unpack_exit
 from ...kernel import links
@@ -108,6 +110,14 @@ class Peer:
         """A number for the other side to answer under, and the future of its answer."""
         accepted: asyncio.Future[None] = self.node.loop.create_future()
         return self.expect(Ask(_ACCEPTANCE, None, (), math.inf, math.inf, accepted)), accepted
+
+    def accepted(self, key: int, error: HoldfastError | None) -> None:
+        """Answer what the other side has sent under a number of its `acceptance`."""
+        if error is None:
+            self.connection.send(frames.Reply(key, NIL))
+        else:
+            kind, name, body = self.codec.encode_error(error)
+            self.connection.send(frames.Failure(key, kind, name, Raw(body)))
 
     def expect(self, ask: Ask) -> int:
         """A number under which the other side shall answer this."""
@@ -243,6 +253,8 @@ def no_records(path: str) -> frames.TakeRecord:
     """Nobody is recovered over this connection."""
     raise BadFrame(f"a record for {path}, which is not recovered")
 
+
+NIL = Raw(msgspec.msgpack.encode(None))
 
 SAME_CLOCK = 60.0
 """Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""

@@ -7,18 +7,13 @@ import functools
 from collections.abc import Awaitable, Iterable
 from typing import TYPE_CHECKING
 
-import msgspec
-
 from ...errors import HoldfastError
-from ...kernel.codec import Parcel, Raw
+from ...kernel.codec import Parcel
 from ...kernel.envelope import Envelope
-from . import frames
 
 if TYPE_CHECKING:
     from ...kernel.cell import Cell
     from .peer import Peer
-
-NIL = msgspec.msgpack.encode(None)
 
 
 class Offered:
@@ -70,13 +65,11 @@ class Offered:
     def _over(self, cell: Cell | None, error: HoldfastError | None) -> None:
         """One receiver has it, or will not."""
         self._left -= 1
-        connection = self._peer.connection
         if error is not None and cell is not None:
             if self._topic is None:
-                kind, name, body = self._peer.codec.encode_error(error)
-                connection.send(frames.Failure(self._id, kind, name, Raw(body)))
+                self._peer.accepted(self._id, error)
                 self._left = -1  # Answered.
                 return
             self._peer.node.not_taken(cell, self._parcel, error)
-        if self._left == 0 and connection.is_open:
-            connection.send(frames.Reply(self._id, Raw(NIL)))
+        if self._left == 0 and self._peer.connection.is_open:
+            self._peer.accepted(self._id, None)

@@ -323,6 +323,8 @@ def _keep(gate: Gate, to: str, frame: frames.Command) -> None:
     period = frame.data.get("period", 0.0)
     if not isinstance(period, (int, float)) or not math.isfinite(period):
         raise BadFrame(f"a period of {period!r}")
+    if type(frame.data.get("answer", 0)) is not int:
+        raise BadFrame(f"an answer under {frame.data['answer']!r}")
 
 
 def _order(gate: Gate, to: str, frame: frames.Command) -> None:
