@@ -172,9 +172,14 @@ class Over(msgspec.Struct, array_like=True, tag=9):
 
 
 class Respec(msgspec.Struct, array_like=True, tag=10):
-    """The child has other mechanisms from now on, also in its next lives: layers as data, none if there are none."""
+    """The child has other mechanisms from now on, also in its next lives: layers as data, none if there are none.
+
+    `isolation` and `limits`: where it lives without a mechanism.
+    """
 
     layers: list[Any]
+    isolation: str = "task"
+    limits: dict[str, Any] = {}
 
 
 ToLife = Feed | Outcome | Go | SnapshotNow | Restore | Begin | Started | Kept | Over | Respec
@@ -272,15 +277,19 @@ class Unsaved(msgspec.Struct, array_like=True, tag=16):
     problem: str
 
 
-class Protected(msgspec.Struct, array_like=True):
-    """What a wanted child that a mechanism protects is made of: its recipe, and the layers as data."""
+class AtRoot(msgspec.Struct, array_like=True):
+    """What a wanted child is made of that is lived at the root: its recipe, and the layers of its mechanisms as data.
+
+    Without layers it has a process of its own, with these limits.
+    """
 
     recipe: bytes
     layers: list[Any]
+    limits: dict[str, Any] = {}
 
 
 class Wanted(msgspec.Struct, array_like=True, tag=17):
-    """A supervisor in another process wants to start a recorded or protected child, whose home is at the root.
+    """A supervisor in another process wants to start a child whose home is at the root, or that is lived there.
 
     `bindings` says where those of the child lead, port to address.
     """
@@ -290,7 +299,7 @@ class Wanted(msgspec.Struct, array_like=True, tag=17):
     topics: list[str]
     method: Method
     bound: Bounded | None
-    protected: Protected | None = None
+    at_root: AtRoot | None = None
     bindings: dict[str, str] = {}
 
 

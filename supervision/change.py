@@ -94,20 +94,23 @@ def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> d
 
 
 def check_place(where: str, specs: Iterable[ChildSpec], node: Node) -> None:
-    """Whether children can live where this supervisor lives.
-
-    Raises:
-        SpecError: an actor process cannot have processes of its own.
-    """
+    """Whether children can be below a supervisor that lives here. Raises SpecError: see `check_subtree`."""
     if node.uplink is not None:
         check_subtree(where, specs)
 
 
 def check_subtree(where: str, specs: Iterable[ChildSpec]) -> None:
-    """Whether specs, and what is below them, can live in one process other than the root."""
+    """Whether specs, and what is below them, can be below a supervisor with a process of its own.
+
+    An actor there may have one too; the root has it, and the supervisor decides on it. A supervisor may not.
+
+    Raises:
+        SpecError: one of them cannot.
+    """
     for spec in everything(specs):
-        if spec.isolation == "process":
-            raise SpecError(where, "a subtree in a process cannot hold process children: its own is theirs")
+        if spec.isolation == "process" and spec.is_supervisor:
+            why = "cannot hold another supervisor with a process of its own: give the actors below it theirs"
+            raise SpecError(where, f"a subtree in a process {why}")
 
 
 def everything(specs: Iterable[ChildSpec]) -> Iterator[ChildSpec]:

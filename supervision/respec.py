@@ -27,7 +27,7 @@ def respec(cell: Cell, start: Start[Any]) -> None:
 
 def replace_place(cell: Cell, spec: ChildSpec) -> None:
     """The next lives at `cell` are lived where `spec` says, also those under supervisors that are started anew."""
-    if cell.spec is not None and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
+    if isinstance(cell.spec, ChildSpec) and cell.spec.start is not spec.start:  # Its code was replaced meanwhile.
         spec = dataclasses.replace(spec, start=cell.spec.start)
     _change(cell, spec, lambda known: dataclasses.replace(known, isolation=spec.isolation, limits=spec.limits))
 

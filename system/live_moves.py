@@ -92,8 +92,10 @@ class Moves:
         async with self.lock(cell):
             origin = place_of(cell)
             spec = _spec_there(cell, isolation, limits)
+            place = cell.host.place
             if spec.mechanism is not None:  # Its replicas have processes: it lives there when nobody protects it.
                 replace_place(cell, spec)
+                cell.host.parent.respecified(cell, place.spec_data(cell))
                 return
             if origin == isolation:
                 return
@@ -129,11 +131,11 @@ class Moves:
         from ..ftm.migration.protection import into_group
 
         before = _spec_of(cell)
-        wanted = dataclasses.replace(before, mechanism=mechanism)
 
         def moved() -> None:
-            replace_mechanism(cell, wanted)
+            replace_mechanism(cell, dataclasses.replace(_spec_of(cell), mechanism=mechanism))
             assert isinstance(cell.host.place, GroupPlace)
+            cell.host.parent.respecified(cell, cell.host.place.spec_data(cell))
             probation = cell.host.place.probation
             if probation is not None:
                 probation.detach = lambda: self.unprotect(cell, timeout)
@@ -180,11 +182,17 @@ class Moves:
             isolation="task" if is_by_way_of_a_task else before.isolation,
             limits=None if is_by_way_of_a_task else before.limits,
         )
+
+        def moved() -> None:
+            replace_mechanism(cell, wanted)
+            if isinstance(cell.host.place, WorkerPlace):
+                cell.host.parent.respecified(cell, cell.host.place.spec_data(cell))
+
         move = await self._moved(
             cell,
             timeout,
             lambda: out_of_group(cell, self._entering(self._node.host_for(wanted), wanted.limits), timeout),
-            lambda: replace_mechanism(cell, wanted),
+            moved,
             gate,
         )
         if self._node.watched:
@@ -215,8 +223,6 @@ class Moves:
         from ..ftm.group.group_place import GroupPlace
         from ..ftm.group.reconfiguration import CannotAdapt
 
-        before: ChildSpec = cell.spec
-        wanted = dataclasses.replace(before, mechanism=mechanism)
         end = self._node.loop.time() + timeout
         while True:
             if not cell.host.is_up(cell):
@@ -227,7 +233,7 @@ class Moves:
             old, life = place.layers, cell.life
 
             def switched(place: GroupPlace = place) -> None:
-                replace_mechanism(cell, wanted)
+                replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=mechanism))
                 begun(place.probation)
 
             try:
@@ -294,6 +300,11 @@ class Moves:
 
     def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
         """The move that brings the actor to where its spec says."""
+        parent = cell.host.parent
+        if isinstance(parent, FarParent):
+            from ..ftm.migration.subtree_moves import move_below
+
+            return move_below(cell, parent, spec, timeout)
         return Move(cell, leaving(cell), self._entering(self._node.host_for(spec), spec.limits), timeout)
 
     @staticmethod
@@ -348,19 +359,14 @@ def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> Chil
     Raises:
         CannotMove: it cannot.
     """
-    spec, kind = cell.spec, cell_kind(cell)
+    spec, kind = _spec_of(cell), cell_kind(cell)
     if kind is not None and issubclass(kind, Supervisor):
         raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
-    if not _is_here(cell):
-        raise CannotMove(cell.path, "its supervisor lives in another process, which cannot have processes of its own")
-    if not isinstance(spec, ChildSpec):
-        raise CannotMove(cell.path, "nobody restarts it, so nobody knows how; start it as a child of a supervisor")
+    is_recorded = isinstance(cell.host.home, JournalHome)
+    if isinstance(cell.host, OutsideHost) or (isinstance(cell.host.parent, FarParent) and not is_recorded):
+        why = "its supervisor lives in another process, and it has no recovery: say its `isolation` in the spec"
+        raise CannotMove(cell.path, why)
     try:
         return dataclasses.replace(spec, isolation=isolation, limits=limits if limits is not None else spec.limits)
     except SpecError as error:
         raise CannotMove(cell.path, str(error)) from error
-
-
-def _is_here(cell: Cell) -> bool:
-    """Whether it is this process that begins the lives of an actor."""
-    return not isinstance(cell.host, OutsideHost) and not isinstance(cell.host.parent, FarParent)

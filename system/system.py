@@ -16,7 +16,7 @@ from ..actors.exit_reasons import SHUTDOWN, ExitReason, pack_exit
 from ..actors.kernel import lifecycle
 from ..actors.kernel.actor import Actor, Start
 from ..actors.kernel.address_host import AddressHost
-from ..actors.kernel.cell import Cell
+from ..actors.kernel.cell import Cell, Host
 from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
@@ -286,16 +286,16 @@ class ActorSystem(Recorded, Controls):
         method = recovery if recovery is not None and recovery.records else None
         return protected_host(self._homes, method, spec.mechanism)
 
-    def _lives_at_root(self, parent: FarParent, cell: Cell, wanted: Wanted, before: AddressHost | None) -> AddressHost:
-        """The host of a protected child whose supervisor is in another process.
+    def _lives_at_root(self, parent: FarParent, cell: Cell, wanted: Wanted, before: Host) -> AddressHost:
+        """The host of a child that is lived at the root, and whose supervisor is in another process.
 
         Raises:
             MechanismRefused: its mechanisms cannot be had here, or do not go together.
         """
-        from ..ftm.migration.subtree_groups import group_below
+        from ..ftm.migration.subtree_groups import life_at_root
         from ..ftm.model.mechanism import COMMON
 
-        group = group_below(parent, cell, wanted, before)
+        group = life_at_root(parent, cell, wanted, before)
         for name in (REPLICA, *COMMON):
             self._workers.want(name)
         return group

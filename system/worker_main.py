@@ -33,9 +33,9 @@ def prepare(host: worker_node.Guest) -> None:
 
 def host_for(host: worker_node.Guest, spec: Any) -> AddressHost:
     """Where a child below this process's supervisor is lived."""
-    if spec.mechanism is None:
+    if spec.mechanism is None and spec.isolation == "task":
         return cast("AddressHost", host.recovery.host_for(spec))
-    from ..ftm.migration.protected_stand_ins import child_at_root  # Most processes protect nobody.
+    from ..ftm.migration.protected_stand_ins import child_at_root  # Most processes have no such child.
 
     place = child_at_root(host, spec)
     return AddressHost(place.home, place, NEAR)

@@ -98,6 +98,10 @@ class Place:
         """The process besides this one that the present life is lived in, if there is one now."""
         return None
 
+    def spec_data(self, cell: Cell) -> dict[str, Any]:
+        """What of the spec says how lives are lived here, as data."""
+        return {}
+
     def give_up(self, why: str) -> None:
         """A change of the place itself is under way, and not wanted any more: it ends soon, undone."""
 
@@ -144,8 +148,8 @@ class Parent:
     def leaves(self, *, is_restarting: bool) -> None:
         """The supervisor gives up the address; it may have been started again by its own (`is_restarting`)."""
 
-    def respecified(self, cell: Cell, layers: list[Any]) -> None:
-        """The next lives there have other mechanisms than the last: these layers, as data."""
+    def respecified(self, cell: Cell, spec: dict[str, Any]) -> None:
+        """The next lives there are lived otherwise than the last: what of the spec says so, as data."""
 
 
 class AddressHost:

@@ -47,11 +47,13 @@ class ToWorker(Entering):
 
     async def prepare(self) -> None:
         cell, move = self.cell, self.move
-        start = cell.extra().start
-        assert start is not None
         self._began: asyncio.Future[float] = move.node.loop.create_future()
-        self.place.workers.want(start.kind.__module__)
-        self.recipe = pack_recipe(start, cell.path)
+        recipe = self.place.parent.recipe(cell)
+        if isinstance(recipe, bytes):
+            self.recipe = recipe
+        else:
+            self.place.workers.want(recipe.kind.__module__)
+            self.recipe = pack_recipe(recipe, cell.path)
         worker = self.worker = await self.place.fork()
         worker.reserve(cell, self._limits, lambda cell, reason: move.give_up(f"the new process has died ({reason})"))
         move.hear(worker, self._heard)

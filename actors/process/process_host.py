@@ -23,7 +23,7 @@ from ..kernel.envelope import Ask, Envelope, Item
 from ..kernel.lifecycle import NEAR
 from ..overflow import DROPS
 from ..persistence import child_key
-from .resource_limits import Limits
+from .resource_limits import Limits, limits_data
 from .wire import frames
 from .wire.connection import BadFrame
 from .wire.peer import obey, send_signal
@@ -481,6 +481,9 @@ class WorkerPlace(Place):
 
     def process(self, cell: Cell) -> Worker | None:
         return self.workers.of(cell)
+
+    def spec_data(self, cell: Cell) -> dict[str, Any]:
+        return {"layers": [], "isolation": "process", "limits": limits_data(self._limits)}
 
     def running(self, cell: Cell) -> int:
         worker = self.workers.of(cell)

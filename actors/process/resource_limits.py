@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from ..errors import SpecError
 
@@ -39,3 +40,8 @@ class Limits:
             raise SpecError("Limits", f"niceness must be 0 to 19, not {self.niceness!r}")
         if not self.watch_interval > 0:
             raise SpecError("Limits", f"watch_interval must be > 0 seconds, not {self.watch_interval!r}")
+
+
+def limits_data(limits: Limits | None) -> dict[str, Any]:
+    """The limits of a process as plain data; `Limits(**data)` are the same again."""
+    return {} if limits is None else dataclasses.asdict(limits)

@@ -22,7 +22,7 @@ from ...actors.kernel.mailbox import Bounded, Senders
 from ...actors.kernel.message import message_name
 from ...actors.process.wire.peer import send_signal
 from ..method import Method
-from ..protocol import Begin, Closed, Over, Protected, Respec, Started, Wanted
+from ..protocol import AtRoot, Begin, Closed, Over, Respec, Started, Wanted
 
 if TYPE_CHECKING:
     from ...actors.process.worker_node import Guest
@@ -154,7 +154,7 @@ class ChildPlace(Place):
     def told_by_root(self, record: Over | Respec) -> None:
         """Take what the root says of a life that is lived there."""
 
-    def ask_for_life(self, cell: Cell, method: Method, made: Protected | None = None) -> asyncio.Future[None]:
+    def ask_for_life(self, cell: Cell, method: Method, made: AtRoot | None = None) -> asyncio.Future[None]:
         """Ask the home for a life; the future ends when it is up. `made`: what a life at the root needs.
 
         Raises:

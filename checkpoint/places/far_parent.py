@@ -1,8 +1,8 @@
 """Addresses below a supervisor that has a process of its own: their homes are here at the root.
 
 The supervisor in the process wants a child started; the home gives it back what it had, and the life is lived there, or
-here at the root, by replicas. When the process dies, the homes keep what they hold until the subtree has been started
-again; lives at the root end with it, for nobody is left who would stop them.
+here at the root, in a process of its own or by replicas. When the supervisor's process dies, the homes keep what they
+hold until the subtree has been started again; lives at the root end with it, for nobody is left who would stop them.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ from ...actors.kernel import lifecycle, links
 from ...actors.kernel.actor import Start
 from ...actors.kernel.address_host import AddressHost, Parent, Place
 from ...actors.kernel.bindings import claim, doubt
-from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
+from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell, Host
 from ...actors.kernel.mailbox import Bound
+from ...actors.process.process_host import RemoteBound
 from ...actors.process.stand_ins import know
 from ...actors.process.wire import frames
-from ...actors.process.worker_pool import Worker
+from ...actors.process.worker_pool import Worker, Workers
 from ..home.homes import Homes
 from ..home.journal_home import Entered, JournalHome
 from ..home.life_ports import RemoteLife
 from ..method import hybrid
-from ..protocol import Begin, Closed, Over, Protected, Respec, Started, ToHome, Wanted
+from ..protocol import AtRoot, Begin, Closed, Over, Respec, Started, ToHome, Wanted
 from ..turn_word import blamed, input_of
 
 STOPPED_STARTING = "it was stopped while it started"
 
-Lives = Callable[["FarParent", Cell, Wanted, "AddressHost | None"], AddressHost]
-"""Gives the host of a life that is to be lived at the root; the last one, if there was one.
+Lives = Callable[["FarParent", Cell, Wanted, Host], AddressHost]
+"""Gives the host of a life that is to be lived at the root, from the address's last one.
 
 Raises HoldfastError: it cannot be had."""
 
@@ -43,11 +44,12 @@ Raises HoldfastError: it cannot be had."""
 class FarParent(Parent):
     """The supervisor of an address, in another process: it wants lives, and hears how they begin and end."""
 
-    def __init__(self, homes: Homes, path: str, lives: Lives, vacated: Callable[[FarParent], None]) -> None:
-        self.homes, self.path, self._lives, self._vacated = homes, path, lives, vacated
+    def __init__(
+        self, homes: Homes, workers: Workers, path: str, lives: Lives, vacated: Callable[[FarParent], None]
+    ) -> None:
+        self.homes, self.workers, self.path, self._lives, self._vacated = homes, workers, path, lives, vacated
         home = JournalHome(homes, hybrid(), self)  # The method is known when a life is wanted.
         self.below = AddressHost(home, SlotPlace(self, home), self)
-        self.host: AddressHost | None = None  # that the life which is wanted is lived by, or the last one was
         self.cell: Cell | None = None
         self.worker: Worker | None = None  # the supervisor's process
         self.slot = 0  # the place on its page; 0 if there was none left
@@ -59,7 +61,7 @@ class FarParent(Parent):
         self._starting: asyncio.Future[None] | None = None
         self._last: tuple[ExitReason, Callable[[bool | None], None]] | None = None  # a life has ended: it was told
         self._is_restarting = False  # it is the supervisor that has ended
-        self._made = Protected(b"", [])
+        self._made = AtRoot(b"", [])
         self._topics: list[str] = []
 
     @property
@@ -72,7 +74,7 @@ class FarParent(Parent):
     @property
     def is_at_root(self) -> bool:
         """Whether the life is lived here, though the supervisor is not."""
-        return self.host is not None and self.host is not self.below
+        return self.cell is not None and self.cell.host.place is not self.below.place
 
     def joined(self, top: Cell, worker: Worker, slot: int) -> None:
         """The process that the next lives are wanted in."""
@@ -118,11 +120,11 @@ class FarParent(Parent):
         cell.spec = wanted  # Somebody restarts it: it is not dead between two lives.
         know(cell, wanted.kind)
         claim(cell, wanted.bindings)
-        if wanted.bound is not None:
+        if wanted.bound is not None and not isinstance(cell.extra().bound, RemoteBound):
             cell.extra().bound = Bound(wanted.bound.capacity, wanted.bound.overflow)
         try:
             host = self._host_for(cell, wanted)
-            cell.host = self.host = host
+            cell.host = host
             context = cell.node.base_context.copy()  # Not in that of the socket, which is whoever's had the process.
             starting = context.run(host.start, cell)
         except HoldfastError as error:  # What is recorded does not fit its class, among others.
@@ -142,16 +144,15 @@ class FarParent(Parent):
         cell = self.cell
         if cell is None or not self.is_at_root:
             return []
-        assert self.host is not None
-        left = self.host.place.left(cell)
+        left = cell.host.place.left(cell)
         return [*left, cell.ended()] if cell.state is RUNNING and not left else left
 
     def _host_for(self, cell: Cell, wanted: Wanted) -> AddressHost:
-        if wanted.protected is None:
+        if wanted.at_root is None:
             self.home.method = wanted.method
             return self.below
-        self._made = wanted.protected
-        return self._lives(self, cell, wanted, self.host)
+        self._made = wanted.at_root
+        return self._lives(self, cell, wanted, cell.host)
 
     def _has_started(self, wanted: Wanted, done: asyncio.Future[None]) -> None:
         error: BaseException | None = StartFailed(self.path, STOPPED_STARTING) if done.cancelled() else done.exception()
@@ -161,7 +162,7 @@ class FarParent(Parent):
         if self.wanted is not wanted:
             return
         problem = "" if error is None else error.reason if isinstance(error, StartFailed) else str(error)
-        if error is not None and self.is_at_root:
+        if error is not None and wanted.at_root is not None:
             self.wanted = None
         self.port().to_life(Started(wanted.number, problem, isinstance(error, StartIgnored)))
 
@@ -220,11 +221,10 @@ class FarParent(Parent):
         """Nobody wants the life at the root any more, however far it has come."""
         self.wanted = None
         assert self.cell is not None
-        assert self.host is not None
         if self._last is not None:
             self._close(recovers=recovers)
         else:
-            self.host.place.end(self.cell, reason)
+            self.cell.host.place.end(self.cell, reason)
 
     def life_over(self, cell: Cell, reason: ExitReason, over: Callable[[bool | None], None]) -> None:
         self._last = reason, over
@@ -236,11 +236,11 @@ class FarParent(Parent):
 
     def _close(self, *, recovers: bool) -> None:
         """The life at the root is over, and it is known what follows: tell whom it concerns here."""
-        cell, host, last, self._last = self.cell, self.host, self._last, None
-        if last is None or cell is None or host is None or cell.state is not RUNNING:
+        cell, last, self._last = self.cell, self._last, None
+        if last is None or cell is None or cell.state is not RUNNING:
             return
         reason, over = last
-        recovers = recovers and host.recovers(reason)
+        recovers = recovers and cell.host.recovers(reason)
         over(recovers)
         cell.extra().suspended = 0
         _tell_end(cell, reason, recovers=recovers)
@@ -264,12 +264,12 @@ class FarParent(Parent):
     def leaves(self, *, is_restarting: bool) -> None:
         self._is_restarting = is_restarting
 
-    def respecified(self, cell: Cell, layers: list[Any]) -> None:
+    def respecified(self, cell: Cell, spec: dict[str, Any]) -> None:
         if self.worker is not None:
-            self.port().to_life(Respec(layers))
+            self.port().to_life(Respec(**spec))
 
     def retired(self, cell: Cell) -> None:
-        left = self.host.place.left(cell) if self.is_at_root and self.host is not None else []
+        left = cell.host.place.left(cell) if self.is_at_root else []
         if self.is_at_root:
             self.wanted = None
         if left:
@@ -284,7 +284,7 @@ class FarParent(Parent):
 
     # -- lives that move while they are lived -----------------------------------------------------------------------
 
-    def prepare(self, made: Protected, topics: list[str]) -> None:
+    def prepare(self, made: AtRoot, topics: list[str]) -> None:
         """A life is to come to the root, of an actor that begins so."""
         self._made, self._topics = made, topics
 
@@ -298,20 +298,20 @@ class FarParent(Parent):
         """The start that is under way, or the last one; its supervisor hears of its end."""
         return self._starting
 
-    def comes_to_root(self, cell: Cell, host: AddressHost, wanted: Wanted) -> None:
+    def comes_to_root(self, cell: Cell, wanted: Wanted) -> None:
         """The life is lived at the root from now on."""
-        self.cell, self.host = cell, host
-        self.wanted = msgspec.structs.replace(wanted, protected=self._made)
+        self.cell = cell
+        self.wanted = msgspec.structs.replace(wanted, at_root=self._made)
 
     def goes_back(self, cell: Cell) -> None:
         """The life is lived in the supervisor's process again, and its home is here."""
         assert self.wanted is not None
-        self.host, self.home.clock = self.below, None
-        cell.spec = self.wanted = msgspec.structs.replace(self.wanted, protected=None)
+        self.home.clock = None
+        cell.spec = self.wanted = msgspec.structs.replace(self.wanted, at_root=None)
 
     def goes_for_good(self) -> None:
         """It is lived in the process again, and there is no home."""
-        self.cell = self.host = self.wanted = self.home.switch = None
+        self.cell = self.wanted = self.home.switch = None
 
 
 class SlotPlace(Place):

@@ -60,7 +60,7 @@ class SubtreePlace(WorkerPlace):
         """The supervisor of an address below."""
         parent = self._below.get(path)
         if parent is None:
-            parent = self._below[path] = FarParent(self._homes, path, self._lives, self._vacated)
+            parent = self._below[path] = FarParent(self._homes, self.workers, path, self._lives, self._vacated)
         return parent
 
     def _vacated(self, parent: FarParent) -> None:

@@ -22,6 +22,7 @@ from ...actors.kernel.address_host import AddressHost, Parent, Place
 from ...actors.kernel.cell import DOWN, GONE, RUNNING, Cell
 from ...actors.kernel.lifecycle import NEAR
 from ...actors.migration.move import Gate
+from ...actors.process.resource_limits import limits_data
 from ...checkpoint.home.homes import Homes
 from ...checkpoint.home.journal_home import Entered, JournalHome
 from ...checkpoint.method import Method
@@ -308,11 +309,18 @@ class GroupPlace(Place):
     def respecified(self, cell: Cell) -> None:
         """The next lives have the stack that there is now."""
         replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=as_spec(self.layers)))
-        self.parent.respecified(cell, self.described())
+        self.parent.respecified(cell, self.spec_data(cell))
 
     def described(self) -> list[Any]:
         """The mechanisms as data."""
         return [msgspec.to_builtins(layer.describe()) for layer in self.layers]
+
+    def spec_data(self, cell: Cell) -> dict[str, Any]:
+        """What the spec says of where the next lives are lived, as data."""
+        said: dict[str, Any] = {"layers": self.described()}
+        if isinstance(cell.spec, ChildSpec):
+            said |= {"isolation": cell.spec.isolation, "limits": limits_data(cell.spec.limits)}
+        return said
 
     def _back_to(self, group: Group) -> Reconfiguration | None:
         """What whoever leads next has to be brought to first."""
@@ -375,7 +383,7 @@ class GroupPlace(Place):
         if not change.is_back:
             self._put_on_probation(cell, group, before, change)
             self.on_switched()
-            self.parent.respecified(cell, self.described())
+            self.parent.respecified(cell, self.spec_data(cell))
         elif probation is not None:
             self.respecified(cell)
             group.send_again()  # What the bricks have let fall; they are at rest.

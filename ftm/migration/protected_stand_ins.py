@@ -21,6 +21,7 @@ from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.migration.here import dispose
 from ...actors.migration.quiesce import farewell, obey_commands, part, settle_with_queue, sorted_out, twin
 from ...actors.migration.worker_moves import GuestMove
+from ...actors.process.resource_limits import Limits, limits_data
 from ...actors.process.wire.connection import BadFrame
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.life.child_stub import ChildPlace, RootHome
@@ -28,9 +29,9 @@ from ...checkpoint.life.recorded_inbox import StopRecorded
 from ...checkpoint.life.recorded_life import Life
 from ...checkpoint.life.worker_lives import ChildHere, child_here
 from ...checkpoint.protocol import (
+    AtRoot,
     Closed,
     Over,
-    Protected,
     Respec,
     Started,
 )
@@ -50,11 +51,13 @@ class ChildAtRoot(ChildPlace):
     is_here = False
 
     def start(self, cell: Cell) -> asyncio.Future[None]:
-        """Ask the root for replicas."""
-        more = cell.extra()
-        assert more.start is not None
-        layers = [msgspec.to_builtins(layer.describe()) for layer in compose(cell.spec.mechanism)]
-        return self.ask_for_life(cell, self._method, Protected(pack_recipe(more.start, cell.path), layers))
+        """Ask the root for replicas, or for a process."""
+        start, spec = cell.extra().start, cell.spec
+        assert start is not None
+        layers = () if spec.mechanism is None else compose(spec.mechanism)
+        described = [msgspec.to_builtins(layer.describe()) for layer in layers]
+        made = AtRoot(pack_recipe(start, cell.path), described, limits_data(spec.limits))
+        return self.ask_for_life(cell, self._method, made)
 
     def started(self, record: Started) -> None:
         cell = self.cell
@@ -71,7 +74,7 @@ class ChildAtRoot(ChildPlace):
     def told_by_root(self, record: Over | Respec) -> None:
         cell = self.cell
         if isinstance(record, Respec):
-            respec(cell, record.layers)
+            respec(cell, record)
         elif record.number == self._number and cell.state is RUNNING:
             reason = unpack_exit(record.reason)
             self.say_closed(cell, reason)
@@ -88,7 +91,7 @@ class ChildAtRoot(ChildPlace):
             self.gave_up_start(cell)
 
     def control(self, cell: Cell, call: Call) -> None:
-        why = "it is protected, and lives at the root: order it from there"
+        why = "it lives in another process: order it from the root"
         call.ask.fail(ControlFailed(cell.path, call.order.verb, why))
 
     def is_up(self, cell: Cell) -> bool:
@@ -96,17 +99,20 @@ class ChildAtRoot(ChildPlace):
 
 
 def child_at_root(guest: Guest, spec: ChildSpec) -> ChildAtRoot:
-    """The place of a protected child of a supervisor in this process."""
+    """The place of a child of a supervisor in this process that is lived elsewhere."""
     recovery = spec.recovery
     method = recovery if recovery is not None and recovery.records else UNKEPT
     return ChildAtRoot(RootHome(guest), method, guest.recovery.port_of)
 
 
-def respec(cell: Cell, described: list[Any]) -> None:
-    """The next lives of a child have these mechanisms."""
-    layers = tuple(map(revive, msgspec.convert(described, list[Description])))
+def respec(cell: Cell, said: Respec) -> None:
+    """The next lives of a child have these mechanisms, or live there without one."""
+    layers = tuple(map(revive, msgspec.convert(said.layers, list[Description])))
     mechanism = None if not layers else layers[0] if len(layers) == 1 else layers
-    replace_mechanism(cell, dataclasses.replace(cell.spec, mechanism=mechanism))
+    limits = Limits(**said.limits) if said.limits else None
+    replace_mechanism(
+        cell, dataclasses.replace(cell.spec, mechanism=mechanism, isolation=said.isolation, limits=limits)
+    )  # fmt: skip
 
 
 # -- lives that are handed over while they are lived -----------------------------------------------------------------
@@ -147,7 +153,7 @@ class RecordedChild:
         old = part(cell)
         _, commands = sorted_out(cell)  # What it was fed is at its home.
         life.cell = old
-        respec(cell, told["layers"])
+        respec(cell, Respec(**told["spec"]))
         child_at_root(self._guest, cell.spec).take_up(cell, told["number"])
         obey_commands(cell, commands)
         farewell(old, StopRecorded(life, exit_reasons.Shutdown("moved into a group of replicas")))
@@ -189,7 +195,7 @@ class RecordedChild:
         arriving.life.cell = cell
         arriving.place.home.life = arriving.life
         arriving.place.take_up(cell, arriving.number)
-        respec(cell, [])
+        respec(cell, Respec([]))
         lifecycle.up(cell)
 
 

@@ -9,8 +9,9 @@ from ...actors.kernel.lifecycle import LOCAL
 from ...actors.migration.move import Move
 from ...actors.process.wire.peer import OutsideHost
 from ...checkpoint.home.journal_home import JournalHome
-from ...checkpoint.places.far_parent import FarParent
-from ...checkpoint.places.recorded_moves import leaving
+from ...checkpoint.places.far_parent import FarParent, SlotPlace
+from ...checkpoint.places.recorded_moves import ToRecordedWorker, leaving
+from ...supervision.respec import recipe_spec
 from ..group.group_place import protected_host
 from ..group.transient_homes import UNKEPT, TransientHome
 from .group_moves import FromGroup, FromRecordedGroup, ToGroup
@@ -22,6 +23,7 @@ from .subtree_moves import (
     group_for,
     parent_of,
     spec_of,
+    to_process_below,
 )
 
 if TYPE_CHECKING:
@@ -45,7 +47,9 @@ def into_group(cell: Cell, homes: Homes, mechanism: Any, timeout: float) -> Move
     if isinstance(home, JournalHome) and isinstance(parent, FarParent):
         spec = spec_of(cell)
         below = group_for(parent, spec, home.method, mechanism)
-        return Move(cell, FromRecordedSubtree(cell, parent, spec, below), ToGroup(below, home.switch), timeout)
+        is_there = isinstance(cell.host.place, SlotPlace)  # Else it has a process of its own.
+        leaves = FromRecordedSubtree(cell, parent, spec, below) if is_there else leaving(cell, PART)
+        return Move(cell, leaves, ToGroup(below, home.switch), timeout)
     if isinstance(home, JournalHome):
         group = protected_host(homes, home.method, mechanism)
         return Move(cell, leaving(cell, PART), ToGroup(group, home.switch), timeout)
@@ -65,6 +69,10 @@ def out_of_group(cell: Cell, entering: Entering, timeout: float) -> Move:
     parent = cell.host.parent
     from_group, to_subtree = (FromGroup, ToSubtree) if is_plain(cell) else (FromRecordedGroup, ToRecordedSubtree)
     if isinstance(parent, FarParent):
+        spec, home = recipe_spec(cell), cell.host.home
+        if isinstance(home, JournalHome) and not is_plain(cell) and spec is not None and spec.isolation == "process":
+            into = ToRecordedWorker(to_process_below(parent, spec, home.method), spec.limits)
+            return Move(cell, from_group(cell, is_below=True), into, timeout)
         return Move(cell, from_group(cell, is_below=True), to_subtree(cell, parent), timeout)
     return Move(cell, from_group(cell, is_below=False), entering, timeout)
 

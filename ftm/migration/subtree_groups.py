@@ -1,8 +1,8 @@
-"""Protected children of a supervisor in another process: their groups are here, at the root.
+"""Children of a supervisor in another process that are lived at the root: by a group, or in a process of their own.
 
-The supervisor in the process wants a life; it is lived by replicas, which are processes of the root as always, and the
-death of one of them does not concern that supervisor. It hears of the end of the life, and decides what follows. When
-its process dies, the group ends with it; the home keeps what it holds until the subtree has been started again.
+The supervisor in the process wants a life; it is lived by processes of the root as always. The death of a replica does
+not concern that supervisor. It hears of the end of the life, and decides what follows. When
+its process dies, the life ends with it; the home keeps what it holds until the subtree has been started again.
 """
 
 from __future__ import annotations
@@ -13,44 +13,75 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from ...actors.errors import StartFailed
+from ...actors.errors import SpecError, StartFailed
+from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.bindings import settle_claims
+from ...actors.process.process_host import FLIGHT, WorkerHome, WorkerPlace
+from ...actors.process.resource_limits import Limits
 from ...actors.process.wire.start_codec import pack_recipe
+from ...checkpoint.home.journal_home import JournalHome
 from ...supervision.respec import recipe_spec
 from ..group.group_place import GroupPlace, protected_host
+from ..group.transient_homes import is_unkept
 from ..model.composition import check_stack, describe
 from ..model.mechanism import COMMON, Code, Description, Mechanism, MechanismRefused, revive
 
 if TYPE_CHECKING:
-    from ...actors.kernel.address_host import AddressHost
-    from ...actors.kernel.cell import Cell
+    from ...actors.kernel.cell import Cell, Host
     from ...checkpoint.places.far_parent import FarParent
     from ...checkpoint.protocol import Wanted
 
 
-def group_below(parent: FarParent, cell: Cell, wanted: Wanted, before: AddressHost | None) -> AddressHost:
+def life_at_root(parent: FarParent, cell: Cell, wanted: Wanted, before: Host) -> AddressHost:
     """The host of the life that is wanted: that of the last one, if nothing has changed.
 
     Raises:
-        HoldfastError: it cannot be protected so.
+        HoldfastError: it cannot be had.
     """
-    made = wanted.protected
+    made = wanted.at_root
     assert made is not None
     layers = tuple(map(known, msgspec.convert(made.layers, list[Description])))
-    check_stack(layers, None, cell.path)
+    if layers:
+        check_stack(layers, None, cell.path)
     problem = parent.homes.refuses(wanted.method)
     if problem:
         raise StartFailed(cell.path, problem)
     spec = recipe_spec(cell)
     settle_claims(cell, {} if spec is None else spec.bindings)
     if spec is not None and pack_recipe(spec.start, cell.path) == made.recipe:
-        cell.spec = dataclasses.replace(spec, mechanism=layers[0] if len(layers) == 1 else layers)
+        mechanism = None if not layers else layers[0] if len(layers) == 1 else layers
+        cell.spec = dataclasses.replace(spec, mechanism=mechanism)
         cell.extra().start = spec.start
-    place = None if before is None else before.place
-    if before is not None and isinstance(place, GroupPlace) and describe(place.layers) == describe(layers):
+    if not layers:
+        return process_below(parent, wanted, before)
+    place = before.place
+    if isinstance(before, AddressHost) and isinstance(place, GroupPlace) and describe(place.layers) == describe(layers):
         place.home.method = wanted.method
         return before
     return protected_host(parent.homes, wanted.method, layers, parent)
+
+
+def process_below(parent: FarParent, wanted: Wanted, before: Host | None) -> AddressHost:
+    """The host of a life in a process of its own.
+
+    Raises:
+        StartFailed: its limits cannot be.
+    """
+    made = wanted.at_root
+    assert made is not None
+    try:
+        limits = Limits(**made.limits) if made.limits else None
+    except (TypeError, SpecError) as error:
+        raise StartFailed(parent.path, f"limits of its process: {error}") from error
+    is_recorded = not is_unkept(wanted.method)
+    last = None if before is None or not isinstance(before.place, WorkerPlace) else before.home
+    if is_recorded:
+        home: WorkerHome = last if isinstance(last, JournalHome) else JournalHome(parent.homes, wanted.method, parent)
+        assert isinstance(home, JournalHome)
+        home.method = wanted.method
+    else:
+        home = FLIGHT
+    return AddressHost(home, WorkerPlace(home, parent, parent.workers, limits), parent)
 
 
 def known(description: Description) -> Mechanism:

@@ -17,10 +17,11 @@ from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.message import message_name
-from ...actors.migration.move import Entering, Leaving
+from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import now
 from ...actors.migration.worker import BUSY
 from ...actors.overflow import Overflow
+from ...actors.process.resource_limits import limits_data
 from ...actors.process.wire import frames
 from ...actors.process.wire.peer import OutsideHost
 from ...actors.process.wire.start_codec import pack_recipe
@@ -30,13 +31,14 @@ from ...checkpoint.home.journal_home import JournalHome
 from ...checkpoint.home.life_ports import RemoteLife
 from ...checkpoint.method import Method
 from ...checkpoint.places.far_parent import FarParent
-from ...checkpoint.places.recorded_moves import Beginning, Detached, refuse_unsaved
+from ...checkpoint.places.recorded_moves import Beginning, Detached, ToRecordedWorker, leaving, refuse_unsaved
 from ...checkpoint.places.subtree_place import SubtreePlace
-from ...checkpoint.protocol import Closed, Protected, ToHome, Wanted
+from ...checkpoint.protocol import AtRoot, Closed, ToHome, Wanted
 from ...supervision.respec import recipe_spec
 from ..group.group_place import GroupPlace, protected_host
 from ..group.transient_homes import UNKEPT
 from .group_moves import settle_in
+from .subtree_groups import process_below
 from .unrecorded_luggage import pack, pack_owed, refuse, unpack, unpack_owed
 
 if TYPE_CHECKING:
@@ -82,14 +84,41 @@ def group_for(parent: FarParent, spec: ChildSpec, method: Method, mechanism: Any
     """The host of a life that is to be lived by a group."""
     host = protected_host(parent.homes, method, mechanism, parent)
     topics = list(spec.start.kind._topics)
-    parent.prepare(Protected(pack_recipe(spec.start, parent.path), layers_of(host)), topics)
+    parent.prepare(AtRoot(pack_recipe(spec.start, parent.path), layers_of(host)), topics)
     return host
 
 
 def layers_of(host: AddressHost) -> list[Any]:
-    """The mechanisms of a group, as data."""
-    assert isinstance(host.place, GroupPlace)
-    return host.place.described()
+    """The mechanisms that a life at the root has, as data."""
+    return host.place.described() if isinstance(host.place, GroupPlace) else []
+
+
+def spec_data(host: AddressHost, spec: ChildSpec) -> dict[str, Any]:
+    """What the supervisor has to know of a child that is lived elsewhere from now on, as data."""
+    return {"layers": layers_of(host), "isolation": spec.isolation, "limits": limits_data(spec.limits)}
+
+
+def move_below(cell: Cell, parent: FarParent, spec: ChildSpec, timeout: float) -> Move:
+    """The move of a recorded child between the process of its supervisor and one of its own, to where its spec says.
+
+    Raises:
+        CannotMove: it cannot.
+    """
+    home = cell.host.home
+    assert isinstance(home, JournalHome)
+    if spec.isolation == "task":
+        return Move(cell, leaving(cell), ToRecordedSubtree(cell, parent), timeout)
+    host = to_process_below(parent, spec, home.method)
+    return Move(cell, FromRecordedSubtree(cell, parent, spec, host), ToRecordedWorker(host, spec.limits), timeout)
+
+
+def to_process_below(parent: FarParent, spec: ChildSpec, method: Method) -> AddressHost:
+    """The host of such a child whose life is to enter a process of its own."""
+    made = AtRoot(pack_recipe(spec.start, parent.path), [], limits_data(spec.limits))
+    topics = list(spec.start.kind._topics)
+    parent.prepare(made, topics)
+    wanted = Wanted(parent.number, message_name(spec.start.kind), topics, method, None, made)
+    return process_below(parent, wanted, None)
 
 
 class FromRecordedSubtree(Leaving):
@@ -123,8 +152,8 @@ class FromRecordedSubtree(Leaving):
     def part(self) -> list[Item]:
         cell, parent = self.cell, self._parent
         assert parent.wanted is not None
-        parent.comes_to_root(cell, self._host, parent.wanted)
-        self.move.say_now(self._worker, "leave", number=parent.number, layers=layers_of(self._host))
+        parent.comes_to_root(cell, parent.wanted)
+        self.move.say_now(self._worker, "leave", number=parent.number, spec=spec_data(self._host, self._spec))
         cell.extra().start = self._spec.start
         return []
 
@@ -199,7 +228,7 @@ class FromSubtree(Leaving):
 
     async def let_go(self) -> None:
         self.move.is_bound = True
-        self.move.say_now(self._worker, "leave", number=NUMBER, layers=layers_of(self._host))
+        self.move.say_now(self._worker, "leave", number=NUMBER, spec=spec_data(self._host, self._spec))
         await asyncio.shield(self._left)
 
     def part(self) -> list[Item]:
@@ -215,7 +244,7 @@ class FromSubtree(Leaving):
         luggage.waiting, self._held = self._held, []
         kind = self._spec.start.kind
         wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen)
-        self._parent.comes_to_root(cell, self._host, wanted)
+        self._parent.comes_to_root(cell, wanted)
         more.start = self._spec.start
         return []
 

@@ -24,6 +24,7 @@ from ...actors.migration.luggage import check_sendable, pack_rest
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
 from ...actors.process.wire.connection import BadFrame
+from ...checkpoint.protocol import Respec
 from .protected_stand_ins import ChildAtRoot, child_at_root, respec
 from .unrecorded_luggage import EarlyAsk, pack, pack_owed, refuse, restore_owing, save_owing, unpack
 
@@ -110,7 +111,7 @@ class PlainChild:
         self._hand_ties_over(cell)
         room = None if bound is None else [bound.capacity, bound.overflow]
         self._say("left", queue=queue, bound=room, owed=pack_owed(guest, self._owed))
-        respec(cell, told["layers"])
+        respec(cell, Respec(**told["spec"]))
         guest.recovery.begins(cell.path)
         place = child_at_root(guest, cell.spec)
         place.home.bound = None if bound is None else Bounded(bound.capacity, bound.overflow)
@@ -214,7 +215,7 @@ class PlainChild:
             message = cell.node.codec.decode(cell.table.kind_named(name), body)
             Timer.unpacked(cell, message, max(0.0, left), interval or None, False)
         self._take_ties_over(cell, told)
-        respec(cell, [])
+        respec(cell, Respec([]))
         for item in held:
             try:
                 cell.admit(cell, item)

@@ -410,13 +410,30 @@ async def test_if_the_new_life_cannot_begin_the_old_one_goes_on(
 
 async def test_a_protected_actor_is_not_moved_by_anything_else(system: hf.ActorSystem) -> None:
     ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=PBR()))
-    with pytest.raises(hf.CannotMove, match="detach"):
-        await system.set_isolation(ref, "process")
-    for step in (lambda change: change.replace_state(ref, dict), lambda change: change.isolation(ref, "process")):
-        with pytest.raises(hf.TransactionRefused, match="detach"):
-            async with system.transaction() as change:
-                step(change)
+    with pytest.raises(hf.TransactionRefused, match="detach"):
+        async with system.transaction() as change:
+            change.replace_state(ref, dict)
     assert await ref.ask(Add(0)) == 1
+
+
+@pytest.mark.parametrize("how", ["at once", "in a transaction", "with the attachment"])
+async def test_where_a_protected_actor_lives_is_where_it_lives_after(system: hf.ActorSystem, how: str) -> None:
+    ref = await system.start(
+        hf.child("alice", hf.start(Counter), mechanism=None if how == "with the attachment" else PBR())
+    )
+    assert await ref.ask(Add(0)) == 1
+    if how == "at once":
+        await system.set_isolation(ref, "process")
+    else:
+        async with system.transaction(timeout=30) as change:
+            change.isolation(ref, "process")
+            if how == "with the attachment":
+                change.protect(ref, PBR())
+    assert isinstance(ref._cell.host.place, GroupPlace)
+    assert await ref.ask(Add(1), timeout=30) == 2
+    await detach(system, ref)
+    assert await ref.ask(Add(2), timeout=30) == 3
+    assert isinstance(ref._cell.host.place, WorkerPlace)
 
 
 async def test_a_binding_is_that_of_every_replica_from_now_on(system: hf.ActorSystem) -> None:

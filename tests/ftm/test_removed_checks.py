@@ -374,7 +374,7 @@ CHECKS = {
     ),
     "a supervisor in a process hears what its child is protected by now": Check(
         "checkpoint/places/far_parent.py",
-        "            self.port().to_life(Respec(layers))\n",
+        "            self.port().to_life(Respec(**spec))\n",
         "            pass\n",
         "tests/ftm/test_subtree_changes.py",
         "test_the_new_stack_holds",

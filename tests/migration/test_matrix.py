@@ -25,8 +25,11 @@ TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
 # Each note: the actors it is about, what the refusal says.
 NOTES: dict[str, tuple[set[str], str]] = {
     "¹": ({"recorded", "checkpoint_only"}, "its journal is kept by its address"),
-    "²": (set(KINDS), "its process knows it by its address|no supervisor looks after it|is kept by its address"),
-    "³": (set(KINDS), "its supervisor lives in another process"),
+    "²": (
+        set(KINDS),
+        "its process knows it|no supervisor looks after it|is kept by its address|a life cannot enter or leave",
+    ),
+    "³": ({"plain"}, "its supervisor lives in another process"),
 }
 
 

@@ -131,17 +131,20 @@ KINDS: dict[str, Any] = {
 }
 
 
+OWN_BELOW = "a process of its own, below a supervisor in another"
+
+
 def tree(place: str, kind: str) -> hf.ChildSpec:
     """The supervisor `/app/here`, with the traveller `one` at that place below it; its mailbox is bounded."""
     where: dict[str, Any] = {"mailbox": hf.bounded(100_000)}
-    if place == "a process":
+    if place in ("a process", OWN_BELOW):
         where["isolation"] = "process"
     if place == "replicas":
         where["mechanism"] = hf.PBR()
     if KINDS[kind] is not None:
         where["recovery"] = KINDS[kind]
     one = hf.child("one", hf.start(Traveller), **where)
-    if place == "a process, below its supervisor":
+    if place in ("a process, below its supervisor", OWN_BELOW):
         return hf.supervisor("here", children=[one], isolation="process", intensity=1000)
     if place == "a process, two deep":
         inner = hf.supervisor("inner", children=[one], intensity=1000)

@@ -196,5 +196,10 @@ async def test_a_supervisor_in_a_process_can_be_changed_too() -> None:
         b = await top.ask(hf.RestartChild("b"))
         c = await top.ask(hf.StartChild(named("c", "c")))
         assert (await b.ask(Name()), await c.ask(Name())) == ("b", "c")
-        error = await refused(top.ask(hf.ChangeSupervisor(children=[named("p", "p", isolation="process")])))
-        assert "cannot hold process children" in str(error)
+        await top.ask(hf.ChangeSupervisor(children=[named("p", "p", isolation="process")]))
+        p = await top.ask(hf.RestartChild("p"))
+        assert await p.ask(Name()) == "p"
+        assert system.pid_of(p) != system.pid_of(top)
+        far = hf.supervisor("far", children=[], isolation="process")
+        error = await refused(top.ask(hf.ChangeSupervisor(children=[far])))
+        assert "cannot hold another supervisor" in str(error)

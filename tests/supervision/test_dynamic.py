@@ -303,8 +303,9 @@ async def test_children_in_processes_and_a_whole_pool_in_a_process() -> None:
         assert (await first.ask(Sum()), await second.ask(Sum())) == (4, 5)
         assert system.pid_of(first) == system.pid_of(remote)
         assert await refused(remote.ask(hf.StartChild(hf.start(Adder)))) == hf.MaxChildren(2)
-        error = await refused(remote.ask(hf.StartChild(hf.child("p", hf.start(Adder), isolation="process"))))
-        assert "cannot hold process children" in str(error)
+        far = hf.supervisor("far", children=[], isolation="process")
+        error = await refused(remote.ask(hf.StartChild(far)))
+        assert "cannot hold another supervisor" in str(error)
         again = await refused(remote.ask(hf.StartChild(hf.child("first", hf.start(Adder)))))
         assert again == hf.AlreadyStarted("first", first)
 

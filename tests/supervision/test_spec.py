@@ -94,11 +94,12 @@ def test_arguments_of_a_process_actor_must_be_encodable() -> None:
     assert hf.child("kid", hf.start(Idle, object())).isolation == "task"
 
 
-def test_a_subtree_in_a_process_takes_all_options_but_process_children() -> None:
+def test_a_subtree_in_a_process_takes_all_options_but_supervisors_with_another() -> None:
     rich = kid(mailbox=hf.bounded(3), backoff=hf.Backoff(), bindings={"teller": "/app/x"}, shutdown="brutal_kill")
     assert top(isolation="process", children=[rich]).isolation == "process"
-    with pytest.raises(hf.SpecError, match="supervisor 'top': a subtree in a process cannot hold process children"):
-        top(isolation="process", children=[kid(isolation="process")])
+    assert top(isolation="process", children=[kid(isolation="process")]).isolation == "process"
+    with pytest.raises(hf.SpecError, match="supervisor 'top': a subtree in a process cannot hold another supervisor"):
+        top(isolation="process", children=[hf.supervisor("inner", children=[], isolation="process")])
 
 
 def test_defaults_are_those_of_otp() -> None:
@@ -122,7 +123,9 @@ def test_start_takes_actor_classes_only() -> None:
         hf.start(int)  # type: ignore[type-var]
 
 
-def test_a_process_holds_no_processes() -> None:
-    inner = hf.supervisor("inner", children=[hf.child("a", hf.start(hf.Actor), isolation="process")])
-    with pytest.raises(hf.SpecError, match="supervisor 'outer': a subtree in a process cannot hold process children"):
+def test_a_process_holds_no_supervisor_with_another_however_deep() -> None:
+    deep = hf.supervisor("deep", children=[hf.child("a", hf.start(hf.Actor), isolation="process")])
+    assert hf.supervisor("outer", children=[deep], isolation="process").isolation == "process"
+    inner = hf.supervisor("inner", children=[hf.supervisor("far", children=[], isolation="process")])
+    with pytest.raises(hf.SpecError, match="supervisor 'outer': a subtree in a process cannot hold another supervisor"):
         hf.supervisor("outer", children=[inner], isolation="process")

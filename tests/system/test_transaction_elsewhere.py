@@ -105,7 +105,9 @@ async def test_what_cannot_be_done_there_is_refused_before_anything_is(system: h
         "another process, which a life cannot enter": lambda change: change.move("/app/near/plain", "/app/far"),
         "its process knows it by its address": lambda change: change.move("/app/near/own", "/app/other"),
         "its journal is kept by its address": lambda change: change.move("/app/near/kept", "/app/other"),
-        "cannot hold process children": lambda change: change.add("/app/far", counter("p", isolation="process")),
+        "cannot hold another supervisor": lambda change: change.add(
+            "/app/far", hf.supervisor("p", children=[], isolation="process")
+        ),
         "removed by this": lambda change: (change.remove("/app/far"), change.add("/app/far", counter("p"))),
     }
     for why, step in refusals.items():

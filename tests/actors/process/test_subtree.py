@@ -162,12 +162,6 @@ async def test_stop_of_the_subtree_and_of_one_child(system: hf.ActorSystem) -> N
         await bob.ask(Total())
 
 
-async def test_process_children_inside_a_process_are_refused() -> None:
-    inner = hf.supervisor("inner", children=[hf.child("deep", hf.start(Account), isolation="process")])
-    with pytest.raises(hf.SpecError, match="process children"):
-        hf.supervisor("team", children=[inner], isolation="process")
-
-
 async def test_options_of_inner_children_travel(system: hf.ActorSystem) -> None:
     children = [
         hf.child("book", hf.start(Notebook), mailbox=hf.bounded(5, overflow="drop_oldest")),

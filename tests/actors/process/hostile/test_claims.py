@@ -11,7 +11,7 @@ import pytest
 import holdfast as hf
 from holdfast.actors.kernel.message import message_name
 from holdfast.actors.process.wire import frames as f
-from holdfast.checkpoint.protocol import Protected, Wanted
+from holdfast.checkpoint.protocol import AtRoot, Wanted
 from holdfast.ftm.group.group_place import GroupPlace
 from tests.actors.process.hostile.forging import command, frame, raw
 from tests.actors.process.hostile.players import Add, Evil, House, Kill, Ping, Terminate, Victim, Write
@@ -126,7 +126,7 @@ async def test_it_may_not_send_an_order_by_a_binding_that_it_claims(town: Town, 
 @pytest.mark.parametrize("protected", [False, True], ids=["recorded", "protected"])
 async def test_what_it_wants_of_another_child_grants_nothing(town: Town, protected: bool) -> None:
     evil = await town.settle("plain")
-    made = Protected(b"", []) if protected else None
+    made = AtRoot(b"", []) if protected else None
     wanted = Wanted(1, "a:B", [], hf.hybrid(), None, made, {"port": SUP})
     await town.refused(evil, Write(frame(f.Record(f"{HOUSE}/x", raw(wanted))) + command(VICTIM, "kill")))
 
