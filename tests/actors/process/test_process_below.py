@@ -104,6 +104,7 @@ async def test_what_is_sent_while_it_is_restarted_waits(system: hf.ActorSystem) 
     asks = []
     for number in range(60):
         if number % 20 == 10:
+            await alice.ask(Total(), timeout=60.0)
             os.kill(system.pid_of(alice), signal.SIGKILL)
         asks.append(alice.ask(Add(1), timeout=60.0))
         await alice.send(Add(1))
