@@ -19,3 +19,19 @@ async def test_what_was_in_hand_when_it_died_is_handled_again(store: str | None,
         await first
         await second
         assert await ref.ask(Seen(), timeout=60.0) == ["first", "second"]
+
+
+async def test_what_was_put_aside_does_not_count_after_a_restart_of_the_root(tmp_path: Path) -> None:
+    options = {"recovery": hf.hybrid(interval=NEVER), "mailbox": hf.bounded(1, overflow="reject")}
+
+    def running() -> hf.ActorSystem:
+        return hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}")
+
+    async with running() as system:
+        ref = await start(system, "task", "doer", hf.start(Doer), **options)
+        for _ in range(2):
+            ref.tell(Do(["stash"]))
+            assert await ref.ask(Seen()) == []
+    async with running() as system:
+        ref = await start(system, "task", "doer", hf.start(Doer), **options)
+        assert await ref.ask(Do(["add open"])) == "1"
