@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 import holdfast as hf
-from tests.checkpoint.players import Do, Doer, Seen, start
+from tests.checkpoint.players import Do, Doer, Note, Seen, start, until
 from tests.checkpoint.strikes import NEVER
 
 
@@ -35,3 +39,35 @@ async def test_what_was_put_aside_does_not_count_after_a_restart_of_the_root(tmp
     async with running() as system:
         ref = await start(system, "task", "doer", hf.start(Doer), **options)
         assert await ref.ask(Do(["add open"])) == "1"
+
+
+@pytest.mark.parametrize("overflow", ["reject", "drop_oldest"])
+async def test_what_waits_counts_after_a_restart_of_the_root(tmp_path: Path, overflow: Any) -> None:
+    options = {
+        "recovery": hf.hybrid(interval=NEVER), "mailbox": hf.bounded(3, overflow=overflow), "shutdown": "brutal_kill",
+    }  # fmt: skip
+    gate = tmp_path / "gate"
+
+    def running() -> hf.ActorSystem:
+        return hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}")
+
+    async with running() as system:
+        ref = await start(system, "task", "doer", hf.start(Doer), **options)
+        ref.tell(Do([f"gate {gate}"]))
+        await until(gate.exists)
+        for number in range(3):
+            ref.tell(Note(f"{number}"))
+    gate.unlink()
+    async with running() as system:
+        ref = await start(system, "task", "doer", hf.start(Doer), **options)
+        await until(gate.exists)
+        if overflow == "reject":
+            with pytest.raises(hf.MailboxFull):
+                ref.tell(Note("3"))
+        else:
+            ref.tell(Note("3"))
+        gate.with_suffix(".open").touch()
+        expected = ["0", "1", "2"] if overflow == "reject" else ["1", "2", "3"]
+        async with asyncio.timeout(20):
+            while (await system.get_state(ref))["seen"] != expected:  # It passes ahead, and does not count.
+                pass

@@ -62,6 +62,15 @@ def test_settings_travel() -> None:
     assert revive(PBR(acknowledge=False, window=3).describe()) == PBR(acknowledge=False, window=3)
 
 
+class Family:
+    class Member(PBR):
+        class Branch(PBR): ...
+
+
+def test_classes_within_classes_travel() -> None:
+    assert revive(Family.Member.Branch().describe()) == Family.Member.Branch()
+
+
 def test_what_is_not_there_or_no_mechanism_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MechanismRefused, match="no mechanism of that name"):
         find("nothing")
