@@ -130,6 +130,17 @@ async def test_what_is_dropped(system: hf.ActorSystem, busy: Busy, gate: Path, o
     assert await ref.ask(Notes()) == kept
 
 
+@pytest.mark.parametrize("overflow", ["drop_oldest", "latest", "drop_newest"])
+async def test_who_asks_hears_that_it_was_dropped(busy: Busy, gate: Path, overflow: str) -> None:
+    ref = await busy(1, overflow)
+    first, second = ref.ask(Add(1), timeout=60.0), ref.ask(Add(10), timeout=60.0)
+    loser, winner = (second, first) if overflow == "drop_newest" else (first, second)
+    with pytest.raises(hf.MailboxFull):
+        await loser
+    gate.touch()
+    assert await winner == (2 if winner is first else 11)
+
+
 async def test_many_messages_flow_through_a_small_mailbox(busy: Busy, gate: Path) -> None:
     ref = await busy(1)
     gate.touch()
