@@ -89,6 +89,15 @@ async def test_ask_is_refused_or_waits(busy: Busy, gate: Path, overflow: str) ->
         assert {type(outcome) for outcome in outcomes[2:]} == {hf.MailboxFull}
 
 
+async def test_asks_that_wait_are_let_in_one_for_each_that_leaves(busy: Busy, gate: Path) -> None:
+    ref = await busy(1)
+    asks = [ref.ask(Add(1)) for _ in range(20)]
+    gate.touch()
+    for number, ask in enumerate(asks):
+        assert await ask == number + 2
+        assert bound_of(ref).count <= 1
+
+
 async def test_an_ask_that_waits_for_room_expires(busy: Busy, gate: Path) -> None:
     ref = await busy(1)
     ref.tell(Add(1))
