@@ -224,9 +224,9 @@ async def test_senders_are_released_when_the_actor_is_gone(system: hf.ActorSyste
     ref = await busy(1)
     ref.tell(Add(1))
     sending = asyncio.ensure_future(ref.send(Add(1)))
-    waiting = ref.ask(Add(1))
+    waiting = [ref.ask(Add(1)) for _ in range(2)]
     await until(lambda: bool(bound_of(ref).senders))
     await system.stop(ref)  # The turn in hand never ends: it is killed.
-    for one in (waiting, sending):
+    for one in (*waiting, sending):
         with pytest.raises(hf.ActorStopped):
             await one
