@@ -75,6 +75,24 @@ async def test_what_waits_counts_after_a_restart_of_the_root_and_what_was_droppe
         assert seen == expected
 
 
+async def test_what_comes_after_a_poisonous_message_is_handled_once(tmp_path: Path) -> None:
+    """The life gets one message at a time; the next life begins with the second one, which is put aside."""
+    gate = tmp_path / "gate"
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        options = {"recovery": hf.hybrid(max_deliveries=1), "mailbox": hf.bounded(9, overflow="drop_oldest")}
+        ref = await start(system, "process", "doer", hf.start(Doer), **options)
+        poison = ref.ask(Do([f"gate {gate}", f"die {tmp_path / 'deaths'}"]), timeout=60.0)
+        await until(gate.exists)
+        ref.tell(Do(["stash put aside"]))
+        ref.tell(Note("next"))
+        gate.with_suffix(".open").touch()
+        with pytest.raises(hf.Quarantined):
+            await poison
+        await ref.ask(Do(["unstash"]), timeout=60.0)
+        assert await ref.ask(Seen(), timeout=60.0) == ["next", "open", "put aside"]
+        assert (await system.get_status(ref)).life == 2
+
+
 async def test_memory_of_what_is_dropped_is_given_back_while_the_turn_still_runs(tmp_path: Path) -> None:
     gate, size = tmp_path / "gate", 1_000_000
     async with hf.ActorSystem("app", log=False) as system:
