@@ -75,6 +75,25 @@ async def test_what_waits_counts_after_a_restart_of_the_root_and_what_was_droppe
         assert seen == expected
 
 
+async def test_a_message_that_comes_before_the_start_is_the_one_in_hand(tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    async with hf.ActorSystem("app", log=False) as system:
+        options: Any = {"recovery": hf.hybrid(interval=NEVER), "mailbox": hf.bounded(2, overflow="drop_oldest")}
+        starting = asyncio.ensure_future(system.start(hf.child("doer", hf.start(Doer), isolation="process", **options)))
+        await until(lambda: "/app/doer" in system.tree())
+        ref = system.ref("/app/doer", Doer)
+        ref.tell(Do([f"gate {gate}"]))
+        await starting
+        await until(gate.exists)
+        for number in range(4):
+            ref.tell(Note(f"{number}"))
+        gate.with_suffix(".open").touch()
+        async with asyncio.timeout(20):
+            while len(seen := (await system.get_state(ref))["seen"]) < 2:
+                pass
+        assert seen == ["2", "3"]
+
+
 async def test_what_comes_after_a_poisonous_message_is_handled_once(tmp_path: Path) -> None:
     """The life gets one message at a time; the next life begins with the second one, which is put aside."""
     gate = tmp_path / "gate"
