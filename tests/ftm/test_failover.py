@@ -481,3 +481,22 @@ async def test_with_a_store_a_protected_actor_comes_back_after_a_restart_of_the_
         ref = await started(system, recovery=hf.hybrid(interval=0.05))
         assert await ref.ask(Tags()) == list(range(21))
         assert await ref.ask(Add(21)) == 22
+
+
+@pytest.mark.parametrize("mechanism", [hf.PBR(), hf.LFR()], ids=["pbr", "lfr"])
+async def test_one_that_comes_back_fresh_leads_on_from_no_state(system: hf.ActorSystem, mechanism: Any) -> None:
+    recovery = hf.hybrid(interval=3600.0, on_escalate="fresh")
+    spec = hf.child("counter", hf.start(Counter), mechanism=mechanism, recovery=recovery)
+    await system.start(hf.supervisor("team", children=[spec], intensity=0))
+    ref = system.ref("/app/team/counter", Counter)
+    assert await ref.ask(Add(0, 5), timeout=60.0) == 5
+    with system.events() as stream:
+        for name in group_of(ref).names:
+            os.kill(pid_of(system, ref, name), signal.SIGKILL)
+        async with asyncio.timeout(30.0):
+            async for one in stream:
+                if isinstance(one, hf.ActorStarted) and one.address == ref.path:
+                    break
+    again = system.ref(ref.path, Counter)
+    assert await again.ask(Add(1), timeout=30.0) == 1
+    assert await again.ask(Tags(), timeout=30.0) == [1]
