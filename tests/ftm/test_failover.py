@@ -6,13 +6,14 @@ import asyncio
 import os
 import random
 import signal
+from collections import Counter as Multiset
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.events import FailedOver, ReplicaJoined, WrongSuspicion
+from holdfast.ftm.events import FailedOver, ReplicaJoined, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group.group import Group
 from holdfast.ftm.group.group_host import GroupHost
 from holdfast.ftm.mechanisms.pbr import PBR
@@ -153,11 +154,13 @@ async def test_killing_a_replica_under_load_loses_nothing(system: hf.ActorSystem
     ref = await started(system, recovery=METHODS[method]())
     load, rng = Load(ref), random.Random(f"{SEED} {method} {who}")
     events = system.events()
+    killed: list[str] = []
     for _ in range(4):
         await load.reached(rng.randrange(1, 60))
         group = group_of(ref)
         name = group.primary if who == "primary" else other(group)
         assert name is not None
+        killed.append(name)
         os.kill(pid_of(system, ref, name), signal.SIGKILL)
         await load.reached(20)
         await two_again(ref)
@@ -166,6 +169,7 @@ async def test_killing_a_replica_under_load_loses_nothing(system: hf.ActorSystem
     seen = events.take()
     assert sum(isinstance(event, FailedOver) for event in seen) == (4 if who == "primary" else 0)
     assert sum(isinstance(event, ReplicaJoined) for event in seen) >= 4
+    assert not Multiset(killed) - Multiset(event.replica for event in seen if isinstance(event, ReplicaLost))
     events.close()
 
 
