@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 import holdfast as hf
-from tests.checkpoint.players import start
+from holdfast.checkpoint.home.pending_asks import SwitchAsk
+from tests.checkpoint.players import Do, Doer, Notes, Seen, Sink, start
 
 
 class No(hf.Refusal):
@@ -77,7 +80,7 @@ class Careless(hf.Actor):
     @hf.on(Count)
     def count(self, message: Count) -> int:
         many: Any = "many"
-        return many  # type: ignore[no-any-return]
+        return many
 
 
 async def test_a_reply_of_another_type_is_an_error(isolation: str) -> None:
@@ -85,3 +88,24 @@ async def test_a_reply_of_another_type_is_an_error(isolation: str) -> None:
         ref = await start(system, isolation, "careless", hf.start(Careless), recovery=hf.hybrid())
         with pytest.raises(hf.HoldfastError, match=f"the reply of {ref.path} does not fit its type: Expected `int`"):
             await ref.ask(Count(), timeout=60.0)
+
+
+async def test_what_an_unrecorded_actor_has_answered_is_known_after_a_restart_of_the_root(tmp_path: Path) -> None:
+    for is_first in (True, False):
+        async with hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}") as system:
+            sink = await start(system, "task", "sink", hf.start(Sink))
+            ref = await start(system, "task", "doer", hf.start(Doer), recovery=hf.replay_only())
+            if is_first:
+                await ref.ask(Do(["ask one", "ask two"], sink))
+            assert await ref.ask(Seen()) == ["one:1", "two:2"]
+            assert await sink.ask(Notes()) == (["one", "two"] if is_first else [])
+
+
+async def test_nothing_stays_of_an_ask_that_was_answered(isolation: str) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        sink = await start(system, "task", "sink", hf.start(Sink))
+        ref = await start(system, isolation, "doer", hf.start(Doer), recovery=hf.hybrid())
+        for _ in range(50):
+            await ref.ask(Do(["ask one"], sink))
+        gc.collect()
+        assert sum(isinstance(one, SwitchAsk) for one in gc.get_objects()) < 5

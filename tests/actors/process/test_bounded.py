@@ -227,6 +227,7 @@ async def test_senders_are_released_when_the_actor_is_gone(system: hf.ActorSyste
     waiting = [ref.ask(Add(1)) for _ in range(2)]
     await until(lambda: bool(bound_of(ref).senders))
     await system.stop(ref)  # The turn in hand never ends: it is killed.
-    for one in (*waiting, sending):
+    everybody: list[Awaitable[Any]] = [*waiting, sending]
+    for one in everybody:
         with pytest.raises(hf.ActorStopped):
             await one
