@@ -10,7 +10,8 @@ import pytest
 
 import holdfast as hf
 from holdfast.checkpoint.home.pending_asks import SwitchAsk
-from tests.checkpoint.players import Do, Doer, Notes, Seen, Sink, start
+from tests.checkpoint.players import Do, Doer, Notes, Seen, Sink, start, until
+from tests.checkpoint.strikes import home
 
 
 class No(hf.Refusal):
@@ -24,6 +25,10 @@ class Give(hf.Message[Any]):
 class Ask(hf.Message[str]):
     other: hf.ActorRef[Any]
     how: str
+
+
+class Send(hf.Message[str]):
+    other: hf.ActorRef[Any]
 
 
 class Giver(hf.Actor):
@@ -40,6 +45,12 @@ class Giver(hf.Actor):
                 return object()
 
 
+class Busy(Doer):
+    @hf.on(Give)
+    def give(self, message: Give) -> int:
+        return 7
+
+
 class Asker(hf.Actor):
     @hf.on(Ask)
     async def ask(self, message: Ask) -> str:
@@ -49,6 +60,14 @@ class Asker(hf.Actor):
             return f"refused: {no.why}"
         except hf.HoldfastError as error:
             return f"{type(error).__name__}: {error}"
+
+    @hf.on(Send)
+    async def send(self, message: Send) -> str:
+        try:
+            await message.other.send(Give("a reply"))
+        except hf.HoldfastError as error:
+            return type(error).__name__
+        return "sent"
 
 
 OUTCOMES = {
@@ -109,3 +128,18 @@ async def test_nothing_stays_of_an_ask_that_was_answered(isolation: str) -> None
             await ref.ask(Do(["ask one"], sink))
         gc.collect()
         assert sum(isinstance(one, SwitchAsk) for one in gc.get_objects()) < 5
+
+
+async def test_who_waits_for_room_hears_that_there_will_be_none(isolation: str, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
+    async with hf.ActorSystem("app", log=False) as system:
+        spec = hf.child("busy", hf.start(Busy), mailbox=hf.bounded(1), shutdown="brutal_kill")
+        busy = await system.start(spec)
+        busy.tell(Do([f"gate {gate}"]))
+        await until(gate.exists)
+        busy.tell(Give("a reply"))
+        one = await start(system, isolation, "asker", hf.start(Asker), recovery=hf.hybrid())
+        sending = one.ask(Send(busy), timeout=60.0)
+        await until(lambda: bool(home(one).calls.sends))
+        await system.stop(busy)
+        assert await sending == "ActorStopped"
