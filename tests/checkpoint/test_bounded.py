@@ -11,7 +11,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.players import Do, Doer, Note, Seen, start, until
-from tests.checkpoint.strikes import NEVER
+from tests.checkpoint.strikes import NEVER, home
 
 
 async def test_what_was_in_hand_when_it_died_is_handled_again(store: str | None, tmp_path: Path) -> None:
@@ -127,4 +127,24 @@ async def test_memory_of_what_is_dropped_is_given_back_while_the_turn_still_runs
         finally:
             tracemalloc.stop()
         assert held < 5 * size
+        gate.with_suffix(".open").touch()
+
+
+async def test_who_waits_for_room_is_released_when_the_supervisor_has_ended(tmp_path: Path) -> None:
+    """What is queued stays for the next life, so there is no room; the address is another life's."""
+    gate = tmp_path / "gate"
+    async with hf.ActorSystem("app", log=False, intensity=1000) as system:
+        spec = hf.child(
+            "doer", hf.start(Doer), recovery=hf.hybrid(interval=NEVER), mailbox=hf.bounded(1), shutdown="brutal_kill"
+        )
+        team = await system.start(hf.supervisor("team", children=[spec]))
+        ref = system.ref("/app/team/doer", Doer)
+        ref.tell(Do([f"gate {gate}"]))
+        await until(gate.exists)
+        ref.tell(Note("queued"))
+        sending = asyncio.ensure_future(ref.send(Note("late")))
+        await until(lambda: bool(home(ref).bound.senders))
+        team.kill()
+        with pytest.raises(hf.ActorStopped):
+            await asyncio.wait_for(sending, 60.0)
         gate.with_suffix(".open").touch()
