@@ -24,10 +24,10 @@ from typing import Any, NamedTuple
 from tests.removing import ROOT, copied
 
 ROOMS = {
-    "actors": ("tests/actors", "tests/control"),
+    "actors": ("tests/actors", "tests/control", "tests/migration"),
     "supervision": ("tests/supervision", "tests/control", "tests/system"),
     "checkpoint": ("tests/checkpoint",),
-    "ftm": ("tests/ftm",),
+    "ftm": ("tests/ftm", "tests/migration"),
 }
 """Where the lines are drawn, and which folders have the tests that are likely to see it."""
 FILES, SECONDS = 10, 300.0

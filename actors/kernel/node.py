@@ -248,8 +248,8 @@ class Node(RunLoop):
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
         cell = self.names.pop(name, None)
-        if cell is not None and cell.more is not None and name in cell.more.names:
-            cell.more.names.remove(name)
+        if cell is not None:
+            cell.extra().names.remove(name)
 
     def bind(self, cell: Cell, port: str, target: Cell, *, is_claimed: bool = False) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on.

@@ -14,7 +14,7 @@ from ...actors.errors import MailboxFull
 from ...actors.kernel.mailbox import Bound, Senders
 from ...actors.overflow import DROPS, Overflow, decide
 from ..inputs import Batch, Input
-from ..protocol import MESSAGE, START, Answer
+from ..protocol import MESSAGE, Answer
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Ask
@@ -153,7 +153,7 @@ class HomeBound:
 
     def may_feed(self, source: Input) -> bool:
         """Whether an input goes to the life now, or waits until the one in hand has ended."""
-        if not self.one_at_a_time or source.kind == START:
+        if not self.one_at_a_time:
             return True
         if self._fed >= 0:
             self._behind[source.id] = source

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import ctypes
 import gc
 import os
 import signal
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 
+from ...actors.process.fork.boot import PR_SET_PDEATHSIG, bind_prctl
 from ...actors.streams import check_can_watch
 from ..protocol import Kept, Marked, Shared, Snapshot, Unsaved
 from .key_variables import state_of, variables
@@ -44,8 +44,7 @@ MOST_COPIED: Final = 200 * 1024 * 1024
 """Arrays up to this size that are rewritten between two snapshots are copied: a fault for each page takes longer."""
 MOST_SEGMENTS: Final = 32
 """Segments that one image may be spread over before it is written anew."""
-_PR_SET_PDEATHSIG: Final = 1
-_prctl: Any = ctypes.CDLL(None).prctl
+_prctl = bind_prctl()
 
 
 class Written(msgspec.Struct, array_like=True):
@@ -313,7 +312,7 @@ def _write_and_exit(imaging: Imaging, job: _Job, state: Any, out: int, parent: i
     """In the forked process: nothing of the program may go on here, and nothing that it holds open stay open."""
     try:
         gc.disable()
-        _prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
+        _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
         _close_all_but({out, job.file})

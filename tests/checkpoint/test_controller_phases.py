@@ -342,3 +342,21 @@ async def test_a_system_ends_in_the_middle_of_a_recovery(isolation: str) -> None
         robot = await planner(system, isolation)
         strike(system, robot)
         await reached.wait()
+
+
+@pytest.mark.parametrize("isolation", ["task", "process"])
+async def test_a_recovery_that_is_given_up_is_over_and_the_next_one_counts_anew(isolation: Any) -> None:
+    async with running() as system:
+        spec = hf.child("robot", hf.start(Doer), isolation=isolation, recovery=hf.hybrid(interval=3600.0))
+        await system.start(hf.supervisor("team", children=[spec], intensity=0))
+        robot = system.ref("/app/team/robot", Doer)
+        await robot.ask(Note("one"))
+        with system.events() as stream:
+            strike(system, robot)
+            await until(lambda: robot._cell.is_dead)
+            await over(system)
+            told = [one for one in stream.take() if isinstance(one, hf.RecoveryPhase)]
+    assert [(one.recovery, one.attempt, one.phase) for one in told] == [
+        (1, 1, "detect"),
+        *((2, 1, one) for one in ORDER),
+    ]

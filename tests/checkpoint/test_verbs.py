@@ -308,6 +308,9 @@ class Forward(hf.Actor):
         task = self.ctx.create_task(self._background())  # While the hook still runs.
         await task
 
+    async def on_recovered(self) -> None:
+        await self.ctx.create_task(self._background())
+
     @hf.on(Tick)
     def tick(self, message: Tick) -> None:
         self.in_background.append(message.text)
@@ -329,11 +332,11 @@ async def test_what_is_refused_is_refused_with_its_reason(isolation: str) -> Non
     async with hf.ActorSystem("app", log=False, intensity=1000) as system:
         ref = await start(system, isolation, "acting", hf.start(Forward), recovery=method("hybrid"))
         await system.checkpoint(ref, timeout=30.0)
-        await struck(system, ref)  # on_start(True) has a background task, too.
+        await struck(system, ref)  # on_start(True) and on_recovered have a background task, too.
         await ref.ask(Act(), timeout=30.0)
         told = await ref.ask(Heard(), timeout=30.0)
     names = list(forbidden(None, ref))
-    assert [one.partition(":")[0] for one in told] == [*names, *names, *names, *names]
+    assert [one.partition(":")[0] for one in told] == names * 5
     assert [one for one in told[: len(names)] if "act in on_start" not in one] == []
     assert all("report with ctx.pipe_to_self" in one for one in told[len(names) :])
 

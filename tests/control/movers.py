@@ -280,6 +280,20 @@ class Spawns(Account):
         self.ctx.spawn(hf.start(Account), "own")
 
 
+class Homesick(hf.Actor):
+    """Never comes up in one process, and notes there that it was ended."""
+
+    def __init__(self, process: int, ended: str) -> None:
+        self.process, self.ended = process, ended
+
+    async def on_start(self, restored: bool) -> None:
+        if os.getpid() == self.process:
+            try:
+                await asyncio.Event().wait()
+            finally:
+                Path(self.ended).touch()
+
+
 class Picky(hf.Actor):
     """Its state goes through hooks."""
 

@@ -20,6 +20,7 @@ from tests.control.movers import (
     Downs,
     End,
     Friend,
+    Homesick,
     Large,
     Later,
     Ledger,
@@ -273,6 +274,17 @@ async def test_a_turn_in_hand_is_waited_for(system: hf.ActorSystem, recovery: An
     assert await waiting == "waited"
     await moving
     assert await one.ask(Add(1)) == 1
+
+
+async def test_a_new_life_that_does_not_come_up_is_ended(system: hf.ActorSystem, recovery: Any, tmp_path: Path) -> None:
+    ended = tmp_path / "ended"
+    recipe = hf.start(Homesick, os.getpid(), str(ended))
+    one = await system.start(hf.child("one", recipe, recovery=recovery, isolation="process"))
+    with pytest.raises(hf.CannotMove):
+        await system.set_isolation(one, "task", timeout=1.0)
+    await until_there(ended)
+    assert lives_in(system, one) == "process"
+    assert (await system.get_state(one))["ended"] == str(ended)
 
 
 async def test_links_watches_topics_bindings_and_names_stay(system: hf.ActorSystem, here: Any) -> None:

@@ -6,13 +6,14 @@ import asyncio
 import os
 import random
 import signal
+from collections import Counter as Multiset
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.events import FailedOver, ReplicaJoined, WrongSuspicion
+from holdfast.ftm.events import FailedOver, ReplicaJoined, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group.group import Group
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
@@ -155,11 +156,13 @@ async def test_killing_a_replica_under_load_loses_nothing(system: hf.ActorSystem
     ref = await started(system, recovery=METHODS[method]())
     load, rng = Load(ref), random.Random(f"{SEED} {method} {who}")
     events = system.events()
+    killed: list[str] = []
     for _ in range(4):
         await load.reached(rng.randrange(1, 60))
         group = group_of(ref)
         name = group.primary if who == "primary" else other(group)
         assert name is not None
+        killed.append(name)
         os.kill(pid_of(system, ref, name), signal.SIGKILL)
         await load.reached(20)
         await two_again(ref)
@@ -168,6 +171,7 @@ async def test_killing_a_replica_under_load_loses_nothing(system: hf.ActorSystem
     seen = events.take()
     assert sum(isinstance(event, FailedOver) for event in seen) == (4 if who == "primary" else 0)
     assert sum(isinstance(event, ReplicaJoined) for event in seen) >= 4
+    assert not Multiset(killed) - Multiset(event.replica for event in seen if isinstance(event, ReplicaLost))
     events.close()
 
 
@@ -491,3 +495,22 @@ async def test_without_state_access_a_follower_is_there_before_the_first_request
     assert await ref.ask(Add(1), timeout=60) == 1
     os.kill(pid_of(system, ref, "r1"), signal.SIGKILL)
     assert await ref.ask(Add(2), timeout=60) == 2
+
+
+@pytest.mark.parametrize("mechanism", [hf.PBR(), hf.LFR()], ids=["pbr", "lfr"])
+async def test_one_that_comes_back_fresh_leads_on_from_no_state(system: hf.ActorSystem, mechanism: Any) -> None:
+    recovery = hf.hybrid(interval=3600.0, on_escalate="fresh")
+    spec = hf.child("counter", hf.start(Counter), mechanism=mechanism, recovery=recovery)
+    await system.start(hf.supervisor("team", children=[spec], intensity=0))
+    ref = system.ref("/app/team/counter", Counter)
+    assert await ref.ask(Add(0, 5), timeout=60.0) == 5
+    with system.events() as stream:
+        for name in group_of(ref).names:
+            os.kill(pid_of(system, ref, name), signal.SIGKILL)
+        async with asyncio.timeout(30.0):
+            async for one in stream:
+                if isinstance(one, hf.ActorStarted) and one.address == ref.path:
+                    break
+    again = system.ref(ref.path, Counter)
+    assert await again.ask(Add(1), timeout=30.0) == 1
+    assert await again.ask(Tags(), timeout=30.0) == [1]

@@ -1,7 +1,8 @@
-"""What a protected actor's `on_start` sets up is there once, whoever leads."""
+"""What the hooks of a protected actor set up or say is there once, whoever leads."""
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 from pathlib import Path
@@ -88,3 +89,41 @@ async def test_a_handle_of_on_start_is_good_after_a_failover_and_a_restart_of_th
         assert len(home.switch.timers.saved()) == 1
         await ref.ask(Halt(), timeout=60.0)
         assert home.switch.timers.saved() == {}
+
+
+class Word(hf.Message):
+    text: str
+
+
+class Words(hf.Message[list[str]]): ...
+
+
+class Listener(hf.Actor):
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    @hf.on(Word)
+    def hear(self, message: Word) -> None:
+        self.heard.append(message.text)
+
+    @hf.on(Words)
+    def read(self, message: Words) -> list[str]:
+        return self.heard
+
+
+class Polite(hf.Actor):
+    """Takes its time to say goodbye."""
+
+    async def on_stop(self, reason: hf.ExitReason) -> None:
+        listener = self.ctx.find("/app/listener", Listener)
+        listener.tell(Word("I go"))
+        await asyncio.sleep(0.1)
+        listener.tell(Word("I am gone"))
+
+
+async def test_what_a_protected_actor_says_when_it_stops_is_heard() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        listener = await system.start(hf.child("listener", hf.start(Listener)))
+        ref = await system.start(hf.child("polite", hf.start(Polite), mechanism=hf.PBR()))
+        await system.stop(ref)
+        assert await listener.ask(Words()) == ["I go", "I am gone"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,15 @@ def test_settings_travel() -> None:
     assert revive(PBR(acknowledge=False, window=3).describe()) == PBR(acknowledge=False, window=3)
 
 
+class Family:
+    class Member(PBR):
+        class Branch(PBR): ...
+
+
+def test_classes_within_classes_travel() -> None:
+    assert revive(Family.Member.Branch().describe()) == Family.Member.Branch()
+
+
 def test_what_is_not_there_or_no_mechanism_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MechanismRefused, match="no mechanism of that name"):
         find("nothing")
@@ -103,6 +113,21 @@ def test_a_file_that_others_may_write_or_that_has_changed_is_refused(tmp_path: P
     path.write_text(path.read_text() + "# changed\n")
     with pytest.raises(MechanismRefused, match="has changed"):
         revive(described)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give a file to others")
+def test_a_file_of_root_is_trusted_and_one_of_another_user_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = own_copy(tmp_path)
+    me, another = 1000, 1
+    monkeypatch.setattr(os, "getuid", lambda: me)
+    for trusted in (0, me):
+        os.chown(path, trusted, trusted)
+        assert load(path).name == "noting"
+    os.chown(path, another, another)
+    with pytest.raises(MechanismRefused, match="must belong to this user"):
+        load(path)
 
 
 def test_one_slot_is_one_brick() -> None:

@@ -294,6 +294,19 @@ async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
     assert (group_of(ref).epoch, ref._cell.life) == (1, 1)
 
 
+async def test_frames_at_a_replica_without_a_secured_link_are_refused_and_harm_nobody(secured: hf.ActorSystem) -> None:
+    ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.PBR()))
+    await joined(ref)
+    lives = dict(group_of(ref).members)
+    for name in ("r1", "r2"):
+        protocol = secured.node.cell_at(f"/app/c/ftm/{name}/protocol").ref
+        for frame in (Greet(b"hello"), Agree(b"hello", b"finish"), Sealed(b"frame")):
+            with pytest.raises(Refused, match="closed"):
+                await protocol.ask(frame)
+    assert await ref.ask(Add(1)) == 1
+    assert group_of(ref).members == lives
+
+
 async def test_keys_rotate_sessions_end_and_each_epoch_has_its_own(secured: hf.ActorSystem) -> None:
     sec = SEC(CA, rotate_messages=3, lifetime=0.3)
     ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(sec, hf.PBR())))

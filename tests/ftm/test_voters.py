@@ -48,6 +48,10 @@ class Kind(enum.IntEnum):
     ONE = 1
 
 
+class Word(str):
+    __slots__ = ()
+
+
 @dataclass
 class Pose:
     x: float
@@ -94,6 +98,9 @@ SAME = [
     (b"x", bytearray(b"x")),
     (np.array([[1.0, NAN]]), np.array([[1.0, NAN]])),
     (np.float64(2.0), 2),
+    (np.int64(2), 2),
+    (np.bool_(True), True),
+    (Word("x"), "x"),
     (Pose(1, 2), Pose(1.0, 2.0)),
     (ValueError("x"), ValueError("x")),
 ]

@@ -243,6 +243,19 @@ async def test_while_nobody_is_up_messages_wait_in_their_order() -> None:
         assert (status.up, status.waiting) == (1, 0)
 
 
+@pytest.mark.asyncio(loop_factories=["virtual"])
+async def test_a_broadcast_waits_while_nobody_is_up() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        worker = hf.child(None, hf.start(Worker), backoff=hf.Backoff(10, 10))
+        _, pool = await begin(system, worker, size=1, routing="broadcast")
+        one(system, 0).tell(Boom())
+        await settled(system)
+        pool.tell(Note("a"))
+        pool.tell(Note("b"))
+        await asyncio.sleep(20)
+        assert await one(system, 0).ask(Notes()) == ["a", "b"]
+
+
 async def test_nothing_is_lost_or_doubled_or_left_while_workers_crash() -> None:
     async with hf.ActorSystem(log=False) as system:
         top, pool = await begin(system, size=3, intensity=10_000)

@@ -69,6 +69,16 @@ async def begun(system: hf.ActorSystem, *paths: str) -> None:
         await asyncio.sleep(0)
 
 
+async def test_a_start_in_a_process_is_ended_by_a_kill_however_early_it_comes() -> None:
+    async with hf.ActorSystem(log=False) as system:
+        spec = hf.child("one", hf.start(Blocker, "nowhere"), isolation="process", restart="temporary")
+        started = asyncio.ensure_future(system.start(spec))
+        await begun(system, "/app/one")
+        system.ref("/app/one", Blocker).kill()
+        with pytest.raises(hf.StartFailed):
+            await asyncio.wait_for(started, SECONDS)
+
+
 # -- it answers -----------------------------------------------------------------------------------------------------
 
 

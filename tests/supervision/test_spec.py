@@ -38,6 +38,8 @@ WRONG: list[tuple[Callable[[], object], str, str]] = [
     (lambda: kid(shutdown=-1), "child 'kid'", "shutdown must be seconds >= 0"),
     (lambda: kid(shutdown=float("nan")), "child 'kid'", "shutdown must be seconds >= 0"),
     (lambda: kid(shutdown=True), "child 'kid'", "shutdown must be seconds >= 0"),
+    (lambda: kid(autostart="no"), "child 'kid'", "autostart must be True or False, not 'no'"),
+    (lambda: kid(significant=1), "child 'kid'", "significant must be True or False, not 1"),
     (lambda: kid(recovery="hybrid"), "child 'kid'", "recovery must be a method such as hybrid(...) or left out"),
     (lambda: kid(mailbox=100), "child 'kid'", "mailbox must be bounded(...) or left out, not 100"),
     (lambda: kid(backoff=1.0), "child 'kid'", "backoff must be Backoff(...) or left out, not 1.0"),

@@ -90,6 +90,15 @@ async def test_ask_is_refused_or_waits(busy: Busy, gate: Path, overflow: str) ->
         assert {type(outcome) for outcome in outcomes[2:]} == {hf.MailboxFull}
 
 
+async def test_asks_that_wait_are_let_in_one_for_each_that_leaves(busy: Busy, gate: Path) -> None:
+    ref = await busy(1)
+    asks = [ref.ask(Add(1)) for _ in range(20)]
+    gate.touch()
+    for number, ask in enumerate(asks):
+        assert await ask == number + 2
+        assert bound_of(ref).count <= 1
+
+
 async def test_an_ask_that_waits_for_room_expires(busy: Busy, gate: Path) -> None:
     ref = await busy(1)
     ref.tell(Add(1))
@@ -129,6 +138,17 @@ async def test_what_is_dropped(system: hf.ActorSystem, busy: Busy, gate: Path, o
     gate.touch()
     await until(lambda: bound_of(ref).count == 0)
     assert await ref.ask(Notes()) == kept
+
+
+@pytest.mark.parametrize("overflow", ["drop_oldest", "latest", "drop_newest"])
+async def test_who_asks_hears_that_it_was_dropped(busy: Busy, gate: Path, overflow: str) -> None:
+    ref = await busy(1, overflow)
+    first, second = ref.ask(Add(1), timeout=60.0), ref.ask(Add(10), timeout=60.0)
+    loser, winner = (second, first) if overflow == "drop_newest" else (first, second)
+    with pytest.raises(hf.MailboxFull):
+        await loser
+    gate.touch()
+    assert await winner == (2 if winner is first else 11)
 
 
 async def test_many_messages_flow_through_a_small_mailbox(busy: Busy, gate: Path) -> None:
@@ -205,9 +225,10 @@ async def test_senders_are_released_when_the_actor_is_gone(system: hf.ActorSyste
     ref = await busy(1)
     ref.tell(Add(1))
     sending = asyncio.ensure_future(ref.send(Add(1)))
-    waiting = ref.ask(Add(1))
+    waiting = [ref.ask(Add(1)) for _ in range(2)]
     await until(lambda: bool(bound_of(ref).senders))
     await system.stop(ref)  # The turn in hand never ends: it is killed.
-    for one in (waiting, sending):
+    everybody: list[Awaitable[Any]] = [*waiting, sending]
+    for one in everybody:
         with pytest.raises(hf.ActorStopped):
             await one

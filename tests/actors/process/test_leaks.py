@@ -141,6 +141,16 @@ async def test_no_actor_is_given_a_process_that_is_about_to_end(system: hf.Actor
     taken.kill(hf.KILLED)
 
 
+async def test_a_process_that_has_ended_launches_nobody(system: hf.ActorSystem) -> None:
+    """It may have ended since it was taken: then its end has been told, and nobody would end the launch."""
+    ref = await system.start(hf.child("account", hf.start(Account), isolation="process"))
+    taken = await system._workers.take()
+    taken.kill(hf.KILLED)
+    await taken.gone()
+    with pytest.raises(hf.StartFailed, match="its process has ended"):
+        await asyncio.wait_for(taken.launch(ref._cell, b"", {}), 60.0)
+
+
 async def test_a_stopped_system_leaves_no_process_that_an_actor_started() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process"))

@@ -102,6 +102,28 @@ async def test_a_revocation_ends_the_sessions_there_are(whom: str) -> None:
         wire.close()
 
 
+async def test_an_end_that_is_closed_takes_nothing_and_begins_nothing() -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.child("ca", hf.start(CertificationAuthority)))
+        wire, other = Wire(system), Wire(system)
+        await wire.outer.ready()
+        assert (await wire.ask(b"before")).body == b"before"
+        wire.inner.close()
+        other.inner.close()
+        for one in (wire, other):  # There is a session, or there is none yet.
+            asked = asyncio.ensure_future(one.ask(b"after"))
+            async with asyncio.timeout(20.0):
+                while not one.refused:
+                    await asyncio.sleep(0)
+            one.is_wanted = False
+            with pytest.raises(LinkLost):
+                await asked
+            assert set(one.refused) == {"closed"}
+            one.close()
+        assert wire.done == [b"before"]
+        assert other.done == []
+
+
 class Late(CertificationAuthority):
     """The time of its lists is over when they come."""
 
