@@ -131,6 +131,7 @@ KINDS: dict[str, Any] = {
 }
 
 
+BELOW = "a process, below its supervisor"
 OWN_BELOW = "a process of its own, below a supervisor in another"
 
 
@@ -144,7 +145,7 @@ def tree(place: str, kind: str) -> hf.ChildSpec:
     if KINDS[kind] is not None:
         where["recovery"] = KINDS[kind]
     one = hf.child("one", hf.start(Traveller), **where)
-    if place in ("a process, below its supervisor", OWN_BELOW):
+    if place in (BELOW, OWN_BELOW):
         return hf.supervisor("here", children=[one], isolation="process", intensity=1000)
     if place == "a process, two deep":
         inner = hf.supervisor("inner", children=[one], intensity=1000)
