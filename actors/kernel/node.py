@@ -9,6 +9,7 @@ import random
 import time
 import weakref
 from collections.abc import Callable
+from time import monotonic
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from ..errors import ActorStopped, HoldfastError, NameTaken, NoSuchActor, SpecError, WrongActor, type_name
@@ -34,6 +35,9 @@ if TYPE_CHECKING:
 
 A = TypeVar("A", bound="Actor")
 
+SAME_CLOCK = 60.0
+"""Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""
+
 
 class Kept(Protocol):
     """What belongs to an address, whoever lives there."""
@@ -57,6 +61,7 @@ class Node(RunLoop):
         self.watched = False  # whether anybody looks at events: else they are not even made
         self.events = EventHub(self._watch)
         self.topics = Topics()
+        self.is_monotonic = abs(monotonic() - loop.time()) < SAME_CLOCK  # whether the loop has the machine's clock
         self.threads = Threads()
         self.names: dict[str, Cell] = {}
         self.kept: weakref.WeakKeyDictionary[Cell, Kept] = weakref.WeakKeyDictionary()  # outlives an actor's lives
@@ -133,6 +138,13 @@ class Node(RunLoop):
         return next(self._turns)
 
     # -- the tree ---------------------------------------------------------------------------------------------------
+
+    def is_past(self, deadline: float) -> bool:
+        """Whether a deadline is over that was set in this process or another one of the system.
+
+        A loop's own time may be some milliseconds late, so the root's may have told of the end already.
+        """
+        return deadline <= (monotonic() if self.is_monotonic else self.loop.time())
 
     def cell_below(self, parent: Cell | None, name: str | None, host: Host | None = None) -> Cell:
         """A new cell in the tree.

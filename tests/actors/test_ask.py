@@ -2,12 +2,14 @@
 
 import asyncio
 import gc
+import time
 import weakref
 from typing import Any
 
 import pytest
 
 import holdfast as hf
+from holdfast.actors.kernel.node import Node
 
 
 class Work(hf.Message[str]):
@@ -492,3 +494,19 @@ async def test_every_ask_under_churn_has_one_outcome(system: hf.ActorSystem) -> 
     kinds = {type(outcome) for outcome in outcomes}
     assert kinds <= {str, hf.ActorStopped, hf.RemoteCrash, hf.AskFailed}
     assert {str, hf.ActorStopped} <= kinds
+
+
+def test_a_deadline_is_over_when_the_machine_says_so_though_the_loop_is_late() -> None:
+    """The loop of an actor's process may be late: whoever has asked has been told already that it was not run."""
+
+    class Late(asyncio.SelectorEventLoop):
+        def time(self) -> float:
+            return super().time() - 0.005
+
+    loop = Late()
+    try:
+        node = Node("late", loop)
+        assert node.is_past(time.monotonic())
+        assert not node.is_past(time.monotonic() + 60.0)
+    finally:
+        loop.close()

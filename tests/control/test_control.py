@@ -86,6 +86,20 @@ async def test_a_caller_may_time_out_at_a_suspended_actor(system: hf.ActorSystem
     assert await one.ask(Total()) == 0  # expired before its turn, so it was not run
 
 
+@pytest.mark.asyncio(loop_factories=["asyncio"])
+async def test_what_an_asker_was_told_is_over_is_not_run_a_moment_later(
+    system: hf.ActorSystem, start_one: Starter
+) -> None:
+    """The two processes may have loops of different kinds, one of which reads its clock seldom."""
+    one = await start_one(hf.start(Account))
+    for _ in range(30):
+        await system.suspend(one)
+        with pytest.raises(hf.AskTimeout):
+            await one.ask(Add(1), timeout=0.003)
+        await system.resume(one)
+    assert await one.ask(Total()) == 0
+
+
 async def test_suspending_and_resuming_twice_is_no_error(system: hf.ActorSystem, start_one: Starter) -> None:
     one = await start_one(hf.start(Account))
     await system.resume(one)

@@ -44,7 +44,6 @@ class Peer:
         self.codec: Codec = node.codec
         self.pending: dict[int, Ask] = {}
         self._last_id = 0
-        self._is_monotonic = abs(monotonic() - node.loop.time()) < SAME_CLOCK
         self.routes: dict[tuple[frames.Name, frames.Name], Route] = {}
         self.kinds_out: dict[type, int] = {}  # the connection's, once there is one
         self.record_taker: Callable[[str], frames.TakeRecord] = no_records  # the recovery method's, by address
@@ -81,7 +80,7 @@ class Peer:
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
         self._last_id = key = self._last_id + 1
-        until = ask.deadline if self._is_monotonic else monotonic() + ask.deadline - self.node.loop.time()
+        until = ask.deadline if self.node.is_monotonic else monotonic() + ask.deadline - self.node.loop.time()
         to = connection.name_out(path)
         name, body = self._payload(ask.message)
         sender = None if ask.sender is None else connection.name_out(ask.sender.path)
@@ -255,9 +254,6 @@ def no_records(path: str) -> frames.TakeRecord:
 
 
 NIL = Raw(msgspec.msgpack.encode(None))
-
-SAME_CLOCK = 60.0
-"""Seconds by which a loop's clock may be behind the monotonic one that it reads; the clock of a test is elsewhere."""
 
 
 class Accepted(Message[None]):
