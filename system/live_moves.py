@@ -90,14 +90,14 @@ class Moves:
         self, cell: Cell, isolation: Isolation, limits: Limits | None, timeout: float, gate: Gate | None
     ) -> None:
         async with self.lock(cell):
-            origin = place_of(cell)
+            origin, place = place_of(cell), cell.host.place
+            known = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
+            if origin == isolation and (known is None or known.mechanism is None):
+                return
             spec = _spec_there(cell, isolation, limits)
-            place = cell.host.place
             if spec.mechanism is not None:  # Its replicas have processes: it lives there when nobody protects it.
                 replace_place(cell, spec)
                 cell.host.parent.respecified(cell, place.spec_data(cell))
-                return
-            if origin == isolation:
                 return
             move = await self._moved(
                 cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
@@ -364,7 +364,7 @@ def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> Chil
         raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
     is_recorded = isinstance(cell.host.home, JournalHome)
     if isinstance(cell.host, OutsideHost) or (isinstance(cell.host.parent, FarParent) and not is_recorded):
-        why = "its supervisor lives in another process, and it has no recovery: say its `isolation` in the spec"
+        why = "its supervisor lives in another process, and it has no recovery: there, its spec says where it lives"
         raise CannotMove(cell.path, why)
     try:
         return dataclasses.replace(spec, isolation=isolation, limits=limits if limits is not None else spec.limits)

@@ -156,6 +156,19 @@ async def test_it_moves_to_its_supervisor_and_back_and_stays_there(system: hf.Ac
     assert await alice.ask(Add(1), timeout=30.0) == 105
 
 
+async def test_without_recovery_it_stays_where_its_spec_says(system: hf.ActorSystem) -> None:
+    await system.start(team())
+    alice, bob = at(system, "alice"), at(system, "bob")
+    await system.set_isolation(alice, "process")  # There it is.
+    await system.set_isolation(bob, "task")
+    for ref, isolation in ((alice, "task"), (bob, "process")):
+        before = system.pid_of(ref)
+        with pytest.raises(hf.CannotMove, match="it has no recovery: there, its spec says where it lives"):
+            await system.set_isolation(ref, isolation)  # type: ignore[arg-type]  # one of both
+        assert await ref.ask(Add(0)) > 0
+        assert system.pid_of(ref) == before
+
+
 async def test_it_is_protected_and_lives_there_again_after_that(system: hf.ActorSystem) -> None:
     await system.start(team(hf.hybrid()))
     alice = at(system, "alice")
