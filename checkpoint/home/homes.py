@@ -21,11 +21,12 @@ from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_schedule import nobody
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
-from .held_messages import let_go
+from .held_messages import Holding, let_go
 from .quarantine import PLACE, Quarantine
 from .switch import Switch
 
 if TYPE_CHECKING:
+    from ...actors.kernel.mailbox import Bound
     from ...actors.kernel.node import Node
 
 ENDED = "it ended before it was live"
@@ -84,8 +85,8 @@ class Homes:
         self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
-            let_go(switch)
-            switch.bound, more.bound = HomeBound(switch, more.bound), None
+            _bind(switch, more.bound)
+            more.bound = None
         self.groups.opened(switch)
         cell.admit = switch.admit
         more.outlet = switch
@@ -291,3 +292,15 @@ class Homes:
         for switch in self._switches.values():
             switch.images.close()
         self.journal.close()
+
+
+def _bind(switch: Switch, chosen: Bound) -> None:
+    """Give a home its mailbox's bound; whoever waits for room there waits on, also in the next life."""
+    before = switch.holding.inner if switch.holding is not None else switch.bound
+    assert not isinstance(before, Holding)
+    if before is not None and (before.capacity, before.overflow) == (chosen.capacity, chosen.overflow):
+        return
+    let_go(switch)
+    bound = switch.bound = HomeBound(switch, chosen)
+    if before is not None:
+        bound.waiting, bound.senders = before.waiting, before.senders

@@ -139,6 +139,25 @@ def pids_now(system: hf.ActorSystem) -> list[int]:
     return [pid for pid in found if pid != os.getpid() and psutil.pid_exists(pid)]
 
 
+@pytest.mark.parametrize("who", ["alice", "bob"])
+async def test_who_waits_for_room_is_let_in_by_the_next_life(system: hf.ActorSystem, who: str) -> None:
+    children = [
+        hf.child("alice", hf.start(Account), isolation="process", recovery=hf.hybrid(), mailbox=hf.bounded(2)),
+        hf.child("bob", hf.start(Account), recovery=hf.hybrid(), mailbox=hf.bounded(2)),
+    ]
+    await system.start(hf.supervisor("team", children=children, isolation="process", intensity=100))
+    ref = at(system, who)
+    await ref.ask(Total())
+    await system.suspend(ref)
+    waiting: list[asyncio.Future[Any]] = [ref.ask(Add(1), timeout=60.0) for _ in range(6)]
+    waiting += [asyncio.ensure_future(ref.send(Add(1))) for _ in range(3)]
+    await asyncio.sleep(0)
+    os.kill(system.pid_of(ref), signal.SIGKILL)  # The suspension ends with the life.
+    async with asyncio.timeout(30.0):
+        await asyncio.gather(*waiting)
+    assert await ref.ask(Total()) == 9
+
+
 async def test_it_moves_to_its_supervisor_and_back_and_stays_there(system: hf.ActorSystem) -> None:
     await system.start(team(hf.hybrid()))
     alice = at(system, "alice")
