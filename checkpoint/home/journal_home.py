@@ -164,8 +164,8 @@ class JournalHome(RecordedHome):
         self.clock.mark("noticed", noticed)
         self.clock.mark("detect")
         switch.died(running, ordered=ordered)
+        end = cell.extra().reason if reason is None else reason
         if recovers is None:
-            end = cell.extra().reason if reason is None else reason
             recovers = self.recovers(end) and cell.spec is not None and cell.spec.restarts(end)
         if recovers:
             hold(switch, running)
@@ -174,6 +174,10 @@ class JournalHome(RecordedHome):
         if switch.live is not None and not switch.live.done():
             switch.live.set_exception(StartFailed(cell.path, why))
             switch.live.exception()  # Nobody may be left to look.
+        self.life_ended(switch, end)
+
+    def life_ended(self, switch: Switch, reason: ExitReason) -> None:
+        """A life has ended: a home that keeps less than everything forgets the rest."""
 
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it counts."""

@@ -40,20 +40,8 @@ class TransientHome(JournalHome):
         self.copy = None
         return entered
 
-    def over(
-        self,
-        cell: Cell,
-        running: int,
-        why: str,
-        *,
-        ordered: bool,
-        noticed: float | None = None,
-        reason: ExitReason | None = None,
-        recovers: bool | None = None,
-    ) -> None:
-        super().over(cell, running, why, ordered=ordered, noticed=noticed, reason=reason, recovers=recovers)
-        if self.switch is not None:
-            forget_later(self.switch, str(cell.extra().reason if reason is None else reason))
+    def life_ended(self, switch: Switch, reason: ExitReason) -> None:
+        forget_later(switch, str(reason))
 
 
 def forget_ended(switch: Switch) -> None:
