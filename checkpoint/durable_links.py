@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 from ..actors.kernel import links
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from ..actors.kernel.cell import Cell
     from .home.switch import Switch
 
@@ -45,11 +47,18 @@ class Ties:
         """Whether there is such a tie, or will be when the other one is there."""
         return (verb, path) in self._kept
 
+    def rename(self, now: Callable[[str], str]) -> None:
+        """Some of the others have moved: `now` gives their addresses."""
+        self._kept, self._untied = _renamed(self._kept, now), _renamed(self._untied, now)
+
     def go_back(self, ties: list[Tie]) -> None:
         """These again, as a snapshot has them: what was tied since is undone, and what was untied comes back."""
         cell, node = self._home.cell, self._home.node
         undo = {verb: name for name, verb in UNDONE_BY.items()}
+        addresses = self._home.addresses
         before, self._kept = self._kept, Counter(ties)
+        if addresses is not None:
+            self._kept = _renamed(self._kept, addresses.now)
         stand = before - self._untied
         for verb, path in (stand - self._kept).elements():
             if cell is not None:
@@ -89,6 +98,10 @@ class Ties:
             return
         if tied(cell, other, verb) < self._kept[verb, path]:  # Else it was undone while the other one was awaited.
             connect(cell, other, verb)
+
+
+def _renamed(ties: Counter[Tie], now: Callable[[str], str]) -> Counter[Tie]:
+    return Counter((verb, now(path)) for verb, path in ties.elements())
 
 
 def tied(cell: Cell, other: Cell, verb: str) -> int:

@@ -28,6 +28,8 @@ class Called:
         self._engine = engine
         self._name = str(getattr(engine, "path", type(engine).__qualname__))
         self._failure: StoreFailed | None = None
+        self.keys: dict[str, str] = {}
+        """The names under which the engine has addresses, where those are other ones (`home/addresses.py`)."""
         self.durable = engine.durable
         self.epoch = self._call(lambda: engine.epoch)
         self.in_hand: InHand | None = getattr(engine, "in_hand", None)
@@ -67,6 +69,8 @@ class Called:
         if self._failure is not None:
             raise StoreFailed(*self._failure.args)
         try:
+            if self.keys:
+                entries = [(self.keys.get(address, address), entry) for address, entry in entries]
             return self._engine.append(entries)  # not through `_call_for_good`: this is done for every message
         except HoldfastError:
             raise
@@ -81,7 +85,7 @@ class Called:
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
         """See `Journal`."""
         self._refuse_failed()
-        self._call(self._engine.cut, address, snapshot, drop, turn=turn, keep=keep)
+        self._call(self._engine.cut, self._key(address), snapshot, drop, turn=turn, keep=keep)
 
     @contextlib.contextmanager
     def together(self) -> Generator[None, None, None]:
@@ -102,32 +106,36 @@ class Called:
 
     def load(self, address: str, *, older: int = False) -> Saved:
         """See `Journal`."""
-        return self._call(self._engine.load, address, older=older)
+        return self._call(self._engine.load, self._key(address), older=older)
 
     def erase(self, address: str) -> None:
         """See `Journal`."""
         self._refuse_failed()
-        self._call(self._engine.erase, address)
+        self._call(self._engine.erase, self._key(address))
 
     def keep_blocks(
         self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
     ) -> None:
         """See `Journal`."""
         self._refuse_failed()
-        self._call(self._engine.keep_blocks, address, number, blocks, compress)
+        self._call(self._engine.keep_blocks, self._key(address), number, blocks, compress)
 
     def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
         """See `Journal`."""
-        return self._call(self._engine.read_blocks, address, number, places)
+        return self._call(self._engine.read_blocks, self._key(address), number, places)
 
     def forget_blocks(self, address: str, needed: Collection[int]) -> None:
         """See `Journal`."""
         self._refuse_failed()
-        self._call(self._engine.forget_blocks, address, needed)
+        self._call(self._engine.forget_blocks, self._key(address), needed)
 
     def addresses(self) -> list[str]:
         """See `Journal`."""
-        return self._call(self._engine.addresses)
+        names = {key: address for address, key in self.keys.items()}
+        return sorted(names.get(key, key) for key in self._call(self._engine.addresses))
+
+    def _key(self, address: str) -> str:
+        return self.keys.get(address, address)
 
     def note(self, key: str, value: bytes | None) -> None:
         """See `Journal`."""

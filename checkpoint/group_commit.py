@@ -14,7 +14,7 @@ import contextlib
 import contextvars
 import functools
 from collections import deque
-from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Protocol
@@ -117,6 +117,12 @@ class Commits:
             self._synced_paths.add(path)
         else:
             self._quick_paths.add(path)
+
+    def rename(self, paths: Mapping[str, str]) -> None:
+        """Homes have other addresses from now on; nothing of theirs waits to be written."""
+        self._synced_paths = {paths.get(path, path) for path in self._synced_paths}
+        self._quick_paths = {paths.get(path, path) for path in self._quick_paths}
+        self._slow = {paths.get(path, path): number for path, number in self._slow.items()}
 
     def _is_slow(self, entries: Iterable[tuple[str, Entry]]) -> bool:
         if not self._quick_paths:

@@ -16,7 +16,7 @@ from ..actors.kernel.cell import Cell
 from ..actors.kernel.node import cell_kind
 from ..actors.kernel.ref import current
 from ..actors.migration.here import ToHere
-from ..actors.migration.move import Entering, Gate, Move
+from ..actors.migration.move import Entering, Gate, Move, Pause
 from ..actors.migration.worker import ToWorker
 from ..actors.ordered import Ordered
 from ..actors.process.process_host import WorkerPlace
@@ -246,6 +246,15 @@ class Moves:
             was, names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
             seconds = change.gone_on_at - change.rest_at
             self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
+
+    async def pause(self, cell: Cell, timeout: float, gate: Gate) -> None:
+        """Bring a recorded actor to rest where it lives, with a snapshot; it goes on when the gate opens.
+
+        Raises:
+            CannotMove, ActorStopped, AskTimeout: it was not at rest in time, or the gate was closed; it goes on.
+        """
+        pausing = self._moved(cell, timeout, lambda: Pause(cell, leaving(cell), timeout), lambda: None, gate)
+        await self._alone(cell, pausing, f"pause of {cell.path}")
 
     async def _alone(self, cell: Cell, change: Coroutine[Any, Any, None], name: str) -> None:
         """Carry out a change of where an actor lives while no other is; it comes to its end in any case."""

@@ -51,7 +51,6 @@ from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script
 from .specification import Specifications
-from .transaction.addresses import Moved
 from .transaction.transaction import Transaction, Transactions
 
 A = TypeVar("A", bound=Actor)
@@ -171,8 +170,7 @@ class ActorSystem(Recorded, Controls):
         node.respec = respec
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
-        self.moved_addresses = Moved(node, self._homes.find)
-        node.outside = self.moved_addresses.find
+        node.outside = self._homes.addresses.find
         node.keeper = self._homes
         if self._log:
             self._sink = LogSink(self.name, node.loop, log_payloads=self._log_payloads)

@@ -42,7 +42,7 @@ class FromHere(Leaving):
         move, entering = self.move, self.move.entering
         self._start = move.cell.extra().start
         self._rested: asyncio.Future[None] = move.node.loop.create_future()
-        take = self._take = Take(entering.owe, self._at_rest, move.give_up, self._ignored)
+        take = self._take = Take(entering.owe, self._at_rest, move.give_up, self._ignored, stays=move.stays)
         lifecycle.urge(move.cell, take)
         await move.within(self._rested, move.timeout, lambda: f"{take.why}, and that did not change")
 

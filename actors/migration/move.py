@@ -165,8 +165,23 @@ class Entering(Side):
         raise NotImplementedError
 
 
+class Staying(Entering):
+    """No other place."""
+
+    to = "nowhere"
+
+    async def begin(self) -> None:
+        """There is no other life."""
+
+    def discard(self) -> None:
+        """There is none."""
+
+
 class Move:
     """One move; `run` carries it out."""
+
+    stays = False
+    """Whether the life only comes to rest, and goes on where it is."""
 
     def __init__(self, cell: Cell, leaving: Leaving, entering: Entering, timeout: float) -> None:
         self.cell, self.leaving, self.entering, self.timeout = cell, leaving, entering, timeout
@@ -239,9 +254,7 @@ class Move:
         cell, leaving, entering = self.cell, self.leaving, self.entering
         if self.given_up.done() and not self.is_bound:
             raise CannotMove(cell.path, self.given_up.result())
-        if cell.state is not RUNNING:
-            self.is_late = True
-            raise CannotMove(cell.path, "its life has ended")
+        self._over()
         assert self.transit is not None
         self.is_done = True
         tap = cell.extra().tap
@@ -257,6 +270,12 @@ class Move:
         obey_commands(cell, commands)
         self.moved()
         entering.settled()
+
+    def _over(self) -> None:
+        """Raises CannotMove: its life has ended."""
+        if self.cell.state is not RUNNING:
+            self.is_late = True
+            raise CannotMove(self.cell.path, "its life has ended")
 
     def _life_ended(self, ended: asyncio.Future[ExitReason]) -> None:
         self.is_late = True
@@ -315,3 +334,17 @@ class Move:
     def reason(self) -> ExitReason:
         """What the old life's `on_stop` is told."""
         return Shutdown(f"moved {self.entering.to}")
+
+
+class Pause(Move):
+    """A recorded life comes to rest where it is, with a snapshot, and goes on there when it has leave to."""
+
+    stays = True
+
+    def __init__(self, cell: Cell, leaving: Leaving, timeout: float) -> None:
+        super().__init__(cell, leaving, Staying(), timeout)
+
+    def commit(self) -> None:
+        self._over()
+        self.is_done = True
+        self.leaving.resume()

@@ -39,7 +39,7 @@ LOOK_AGAIN = 0.005
 class Take(Item):
     """A command: come to rest, as soon as no background work is out, with the state packed. Until then all goes on."""
 
-    __slots__ = ("_ignored", "_owe", "_refused", "_taken", "is_done", "is_void", "why")
+    __slots__ = ("_ignored", "_owe", "_refused", "_stays", "_taken", "is_done", "is_void", "why")
 
     def __init__(
         self,
@@ -47,7 +47,10 @@ class Take(Item):
         taken: Callable[[Actor, bytes], None],
         refused: Callable[[str], None],
         ignored: tuple[str, ...] = (),
+        *,
+        stays: bool = False,
     ) -> None:
+        self._stays = stays  # it goes on where it is: what it has out, and its children, do no harm
         self._owe, self._taken, self._refused = owe, taken, refused
         self._ignored = ignored  # children that are not the actor's own
         self.is_done = False  # the actor is at rest
@@ -61,13 +64,13 @@ class Take(Item):
         cell: Cell = ctx.cell
         if take.is_void or ctx.postpones(take) or any(map(_ends, cell.extra().urgent or ())):
             return None
-        take.why = _busy(cell)
+        take.why = "" if take._stays else _busy(cell)
         if take.why:
             cell.node.loop.call_later(LOOK_AGAIN, take._again, cell, cell.life)
             return None
         try:
             children = [name for name in cell.children or () if name not in take._ignored]
-            if children:
+            if children and not take._stays:
                 raise Stays(
                     f"it has children of its own ({', '.join(children)}): have a supervisor start them beside it"
                 )

@@ -130,7 +130,7 @@ class FromOwnWorker(Leaving):
         move = self.move
         self.taken: asyncio.Future[None] = move.node.loop.create_future()
         move.hear(self.worker, self.heard)
-        move.say_now(self.worker, "take")
+        move.say_now(self.worker, "take", stays=move.stays)
         await move.within(self.taken, move.timeout, lambda: BUSY)
 
     def heard(self, step: str, told: dict[str, Any]) -> None:

@@ -64,6 +64,13 @@ class GuestMoves:
         made = self._attempts[path] = number, Incoming(imports=True), attempt or GuestMove(self._guest, path, number)
         return made
 
+    def readdressed(self, old: str, new: str) -> None:
+        """The process's own actor has another address now; an attempt to move it goes on."""
+        known = self._attempts.pop(old, None)
+        if known is not None and isinstance(known[2], GuestMove):
+            self._attempts[new] = known
+            known[2].readdressed(new)
+
     @staticmethod
     def prepare(recipe: bytes) -> None:
         """Import what an actor needs, and see whether it can be constructed.
@@ -99,6 +106,9 @@ class GuestMove:
     def _say(self, step: str, **told: Any) -> None:
         say(self._guest.connection, self._path, self._number, step, **told)
 
+    def readdressed(self, path: str) -> None:
+        self._path = path
+
     def obey(self, step: str, told: dict[str, Any]) -> None:
         if step == "luggage":  # It has no cell yet.
             self._luggage = told
@@ -110,7 +120,7 @@ class GuestMove:
             case "go":
                 self._go(cell, suspended=bool(told["suspended"]))
             case "take":
-                self._take = Take(_number, self._taken, lambda why: self._say("refused", why=why))
+                self._take = Take(_number, self._taken, self._refused, stays=bool(told.get("stays")))
                 if cell.state is RUNNING:
                     lifecycle.urge(cell, self._take)
             case "pack":
@@ -180,6 +190,9 @@ class GuestMove:
         self._state = state
         more = actor.ctx.cell.extra()
         self._say("taken", at=now(), trap_exits=more.trap_exits, suspended=bool(more.suspended & mailbox.BY_USER))
+
+    def _refused(self, why: str) -> None:
+        self._say("refused", why=why)
 
     def _pack(self, cell: Cell) -> None:
         """Nothing comes any more: send what there is."""

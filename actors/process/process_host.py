@@ -239,6 +239,9 @@ class WorkerHome(Home):
         """
         raise NotImplementedError
 
+    def readdressed(self, cell: Cell) -> None:
+        """The actor has moved to another supervisor."""
+
     def takes_stop(self, cell: Cell) -> bool:
         """Whether a life has come so far that it can be told to end in good order."""
         raise NotImplementedError
@@ -294,6 +297,11 @@ class FlightHome(WorkerHome):
                     outlet.hand_over(cell, item)
                 except BadMessage as error:
                     undelivered(cell, item, error)
+
+    def readdressed(self, cell: Cell) -> None:
+        outlet: Outlet | None = cell.extra().outlet
+        if outlet is not None:
+            outlet.path = cell.path
 
     def takes_stop(self, cell: Cell) -> bool:
         outlet: Outlet | None = cell.extra().outlet
@@ -367,6 +375,13 @@ class WorkerPlace(Place):
         self._starting: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
         self.stop_sent: ExitReason | None = None  # the life in the process has been told to stop
+
+    def readdress(self, cell: Cell) -> None:
+        """The actor has moved to another supervisor: its process is told its address."""
+        worker = self.process(cell)
+        if worker is not None:
+            worker.readdress(cell.path)
+        self.home.readdressed(cell)
 
     # -- beginning --------------------------------------------------------------------------------------------------
 
@@ -553,6 +568,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)
         case "keep":
             keep(worker, frame)
+        case "readdressed":
+            pass  # Its gate has heard it.
         case _:
             obey(node, cell, frame)
 

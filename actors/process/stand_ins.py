@@ -64,6 +64,10 @@ class Inner:
         self._cells[path] = cell
         return cell
 
+    def readdressed(self, old: str, new: str) -> None:
+        """The process's own actor has another address, and so have these."""
+        self._cells = {new + path[len(old) :]: cell for path, cell in self._cells.items()}
+
     def lived_there(self, cell: Cell) -> Host:
         """What is sent to an address goes into the process from now on; returns its host."""
         cell.admit = self._admit

@@ -154,7 +154,7 @@ class Guest(Peer):
             frames.Reply: self.on_reply,
             frames.Failure: self.on_failure,
             frames.Launch: self._launch,
-            frames.Command: lambda frame: self._command(self._target(frame.to), frame),
+            frames.Command: self._command,
             frames.Record: self.on_record,
             frames.Migrate: lambda frame: self.moves.hear(self.connection.name_in(frame.to), frame),
             frames.Forget: self.on_forget,
@@ -370,7 +370,11 @@ class Guest(Peer):
         else:
             self.connection.send(frames.Launched(key, "" if error is None else str(exit_reasons.crash(error))))
 
-    def _command(self, cell: Cell, frame: frames.Command) -> None:
+    def _command(self, frame: frames.Command) -> None:
+        if frame.verb == "readdress":
+            self._readdress(self.connection.name_in(frame.to))
+            return
+        cell = self._target(frame.to)
         if frame.verb == "bind":
             more, port = cell.extra(), str(frame.data["port"])
             more.bindings[port] = named(self.node, frame, "target")
@@ -379,6 +383,17 @@ class Guest(Peer):
             obey_order(self, cell, frame)
         else:
             obey(self.node, cell, frame)
+
+    def _readdress(self, path: str) -> None:
+        """Our own actor has moved to another supervisor."""
+        cell = self.node.root
+        assert cell is not None
+        old, cell.name = cell.path, path
+        self._outside.pop(path, None)
+        self.moves.readdressed(old, path)
+        if self.recovery is not None:
+            self.recovery.readdressed(old, path)
+        self.command(cell, "readdressed", {})
 
     # -- the end ----------------------------------------------------------------------------------------------------
 

@@ -166,6 +166,13 @@ class Worker(Peer):
         if limits is not None:
             self._watch = Watch(self, limits)
 
+    def readdress(self, path: str) -> None:
+        """Its actor has another address from now on; what is on its way from there still says the old one."""
+        old, self.home = self.home, path
+        self.gate.readdressed(old, path)
+        self.inner.readdressed(old, path)
+        self.connection.send(frames.Command(self.connection.name_out(path), "readdress", {}))
+
     def give_back(self) -> None:
         """The actor is not moved into this process: it ends, and nobody is told."""
         self.cell = self._died = None

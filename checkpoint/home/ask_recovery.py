@@ -17,6 +17,8 @@ from ..protocol import MESSAGE, Answer, Out
 from .pending_asks import MARK, OVER, SwitchAsk
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ...actors.kernel.codec import Codec
     from .homes import Homes
     from .switch import Switch
@@ -75,6 +77,7 @@ class Rejoin:
             ask.to, ask.started = home.cell, True
 
     def _of(self, asker: str, turn: int, k: int) -> RejoinedAsk:
+        asker = self._homes.addresses.now(asker)
         ask = self._asks.get((asker, turn, k))
         if ask is None or ask.is_over:
             cell = self._homes.node.cell_at(asker)
@@ -83,6 +86,12 @@ class Rejoin:
             ask.future, ask.homes, ask.asker, ask.turn, ask.k = ask, self._homes, asker, turn, k
             self._asks[asker, turn, k] = ask
         return ask
+
+    def rename(self, paths: Mapping[str, str]) -> None:
+        """Some who have asked have other addresses now."""
+        for ask in self._asks.values():
+            ask.asker = paths.get(ask.asker, ask.asker)
+        self._asks = {(ask.asker, ask.turn, ask.k): ask for ask in self._asks.values()}
 
     def forget(self, ask: RejoinedAsk) -> None:
         """It has its outcome."""

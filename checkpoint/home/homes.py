@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from ...actors.errors import ControlFailed, HoldfastError, StartFailed
@@ -19,6 +19,7 @@ from ..recovery_file import RecoveryFile
 from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_schedule import nobody
+from .addresses import Addresses, renamed
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
 from .held_messages import Holding, let_go
@@ -42,6 +43,7 @@ class Homes:
         self.node = node
         self.journal = Commits(journal, node.loop, durability=durability or "os", emit=node.emit, where=f"/{node.name}")
         self._unkept = Unkept(self.journal)
+        self.addresses = Addresses(node, journal, self.find)
         self.quarantine = Quarantine(node, self.journal)
         self._switches: dict[str, Switch] = {}
         self.recoveries = Recoveries(node)
@@ -66,13 +68,15 @@ class Homes:
         """
         switch = self._switches.get(cell.path)
         if switch is None:
+            self._settle_key(cell.path)
             switch = Switch(self.node, cell.path, method, self._journal_of(method), self.planted.get(cell.path))
-            switch.cell = cell
+            switch.cell, switch.addresses = cell, self.addresses
             self._check(switch, cell)
             self.planted.pop(cell.path, None)
             self._switches[cell.path] = switch
             switch.recoveries, switch.quarantine, switch.rejoin = self.recoveries, self.quarantine, self.rejoin
             self.rejoin.loaded(switch)
+            switch.ties.rename(self.addresses.now)
             self._count_death(switch)
             if self.on_first is not None:
                 begin, self.on_first = self.on_first, None
@@ -91,6 +95,12 @@ class Homes:
         cell.admit = switch.admit
         more.outlet = switch
         return switch
+
+    def _settle_key(self, path: str) -> None:
+        try:
+            self.addresses.settle(path)
+        except HoldfastError as error:
+            raise StartFailed(path, str(error)) from error
 
     def _check(self, switch: Switch, cell: Cell) -> None:
         """Refuse what would misread the records of a home that was just read.
@@ -112,7 +122,7 @@ class Homes:
             StartFailed: the store refused.
         """
         hands = self.journal.in_hand
-        source = None if hands is None else switch.open.get(hands.begun(switch.path))
+        source = None if hands is None else switch.open.get(hands.begun(self.addresses.key(switch.path)))
         if hands is None or source is None or source.kind == START:
             return
         source.deliveries += 1
@@ -120,14 +130,14 @@ class Homes:
             source.positions += self.journal.append([(switch.path, ("tried", source.id, source.deliveries))])
         except HoldfastError as error:
             raise StartFailed(switch.path, str(error)) from error
-        hands.word(switch.path)[0] = 0
+        hands.word(self.addresses.key(switch.path))[0] = 0
         if source.deliveries >= switch.method.max_deliveries:
             switch.ends.quarantine(source)
 
     def page(self, switch: Switch) -> memoryview | None:
         """Where a life in this process says which input it has in hand, so that it is known when that one is killed."""
         hands = self.journal.in_hand
-        return None if hands is None or not switch.journal.durable else hands.word(switch.path)
+        return None if hands is None or not switch.journal.durable else hands.word(self.addresses.key(switch.path))
 
     def _journal_of(self, method: Method) -> HomeJournal:
         """Where what happens at an address is kept, from its first life on."""
@@ -138,6 +148,7 @@ class Homes:
         """A home for an actor that has none, which nothing reaches before it is adopted."""
         switch = Switch(self.node, cell.path, method, self._journal_of(method))
         switch.recoveries, switch.quarantine, switch.cell = self.recoveries, self.quarantine, cell
+        switch.addresses = self.addresses
         return switch
 
     def adopt(self, cell: Cell, switch: Switch, method: Method) -> None:
@@ -148,6 +159,37 @@ class Homes:
     def released(self, path: str) -> None:
         """The actor at an address, which was not recorded, goes on without a home."""
         self._switches.pop(path, None)
+
+    def move(self, names: Mapping[str, str]) -> None:
+        """Actors have moved, with all below them: what is known of their addresses is true of the new ones.
+
+        Args:
+            names: the new addresses by the old ones, all at once.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        paths = {path: renamed(names, path) for path in {*self._stored, *self._switches}}
+        paths = {was: now for was, now in paths.items() if was != now}
+        self.addresses.rename(paths)
+        self.addresses.moved(names)
+        for key, value in list(self.journal.notes(child_key("", "")[:-1]).items()):
+            above, _, name = key.removeprefix(child_key("", "")[:-1]).rpartition("/")
+            if (now := renamed(names, above)) != above:
+                self.journal.note(key, None)
+                self.journal.note(child_key(now, name), value)
+        self.quarantine.rename(paths)
+        self.journal.rename(paths)
+        self._switches = {paths.get(path, path): switch for path, switch in self._switches.items()}
+        self._stored = {paths.get(path, path) for path in self._stored}
+        self._blamed = {paths.get(path, path) for path in self._blamed}
+        self._returns = {paths.get(path, path): times for path, times in self._returns.items()}
+        self.planted = {paths.get(path, path): saved for path, saved in self.planted.items()}
+        for path, switch in self._switches.items():
+            if switch.path != path:
+                switch.readdress(path)
+            switch.ties.rename(lambda one: renamed(names, one))
+        self.rejoin.rename(paths)
 
     def vacate(self, path: str, why: str) -> None:
         """What is known here of an address where nobody lives is not true any more; the store is somebody else's."""
@@ -224,6 +266,7 @@ class Homes:
         if path in self._stored and path not in self._switches:
             self._tell_stored(path, ERASED)
         self.journal.erase(path)  # First: if the store refuses, nothing is forgotten here either.
+        self.addresses.erased(path)
         self.quarantine.forget(path)
         self._stored.discard(path)
         self._blamed.discard(path)

@@ -57,7 +57,9 @@ class RemoteLife:
     begins = True
 
     def __init__(self, path: str, worker: Worker) -> None:
-        self._path, self._connection = path, worker.connection
+        self._worker, self._connection = worker, worker.connection
+        self._below = path[len(worker.home) :]  # of a child of the process's own actor
 
     def to_life(self, record: ToLife) -> None:
-        self._connection.send(frames.Record(self._connection.name_out(self._path), record), self._path)  # type: ignore[arg-type]  # encoded in place
+        path = self._worker.home + self._below
+        self._connection.send(frames.Record(self._connection.name_out(path), record), path)  # type: ignore[arg-type]  # encoded in place

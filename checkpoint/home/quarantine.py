@@ -18,8 +18,11 @@ from ..inputs import Batch, Input
 from ..protocol import MESSAGE, PIPE, TICK
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from ...actors.kernel.node import Node
     from ..group_commit import Commits
+    from ..journal import Entry
     from .switch import Switch
 
 PLACE = "quarantine"
@@ -159,6 +162,22 @@ class Quarantine:
         for one in [one for one in self._held.values() if one.address == address]:
             self._free(one, self._journal.durable, batch)
         batch.commit(self._journal)
+
+    def rename(self, paths: Mapping[str, str]) -> None:
+        """What belongs to these addresses belongs to others now.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        moved = [one for one in self._held.values() if one.address in paths]
+        fresh = [msgspec.structs.replace(one, address=paths[one.address]) for one in moved]
+        for one in moved:
+            del self._held[one.address, one.id]
+        self._held.update({(one.address, one.id): one for one in fresh})
+        if moved and self._journal.durable:
+            entries: list[Entry] = [("free", one.address, one.id) for one in moved]
+            entries += [("held", *msgspec.structs.astuple(one)) for one in fresh]
+            self._positions += self._journal.append([(PLACE, entry) for entry in entries])
 
     def _one(self, asked: QuarantinedMessage) -> Held:
         one = self._held.get((asked.address, asked.id))

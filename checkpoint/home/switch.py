@@ -75,6 +75,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.actor import Start
     from ...actors.kernel.node import Node
     from ..recovery.recoveries import Recoveries
+    from .addresses import Addresses
     from .ask_recovery import Rejoin
 
 
@@ -104,6 +105,7 @@ class Switch:
         self.recoveries: Recoveries | None = None
         self.quarantine: Quarantine | None = None
         self.rejoin: Rejoin | None = None
+        self.addresses: Addresses | None = None
         self.waits_for_release = False  # somebody else says when the actor gets what is new
         self.replay = Replay(self)
         self.skipping = Skipping(self)
@@ -129,6 +131,12 @@ class Switch:
         self.shapes = Shapes(self)
         self._replay_k, self._replay_turn = 0, -1
         load(self, saved)
+
+    def readdress(self, path: str) -> None:
+        """Its actor has another address from now on."""
+        self.path = path
+        for inlet in self.inlets.values():
+            inlet.name = path
 
     def use(self, method: Method) -> None:
         """Work as this method says, from now on."""

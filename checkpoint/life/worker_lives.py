@@ -65,6 +65,13 @@ class RecordedGuest:
         """Nobody lives at an address any more: whoever does so again is given a new way."""
         self._ports.pop(path, None)
 
+    def readdressed(self, old: str, new: str) -> None:
+        """The process's own actor has another address."""
+        port = self._ports.pop(old, None)
+        if port is not None:
+            self._ports[new] = port
+            port.path = new
+
     def start(self, cell: Cell, options: dict[str, Any]) -> None:
         """Begin the life that a launch asks for, of the process's own actor.
 
@@ -149,7 +156,7 @@ class Port:
     """The way home of the lives at one address, and what comes from there."""
 
     def __init__(self, guest: Guest, path: str) -> None:
-        self._guest, self._path = guest, path
+        self._guest, self.path = guest, path
         self.life: Life | None = None
         self._state: list[Restore] = []
         self.place: ChildPlace | None = None  # of a child: it hears of its lives
@@ -190,7 +197,7 @@ class Port:
 
     def to_home(self, record: ToHome) -> None:
         connection = self._guest.connection
-        connection.send(frames.Record(connection.name_out(self._path), cast("Any", record)), self._path)
+        connection.send(frames.Record(connection.name_out(self.path), cast("Any", record)), self.path)
 
     def when_told(self, then: Callable[[], None]) -> None:
         self._guest.node.loop.call_soon(then)  # Behind the flush, which was called for before.

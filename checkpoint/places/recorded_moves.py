@@ -56,13 +56,15 @@ def leaving(cell: Cell, ignored: tuple[str, ...] = ()) -> Leaving:
 class Detached:
     """A home whose life is at rest, and how to give it back."""
 
-    def __init__(self, switch: Switch) -> None:
+    def __init__(self, switch: Switch, *, stays: bool = False) -> None:
         self._switch, self._next_id = switch, switch.next_id
         self._held = {source.id for source in switch.open.values() if source.held}  # not fed yet
         self._port: LifePort | None = switch.port
         bound = switch.bound
         self._in_hand = None if bound is None else bound.in_hand()
-        switch.port, switch.is_released = None, False
+        switch.is_released = False
+        if not stays:
+            switch.port = None
         if bound is not None:
             bound.restart()
 
@@ -107,7 +109,7 @@ class FromRecordedHere(FromHere):
 
     def pack(self, actor: Actor, state: bytes) -> None:
         assert self._home.switch is not None
-        self._detached = Detached(self._home.switch)
+        self._detached = Detached(self._home.switch, stays=self.move.stays)
 
     def part(self) -> list[Item]:
         place = self.cell.host.place
@@ -143,7 +145,7 @@ class FromRecordedWorker(FromOwnWorker):
 
     def left(self) -> None:
         assert self._home.switch is not None
-        self._detached = Detached(self._home.switch)
+        self._detached = Detached(self._home.switch, stays=self.move.stays)
         self.taken.set_result(None)
 
     def part(self) -> list[Item]:

@@ -86,7 +86,7 @@ class Groups:
         Raises:
             NoSuchGroup: there is none of that name.
         """
-        return [image.path for image in self._group(name).images]
+        return [image.path for image in self._group(name).images]  # as they are now
 
     def names(self) -> list[str]:
         """The group snapshots there are, oldest first."""
@@ -132,7 +132,10 @@ class Groups:
         data = self._homes.journal.noted(_key(name))
         if data is None:
             raise NoSuchGroup(name)
-        return msgspec.msgpack.decode(data, type=Group)
+        group = msgspec.msgpack.decode(data, type=Group)
+        now = self._homes.addresses.now
+        images = [msgspec.structs.replace(image, path=now(image.path)) for image in group.images]
+        return msgspec.structs.replace(group, images=images)
 
     def wait(self, paths: Iterable[str]) -> None:
         """From now on these homes hold what waits, until `let_go`: what they send would find nobody."""

@@ -113,17 +113,15 @@ class Arrangement:
         for place, supervisor in here.items():
             _arrange(place, supervisor, taken)
         _readdress(here, taken)
-        for child, path in was.items():
-            cell = taken[child].cell
-            if cell is not None and cell.state is not GONE:
-                system.moved_addresses.leave(path, cell)
+        now = {path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}
         if moved and system.node.root is not None:  # First: what comes now is called by addresses as they are now.
-            now = {path: f"{cells[_below(child)].path}/{child.name}" for child, path in was.items()}
             Renamed(now).keep(system.node.root)
         for place, supervisor in here.items():
             _respecify(place, supervisor)
         for place, cell in cells.items():
             keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
+        if moved:
+            system.homes.move(now)
 
     async def finish(self, system: ActorSystem) -> None:
         """Tell those that live in other processes."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import dataclasses
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from typing import TYPE_CHECKING, Any
 
 from ...actors.kernel.cell import Cell
@@ -28,6 +28,63 @@ MOVED_WITHIN = 60.0
 """Seconds that a life may take to move; the transaction's own time limit is shorter."""
 
 
+class Gated:
+    """A change of one live actor that waits, when all is ready, for the commit; until then it can be given up."""
+
+    def __init__(self, place: Place, text: str) -> None:
+        self._place, self._text = place, text
+        self.task: asyncio.Task[None] | None = None
+        self._gate: Gate | None = None
+
+    def begin(self, system: ActorSystem, work: Coroutine[Any, Any, None]) -> None:
+        """Have it done; with a gate that `work` was given it waits there."""
+        cell = self._place.living(system.node)
+        self.task = system.node.loop.create_task(
+            to_its_end(cell.path, asyncio.ensure_future(work)),
+            name=self._text,
+            context=system.node.base_context.copy(),
+        )
+        self.task.add_done_callback(_seen)
+
+    async def reach(self, system: ActorSystem, work: Callable[[Gate], Coroutine[Any, Any, None]]) -> None:
+        """Have it begun, if it is not, and wait until it is ready."""
+        if self.task is None:
+            self._gate = Gate(system.node.loop)
+            self.begin(system, work(self._gate))
+        gate, task = self._gate, self.task
+        assert gate is not None
+        assert task is not None
+        while not gate.is_waiting and not task.done():
+            await asyncio.wait((gate.reached, task), return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            task.result()
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether it is ready at this instant, or there was nothing to be done. Raises what has ended it."""
+        if self.task is not None and self.task.done():
+            self.task.result()
+            return True
+        return self._gate is not None and self._gate.is_waiting
+
+    def open(self) -> None:
+        """It is in force."""
+        if self._gate is not None:
+            self._gate.open()
+
+    async def give_up(self, system: ActorSystem) -> None:
+        """It is not to be, and can be begun anew."""
+        if self._gate is not None:
+            self._gate.close()
+        task = self.task
+        while task is not None and not task.done():  # What has only begun may not hear it yet.
+            cell = self._place.now(system.node)
+            if cell is not None:
+                system._moves.give_up(cell, "it is not wanted any more")
+            await asyncio.wait((task,), timeout=AGAIN_AFTER)
+        self.task = self._gate = None
+
+
 class Relocation:
     """One actor that is to live elsewhere, or behind other mechanisms: the way from its spec to that of the draft."""
 
@@ -36,8 +93,7 @@ class Relocation:
         assert place.spec is not None
         self.before: ChildSpec = place.spec
         """What its spec says before the transaction."""
-        self._task: asyncio.Task[None] | None = None
-        self._gate: Gate | None = None
+        self._move = Gated(place, text)
         self._grant: Grant | None = None
         self.probation: Probation | None = None
         """Whether its mechanisms stay is known when this is over; None: at once."""
@@ -82,38 +138,18 @@ class Relocation:
             self._grant = arbiter_of(system.node).claim(path, Hand.ADAPTATION, self._text)
             system.mechanism_notes.begun(path, self._text)
         if not self._comes_last:
-            await self._ready_at_gate(system)
+            await self._move.reach(system, lambda gate: self._work(system, gate))
 
-    async def _ready_at_gate(self, system: ActorSystem) -> None:
-        if self._task is None:
-            self._gate = Gate(system.node.loop)
-            self._task = self._begin(system, self._gate)
-        gate, task = self._gate, self._task
-        assert gate is not None
-        while not gate.is_waiting and not task.done():
-            await asyncio.wait((gate.reached, task), return_when=asyncio.FIRST_COMPLETED)
-        if task.done():
-            task.result()
-
-    def _begin(self, system: ActorSystem, gate: Gate | None) -> asyncio.Task[None]:
+    def _work(self, system: ActorSystem, gate: Gate | None) -> Coroutine[Any, Any, None]:
         cell, moves = self._place.living(system.node), system._moves
         wanted, before = self._after.mechanism, self.before.mechanism
-        work: Coroutine[Any, Any, None]
         if not self._adapts:
-            work = moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN, gate)
-        elif wanted is None:
-            work = moves.unprotect(cell, MOVED_WITHIN, gate)
-        elif before is None:
-            work = moves.protect(cell, system.homes, wanted, MOVED_WITHIN, gate, self._begun)
-        else:
-            work = moves.adapt(cell, wanted, MOVED_WITHIN, gate, self._begun)
-        task = system.node.loop.create_task(
-            to_its_end(cell.path, asyncio.ensure_future(work)),
-            name=f"{self._text}",
-            context=system.node.base_context.copy(),
-        )
-        task.add_done_callback(_seen)
-        return task
+            return moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN, gate)
+        if wanted is None:
+            return moves.unprotect(cell, MOVED_WITHIN, gate)
+        if before is None:
+            return moves.protect(cell, system.homes, wanted, MOVED_WITHIN, gate, self._begun)
+        return moves.adapt(cell, wanted, MOVED_WITHIN, gate, self._begun)
 
     def _begun(self, probation: Probation) -> None:
         self.probation = probation
@@ -121,12 +157,9 @@ class Relocation:
     def ready(self, system: ActorSystem) -> str:
         """Whether it is at rest, and everything is ready for it."""
         cell = self._place.living(system.node) if not self._place.is_planned else None
-        if cell is None or self._task is None or self._gate is None:
+        if cell is None or self._move.task is None or self._move.is_waiting:
             return ""
-        if self._task.done():
-            self._task.result()
-            return ""  # There was nothing to be done.
-        return "" if self._gate.is_waiting else f"{cell.path} is not at rest any more"
+        return f"{cell.path} is not at rest any more"
 
     # -- from the commit on -------------------------------------------------------------------------------------------
 
@@ -138,22 +171,22 @@ class Relocation:
         now = cell.spec if isinstance(cell.spec, ChildSpec) else recipe_spec(cell)
         if now is not None and self._is_elsewhere and not (self._adapts and self._moves):
             replace_place(cell, dataclasses.replace(now, isolation=self._after.isolation))
-        if now is not None and self._adapts and self._task is not None:
+        if now is not None and self._adapts and self._move.task is not None:
             isolation = now.isolation if self._moves else self._after.isolation
             replace_mechanism(
                 cell, dataclasses.replace(now, mechanism=self._after.mechanism, isolation=isolation)
             )  # fmt: skip
-        if self._gate is not None:
-            self._gate.open()
+        self._move.open()
 
     async def finish(self, system: ActorSystem) -> None:
         """Have its life follow."""
         if self._place.is_planned or not (self._adapts or self._moves):
             return
         try:
-            if self._task is None:
-                self._task = self._begin(system, None)
-            await asyncio.shield(self._task)
+            if self._move.task is None:
+                self._move.begin(system, self._work(system, None))
+            assert self._move.task is not None
+            await asyncio.shield(self._move.task)
             if self._adapts and self._moves:
                 cell = self._place.living(system.node)
                 await system._moves.move(cell, self._after.isolation, self._after.limits, MOVED_WITHIN)
@@ -190,15 +223,7 @@ class Relocation:
     async def release(self, system: ActorSystem) -> None:
         """It goes on where it is."""
         try:
-            task = self._task
-            if self._gate is not None:
-                self._gate.close()
-            if task is not None and not task.done():
-                while not task.done():  # What has only begun may not hear it yet.
-                    cell = self._place.now(system.node)
-                    if cell is not None:
-                        system._moves.give_up(cell, "it is not wanted any more")
-                    await asyncio.wait((task,), timeout=AGAIN_AFTER)
+            await self._move.give_up(system)
             if self._grant is not None:
                 system.mechanism_notes.over(self._place.path)
         finally:

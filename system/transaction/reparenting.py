@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import functools
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.kernel.lifecycle import LOCAL
-from ...checkpoint.home.homes import Homes
+from ...actors.process.process_host import WorkerPlace
+from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
 from ...supervision.admin import NotSupported
@@ -13,6 +16,7 @@ from ...supervision.children import STOPPED, UP
 from .arrangement import busy, child_of
 from .draft import Draft, Place, Target, is_elsewhere
 from .operation import Operation, wrong
+from .relocation import MOVED_WITHIN, Gated
 from .structure import check_child, text_of
 
 if TYPE_CHECKING:
@@ -31,6 +35,7 @@ class Move(Operation):
         self._above: Place | None = None  # the new supervisor, at this point
         self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
         self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
+        self._rests: dict[Place, Gated] = {}
 
     @property
     def text(self) -> str:
@@ -68,6 +73,34 @@ class Move(Operation):
         for holder in (old, new):
             draft.arrangement.touch(holder, self)
 
+    async def prepare(self, system: ActorSystem) -> None:
+        """Have recorded actors rest, with a snapshot: no turn of theirs is to be repeated under another address."""
+        if self._place is None or not (self._leads and self._place.has_moved):
+            return
+        waits = bool(self._others_settle(system))
+        for one, rest in self._resting(system):
+            if waits:  # Perhaps for what those here have to answer.
+                await rest.give_up(system)
+            else:
+                await rest.reach(system, functools.partial(system._moves.pause, one.living(system.node), MOVED_WITHIN))
+
+    def _resting(self, system: ActorSystem) -> list[tuple[Place, Gated]]:
+        """Those that replay turns, of the actor and all below it, and how each comes to rest."""
+        assert self._place is not None
+        for one in self._place.walk():
+            cell = one.now(system.node) if not one.is_planned else None
+            switch = switch_of(cell) if cell is not None else None
+            if switch is not None and switch.method.replays and one not in self._rests:
+                self._rests[one] = Gated(one, f"pause of {one.path}")
+        return list(self._rests.items())
+
+    def _others_settle(self, system: ActorSystem) -> str:
+        """Why the others are not so far that addresses can change; they are asked for what is missing."""
+        own = {switch for one, _ in self._resting(system) if (switch := switch_of(one.living(system.node))) is not None}
+        others = [switch for switch in system.homes if switch not in own]
+        settle_senders(others, self._asked)
+        return WAITING if any(map(is_unsettled, others)) else ""
+
     def ready(self, system: ActorSystem) -> str:
         place = self._place
         assert place is not None
@@ -82,31 +115,56 @@ class Move(Operation):
             raise wrong(old.path, f"it has no child {place.name!r} any more")
         if one.state not in (UP, STOPPED) or one.row is not None or one.up is not None:
             return f"{self.target} is being restarted"
-        settle_senders(system.homes, self._asked)
-        return WAITING if unsettled(system.homes) else ""
+        if why := self._others_settle(system):
+            return why
+        for resting, rest in self._resting(system):
+            switch = switch_of(resting.living(system.node))
+            if not rest.is_waiting:
+                return f"{resting.path} is not at rest"
+            if switch is not None and not is_saved(switch):
+                return f"the last snapshot of {resting.path} is not in the store yet"
+        return ""
+
+    def commit(self, system: ActorSystem) -> None:
+        if self._place is None or not self._leads:
+            return
+        for one in self._place.walk():
+            cell = one.now(system.node) if not one.is_planned else None
+            if cell is not None and isinstance(cell.host.place, WorkerPlace):
+                cell.host.place.readdress(cell)
+        for rest in self._rests.values():
+            rest.open()
+
+    async def finish(self, system: ActorSystem) -> None:
+        for rest in self._rests.values():
+            if rest.task is not None:
+                await asyncio.shield(rest.task)
+
+    async def release(self, system: ActorSystem) -> None:
+        for rest in self._rests.values():
+            await rest.give_up(system)
 
 
 def check_movable(place: Place) -> None:
     """Whether an actor can have another address.
 
     Raises:
-        SpecError: something besides its refs knows it by its address.
+        SpecError: something that cannot be told knows it by its address.
     """
     cell, spec = place.cell, place.spec
-    if (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell)):
-        raise wrong(place.path, "its process knows it by its address: have it live in a task first")
-    if (spec is not None and spec.recovery is not None and spec.recovery.records) or (
-        cell is not None and cell.host is not LOCAL
+    if place.is_protected:
+        raise wrong(place.path, "its replicas know it by its address: detach its mechanism first")
+    if place.is_supervisor and (
+        (spec is not None and spec.isolation == "process") or (cell is not None and is_elsewhere(cell))
     ):
-        raise wrong(place.path, "its journal is kept by its address: a recorded actor cannot be moved")
+        raise wrong(place.path, "its process knows all below it by their addresses")
+    method = spec.recovery if spec is not None else None
+    if method is not None and method.replays and not method.snapshots:
+        why = "it takes no snapshots, so all its turns would be repeated under another address"
+        raise wrong(place.path, f"{why}: use hybrid(...)")
 
 
 WAITING = "recorded actors may have to repeat what they sent to it: their snapshots are waited for"
-
-
-def unsettled(homes: Homes) -> bool:
-    """Whether a recorded actor would compare addresses in a replay: then none may change."""
-    return any(map(is_unsettled, homes))
 
 
 def is_unsettled(switch: Switch) -> bool:
@@ -114,7 +172,13 @@ def is_unsettled(switch: Switch) -> bool:
     return bool(switch.partial) or any(turn.digests for turn in switch.turns.values())
 
 
-def settle_senders(homes: Homes, asked: dict[Switch, int]) -> None:
+def is_saved(switch: Switch) -> bool:
+    """Whether a replay would compare nothing: all that it has done is in its snapshot."""
+    compared = any(turn.digests or turn.reply or turn.state for turn in switch.turns.values())
+    return not (compared or switch.partial or switch.images.is_saving)
+
+
+def settle_senders(homes: Iterable[Switch], asked: dict[Switch, int]) -> None:
     """Have recorded actors take a snapshot, so that no replay sends to an address of before; each turn once."""
     for switch in homes:
         if is_unsettled(switch) and asked.get(switch) != switch.turn and switch.port is not None and switch.is_released:

@@ -24,12 +24,8 @@ TEXT = (Path(__file__).parents[2] / "docs" / "control.md").read_text("utf-8")
 TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
 # Each note: the actors it is about, what the refusal says.
 NOTES: dict[str, tuple[set[str], str]] = {
-    "¹": ({"recorded", "checkpoint_only"}, "its journal is kept by its address"),
-    "²": (
-        set(KINDS),
-        "its process knows it|no supervisor looks after it|is kept by its address|a life cannot enter or leave",
-    ),
-    "³": ({"plain"}, "its supervisor lives in another process"),
+    "¹": (set(KINDS), "its replicas know it|no supervisor looks after it|a life cannot enter or leave"),
+    "²": ({"plain"}, "its supervisor lives in another process"),
 }
 
 
@@ -55,8 +51,8 @@ def refusal(kind: str, note: str) -> str:
 
 def test_the_notes_become_fewer() -> None:
     used = {cell.values[3] for cell in cells()} - {""}
-    assert used == {*NOTES, "⁴"}  # The last one is no refusal.
-    assert len(NOTES) <= 3
+    assert used == {*NOTES, "³"}  # The last one is no refusal.
+    assert len(NOTES) <= 2
 
 
 @pytest.fixture

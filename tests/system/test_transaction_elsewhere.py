@@ -103,8 +103,6 @@ async def test_what_cannot_be_done_there_is_refused_before_anything_is(system: h
     before = await shape(system)
     refusals = {
         "another process, which a life cannot enter": lambda change: change.move("/app/near/plain", "/app/far"),
-        "its process knows it by its address": lambda change: change.move("/app/near/own", "/app/other"),
-        "its journal is kept by its address": lambda change: change.move("/app/near/kept", "/app/other"),
         "cannot hold another supervisor": lambda change: change.add(
             "/app/far", hf.supervisor("p", children=[], isolation="process")
         ),

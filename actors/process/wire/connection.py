@@ -148,6 +148,10 @@ class Connection(asyncio.BufferedProtocol):
             raise BadFrame(f"name {number} was never introduced")
         return self._names_in[number]
 
+    def rename_in(self, now: Callable[[str], str]) -> None:
+        """Names that the peer gave mean other ones from now on."""
+        self._names_in = list(map(now, self._names_in))
+
     def number_in(self, name: Name) -> int:
         """The number of the name that `name_in` was given last: the peer uses it from now on."""
         return len(self._names_in) - 1 if type(name) is str else cast("int", name)

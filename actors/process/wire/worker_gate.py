@@ -12,6 +12,7 @@ process and nothing else.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, Final
 
@@ -49,6 +50,28 @@ class Gate:
         self._cleared: set[tuple[str, str]] = set()  # what a recorded life has sent before: address, message
         self._targets: dict[int, Cell] = {}
         self._chars = 0
+        self._left: deque[tuple[str, str]] = deque()  # addresses it had, and has not heard yet that it has others
+
+    def readdressed(self, old: str, new: str) -> None:
+        """Its actor has another address: what it says until it knows that is meant so."""
+        self._left.append((old, new))
+        self._worker.connection.rename_in(self._now)
+
+    def _now(self, path: str) -> str:
+        for old, new in self._left:
+            if is_at_or_below(path, old):
+                path = new + path[len(old) :]
+        return path
+
+    def heard(self) -> None:
+        """It knows the oldest of these.
+
+        Raises:
+            BadFrame: there is none that it could have heard of.
+        """
+        if not self._left:
+            raise BadFrame("it has heard of an address that nobody has told it")
+        self._left.popleft()
 
     def forget(self) -> None:
         """The process gives all its names anew."""
@@ -67,6 +90,10 @@ class Gate:
         rule = RULES.get(type(frame))
         if rule is None:
             raise BadFrame(f"an actor process cannot send a {type(frame).__name__}")
+        if self._left and isinstance(frame, (frames.Command, frames.Note)):
+            frame.data = {
+                key: self._now(value) if isinstance(value, str) else value for key, value in frame.data.items()
+            }
         rule(self, frame)
 
     # -- whose it is ------------------------------------------------------------------------------------------------
@@ -113,6 +140,8 @@ class Gate:
     def _introduce(self, text: str) -> int:
         """A name that the process gives for the first time: its number."""
         connection = self._worker.connection
+        if self._left:
+            text = self._now(text)
         connection.name_in(text)
         number = connection.number_in(text)
         self._chars += len(text)
@@ -284,6 +313,12 @@ def _home(gate: Gate, to: str, frame: frames.Command) -> None:
         raise BadFrame(f"{frame.verb!r} of {to}, and the process is that of {gate.home}")
 
 
+def _knows(gate: Gate, to: str, frame: frames.Command) -> None:
+    """It has heard of its actor's new address."""
+    _home(gate, to, frame)
+    gate.heard()
+
+
 def _own(gate: Gate, to: str, frame: frames.Command) -> None:
     """It speaks of one of its actors."""
     gate.require_own(to, repr(frame.verb))
@@ -368,6 +403,7 @@ RULES: Final[dict[type[frames.Frame], Rule]] = {
 """What has no row (`Launch`, `Run`) only the root sends. `Forget` is the connection's own."""
 
 COMMANDS: Final[dict[str, Callable[[Gate, str, frames.Command], None]]] = {
+    "readdressed": _knows,
     "subscribe": _topic,
     "unsubscribe": _topic,
     "born": _born,

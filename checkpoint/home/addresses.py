@@ -1,0 +1,159 @@
+"""Addresses that actors have left: where they are found now, and under which key the store has what is theirs.
+
+What is recorded of an actor stays under the key that it was first kept under, whatever its address becomes: a move to
+another supervisor writes one note instead of a journal. Both tables are in the store, so the next root has them too:
+who kept only an old address, in a state or in a message that waits, still reaches the actor.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import TYPE_CHECKING
+
+from ...actors.errors import HoldfastError
+from ...actors.kernel.cell import Cell
+from ..engine_calls import Called
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+
+    from ...actors.kernel.node import Node
+    from ..journal import Journal
+
+LEFT = "moved from "
+"""How the note begins that an address was left; the address follows, and the note is where its actor lives now."""
+KEY = "recorded under "
+"""How the note begins of an actor whose key is not its address; the address follows, and the note is the key."""
+
+
+class Addresses:
+    """Where those live who were moved. An address that was left is forgotten when somebody else comes to live there."""
+
+    def __init__(self, node: Node, journal: Journal, recorded: Callable[[str], Cell | None]) -> None:
+        self._node, self._journal, self._recorded = node, journal, recorded
+        self._left = {at.removeprefix(LEFT): now.decode() for at, now in journal.notes(LEFT).items()}
+        keys = {at.removeprefix(KEY): key.decode() for at, key in journal.notes(KEY).items()}
+        self._keys = journal.keys if isinstance(journal, Called) else {}  # Of what is in memory only, nothing is read.
+        self._keys.update(keys)
+        self._watched: set[str] = set()
+        for path in self._left:
+            self._watch(path)
+
+    # -- where they are -----------------------------------------------------------------------------------------------
+
+    def now(self, path: str) -> str:
+        """The address that an actor has now which is known by this one: the same, unless it has moved."""
+        return renamed(self._left, path) if self._left else path
+
+    def find(self, path: str) -> Cell | None:
+        """Who lives at an address where the node has nobody: one that waits for its next life, or has moved."""
+        found = self._recorded(path)
+        if found is not None or not self._left:
+            return found
+        now = self.now(path)
+        return None if now == path else self._at(now) or self._recorded(now)
+
+    def _at(self, path: str) -> Cell | None:
+        at: Cell | None = self._node.root
+        for name in path.split("/")[2:]:
+            at = (at.children or {}).get(name) if at is not None else None
+        return at
+
+    # -- moves --------------------------------------------------------------------------------------------------------
+
+    def moved(self, names: Mapping[str, str]) -> None:
+        """Actors have other addresses from now on, and all below them: where they live now, by where they did.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        left = dict(self._left)
+        for old, now in left.items():
+            self._put(old, renamed(names, now))
+        for was, now in names.items():
+            if was not in self._left:
+                self._put(was, now)
+        for path in list(self._left):
+            if self._at(path) is not None or self._left[path] == path:
+                self._put(path, None)
+
+    def _put(self, path: str, now: str | None) -> None:
+        if self._left.get(path) == now:
+            return
+        if now is None:
+            del self._left[path]
+        else:
+            self._left[path] = now
+            self._watch(path)
+        self._journal.note(LEFT + path, None if now is None else now.encode())
+
+    def _watch(self, path: str) -> None:
+        if path not in self._watched:
+            self._watched.add(path)
+            self._node.awaited.setdefault(path, []).append(functools.partial(self._come, path))
+
+    def _come(self, path: str) -> None:
+        """Somebody else lives there now."""
+        self._watched.discard(path)
+        if path in self._left:
+            try:
+                self._put(path, None)
+            except HoldfastError:
+                pass  # The next root forgets it in the same way.
+
+    # -- keys ---------------------------------------------------------------------------------------------------------
+
+    def key(self, path: str) -> str:
+        """Under which name the store has what is recorded at an address."""
+        return self._keys.get(path, path)
+
+    def rename(self, names: Mapping[str, str]) -> None:
+        """What is recorded at these addresses, by name, is that of other ones now: the new one, by the old one.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        keys = {now: self.key(was) for was, now in names.items()}
+        for was in names:
+            self._name(was, None)
+        for now, key in keys.items():
+            self._name(now, key)
+
+    def settle(self, path: str) -> None:
+        """Something is about to be recorded at an address; one that was left has its key no more.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        taken = self._keys.values()
+        if path in self._keys or path not in taken:
+            return
+        number = next(n for n in range(1, len(self._keys) + 2) if f"{path}//{n}" not in taken)
+        self._name(path, f"{path}//{number}")  # No actor's name is empty.
+
+    def erased(self, path: str) -> None:
+        """Nothing is recorded at an address any more.
+
+        Raises:
+            HoldfastError: the store refused.
+        """
+        self._name(path, None)
+
+    def _name(self, path: str, key: str | None) -> None:
+        key = None if key == path else key
+        if self._keys.get(path) == key:
+            return
+        self._journal.note(KEY + path, None if key is None else key.encode())
+        if key is None:
+            del self._keys[path]
+        else:
+            self._keys[path] = key
+
+
+def renamed(names: Mapping[str, str], path: str) -> str:
+    """What an address is now, if it, or one above it, is among these names."""
+    above, below = path, ""
+    while above and above not in names:
+        above, _, name = above.rpartition("/")
+        below = f"/{name}{below}"
+    return names[above] + below if above else path
