@@ -171,6 +171,8 @@ class Homes:
         """
         paths = {path: renamed(names, path) for path in {*self._stored, *self._switches}}
         paths = {was: now for was, now in paths.items() if was != now}
+        for path in {now for now in paths.values() if now not in paths and self.knows(now)}:
+            self._erase(path)  # Whoever had it is not there any more, and what comes there has a journal of its own.
         self.addresses.rename(paths)
         self.addresses.moved(names)
         for key, value in list(self.journal.notes(child_key("", "")[:-1]).items()):

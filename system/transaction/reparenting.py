@@ -88,8 +88,8 @@ class Move(Operation):
         """Those that replay turns, of the actor and all below it, and how each comes to rest."""
         assert self._place is not None
         for one in self._place.walk():
-            cell = one.now(system.node) if not one.is_planned else None
-            switch = switch_of(cell) if cell is not None else None
+            cell = one.now(system.node) if not (one.is_planned or one.rework is not None) else None
+            switch = switch_of(cell) if cell is not None else None  # Who is reworked rests for that, and is saved.
             if switch is not None and switch.method.replays and one not in self._rests:
                 self._rests[one] = Gated(one, f"pause of {one.path}")
         return list(self._rests.items())

@@ -102,7 +102,7 @@ class Walk:
         options = [
             step
             for place, kind, step, note in (cell.values for cell in cells())
-            if (place, kind) == (self.place, self._kind) and step != "move" and not refusal(kind, note)
+            if (place, kind) == (self.place, self._kind) and not refusal(kind, note)
         ]
         if self._kind == "plain" and self._is_below:  # Of these, `replicas` says what is true near the root.
             options = [step for step in options if step not in ("task", "process")]
@@ -126,7 +126,7 @@ class Walk:
         places = {"task": task, "process": process, "protect": "replicas", "unprotect": self._home}
         if step in ("task", "process"):
             self._home = places[step]  # Also of one that is protected: it lives there behind its mechanism.
-        if self.place != "replicas" or step == "unprotect":
+        if step != "move" and (self.place != "replicas" or step == "unprotect"):
             self.place = places[step]
 
     @property

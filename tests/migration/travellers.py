@@ -171,7 +171,7 @@ async def take(system: hf.ActorSystem, ref: hf.ActorRef[Any], step: str) -> None
                 change.detach(ref)
         case "move":
             async with system.transaction(timeout=60.0) as change:
-                change.move(ref, "/app/there")
+                change.move(ref, "/app/here" if ref.path.startswith("/app/there/") else "/app/there")
         case _:
             raise AssertionError(step)
 

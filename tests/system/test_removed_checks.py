@@ -10,6 +10,7 @@ from tests.removing import Check, as_tests
 
 COMMIT = "tests/system/test_transaction_commit.py"
 KEPT = "tests/system/test_specification.py"
+MOVED = "tests/system/test_readdressed.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -81,6 +82,62 @@ CHECKS = {
         "        if False:\n",
         COMMIT,
         "test_an_address_that_somebody_else_has",
+    ),
+    "what is recorded is found under the new address": Check(
+        "checkpoint/home/homes.py",
+        "        self.addresses.rename(paths)\n",
+        "        pass\n",
+        MOVED,
+        "test_a_root_that_is_killed and finish-task",
+    ),
+    "an address that was left has another journal": Check(
+        "checkpoint/home/addresses.py",
+        "        if path in self._keys or path not in taken:\n",
+        "        if True:\n",
+        MOVED,
+        "test_who_comes_to_live and task",
+    ),
+    "no turn is repeated under another address": Check(
+        "system/transaction/reparenting.py",
+        "            if switch is not None and switch.method.replays and one not in self._rests:\n",
+        "            if False:\n",
+        MOVED,
+        "test_what_is_recorded and task",
+    ),
+    "a process is told its address": Check(
+        "system/transaction/reparenting.py",
+        "                cell.host.place.readdress(cell)\n",
+        "                pass\n",
+        MOVED,
+        "test_what_a_process_says",
+    ),
+    "what a process names for the first time is meant as it is now": Check(
+        "actors/process/wire/worker_gate.py",
+        "        if self._left:\n            text = self._now(text)\n",
+        "",
+        MOVED,
+        "test_what_a_process_says",
+    ),
+    "what a process tells is meant as it is now": Check(
+        "actors/process/wire/worker_gate.py",
+        "        if self._left and isinstance(frame, (frames.Command, frames.Note)):\n",
+        "        if False:\n",
+        MOVED,
+        "test_what_a_process_says",
+    ),
+    "who is watched is known by its new address": Check(
+        "checkpoint/home/homes.py",
+        "            switch.ties.rename(lambda one: renamed(names, one))\n",
+        "            pass\n",
+        MOVED,
+        "test_who_knows_it and task",
+    ),
+    "who rests is let go of when others have to be waited for": Check(
+        "system/transaction/reparenting.py",
+        "            if waits:  # Perhaps for what those here have to answer.\n",
+        "            if False:\n",
+        MOVED,
+        "test_it_waits_for_nobody",
     ),
     "a binding follows the actor and not its address": Check(
         "system/transaction/arrangement.py",
