@@ -50,7 +50,7 @@ class Take(Item):
         *,
         stays: bool = False,
     ) -> None:
-        self._stays = stays  # it goes on where it is: what it has out, and its children, do no harm
+        self._stays = stays  # it goes on where it is, with its children
         self._owe, self._taken, self._refused = owe, taken, refused
         self._ignored = ignored  # children that are not the actor's own
         self.is_done = False  # the actor is at rest
@@ -64,7 +64,7 @@ class Take(Item):
         cell: Cell = ctx.cell
         if take.is_void or ctx.postpones(take) or any(map(_ends, cell.extra().urgent or ())):
             return None
-        take.why = "" if take._stays else _busy(cell)
+        take.why = _busy(cell)
         if take.why:
             cell.node.loop.call_later(LOOK_AGAIN, take._again, cell, cell.life)
             return None

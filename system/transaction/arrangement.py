@@ -7,12 +7,14 @@ with them, so that a restart of a supervisor keeps it.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ...actors.errors import HoldfastError, NameTaken
 from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.kernel.ref import ActorRef
+from ...actors.process.process_host import WorkerPlace
 from ...supervision.admin import ChangeSupervisor
 from ...supervision.children import Child, new_cell
 from ...supervision.spec import ChildSpec, Flags
@@ -122,6 +124,10 @@ class Arrangement:
             keep(cell, lambda flags, specs, place=place: _edited(place, flags, specs, taken))  # type: ignore[misc]
         if moved:
             system.homes.move(now)
+        for child in moved:  # Before anything else is said to their processes.
+            for cell in every_cell(taken[child].cell):
+                if isinstance(cell.host.place, WorkerPlace):
+                    cell.host.place.readdress(cell)
 
     async def finish(self, system: ActorSystem) -> None:
         """Tell those that live in other processes."""
@@ -131,6 +137,15 @@ class Arrangement:
                 flags, specs = recipe_flags(cell), recipe_specs(cell)
                 ref: ActorRef[Supervisor] = ActorRef(cell)
                 await ref.ask(ChangeSupervisor(flags=flags, children=list(specs or ())), START_TIMEOUT)
+
+
+def every_cell(top: Cell | None) -> Iterator[Cell]:
+    """An actor, if there is one, and all below it."""
+    waiting = [] if top is None else [top]
+    while waiting:
+        cell = waiting.pop()
+        waiting.extend((cell.children or {}).values())
+        yield cell
 
 
 def busy(supervisor: Cell) -> str:
@@ -149,10 +164,7 @@ def child_of(supervisor: Cell, name: str) -> Child | None:
 
 def settle_bindings(root: Cell | None) -> None:
     """Who is bound to a life that is over is bound to the one that has followed it, wherever that goes now."""
-    waiting = [] if root is None else [root]
-    while waiting:
-        cell = waiting.pop()
-        waiting.extend((cell.children or {}).values())
+    for cell in every_cell(root):
         if cell.more is None:
             continue
         for bindings in (cell.more.bindings, cell.more.turn.rebinds if cell.more.turn is not None else None):

@@ -7,7 +7,6 @@ import functools
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, ClassVar
 
-from ...actors.process.process_host import WorkerPlace
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
@@ -33,6 +32,7 @@ class Move(Operation):
         self._at, self._to = target, supervisor
         self._place: Place | None = None
         self._above: Place | None = None  # the new supervisor, at this point
+        self._root: Place | None = None
         self._leads = False  # it is the first step that moves this actor: it brings it to where the last one wants it
         self._asked: dict[Switch, int] = {}  # who was asked for a snapshot, behind which turn
         self._rests: dict[Place, Gated] = {}
@@ -66,7 +66,7 @@ class Move(Operation):
         check_child(new, place.spec)
         del old.children[place.name]
         new.children[place.name], place.parent = place, new
-        self._place, self._above = place, new
+        self._place, self._above, self._root = place, new, draft.root
         self._leads = not (place.is_moved or place.is_planned)  # Who is added is started where it is to be.
         place.is_moved = True
         self.between_turns_of = (old, new)
@@ -96,8 +96,11 @@ class Move(Operation):
 
     def _others_settle(self, system: ActorSystem) -> str:
         """Why the others are not so far that addresses can change; they are asked for what is missing."""
-        own = {switch for one, _ in self._resting(system) if (switch := switch_of(one.living(system.node))) is not None}
-        others = [switch for switch in system.homes if switch not in own]
+        assert self._root is not None
+        reworked = [place for place in self._root.walk() if place.rework is not None]  # They are saved at the commit.
+        own = [place.now(system.node) for place in (*reworked, *(one for one, _ in self._resting(system)))]
+        settled = {switch_of(cell) for cell in own if cell is not None}
+        others = [switch for switch in system.homes if switch not in settled]
         settle_senders(others, self._asked)
         return WAITING if any(map(is_unsettled, others)) else ""
 
@@ -126,12 +129,6 @@ class Move(Operation):
         return ""
 
     def commit(self, system: ActorSystem) -> None:
-        if self._place is None or not self._leads:
-            return
-        for one in self._place.walk():
-            cell = one.now(system.node) if not one.is_planned else None
-            if cell is not None and isinstance(cell.host.place, WorkerPlace):
-                cell.host.place.readdress(cell)
         for rest in self._rests.values():
             rest.open()
 
@@ -183,4 +180,4 @@ def settle_senders(homes: Iterable[Switch], asked: dict[Switch, int]) -> None:
     for switch in homes:
         if is_unsettled(switch) and asked.get(switch) != switch.turn and switch.port is not None and switch.is_released:
             asked[switch] = switch.turn
-            switch.port.to_life(SnapshotNow())
+            switch.port.to_life(SnapshotNow(urgent=True))  # also if it is suspended

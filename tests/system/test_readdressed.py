@@ -48,6 +48,10 @@ class Hold(hf.Message[bool]):
     friend: str
 
 
+class Work(hf.Message):
+    """Have something be computed beside."""
+
+
 class Ends(hf.Message[list[str]]): ...
 
 
@@ -91,6 +95,14 @@ class Friend(Counter):
         self.ctx.subscribe("/news")
         friend.tell(Add(1))
         return True
+
+    @hf.on(Work)
+    def work(self, message: Work) -> None:
+        async def compute() -> int:
+            await asyncio.sleep(0.1)
+            return 40
+
+        self.ctx.pipe_to_self(compute(), Add)
 
     @hf.on(Ends, readonly=True)
     def seen(self, message: Ends) -> list[str]:
@@ -307,6 +319,33 @@ async def test_it_waits_for_nobody_who_waits_for_it(tmp_path: Path) -> None:
         assert one.path == "/app/there/one"
         await task
         assert answers == list(range(1, 201))
+
+
+async def test_it_goes_past_recorded_actors_that_are_suspended(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system:
+        one, other = ref(system, "/app/here/one"), ref(system, "/app/there/friend")
+        assert await other.ask(Know(one))
+        assert await other.ask(Pass(1)) == 1
+        for suspended in (other, one):
+            await system.suspend(suspended)
+        await moved(system)
+        waiting = one.ask(Add(1), IN_TIME)
+        await system.resume(other)
+        assert (await system.get_status(one)).state == "suspended"
+        await system.resume(one)
+        assert await waiting == 2
+
+
+async def test_it_waits_for_the_background_work_of_the_actor(tmp_path: Path) -> None:
+    async with program(tmp_path / "store") as system:
+        one = ref(system, "/app/here/one")
+        await one.ask(Work())
+        moving = asyncio.ensure_future(moved(system))
+        async with asyncio.timeout(IN_TIME):
+            while await one.ask(Add(0)) != 40:
+                await asyncio.sleep(0.005)
+        await moving
+        assert await one.ask(Add(1)) == 41
 
 
 async def test_without_snapshots_all_turns_would_be_repeated_under_another_address(tmp_path: Path) -> None:

@@ -105,9 +105,9 @@ CHECKS = {
         "test_what_is_recorded and task",
     ),
     "a process is told its address": Check(
-        "system/transaction/reparenting.py",
-        "                cell.host.place.readdress(cell)\n",
-        "                pass\n",
+        "system/transaction/arrangement.py",
+        "                    cell.host.place.readdress(cell)\n",
+        "                    pass\n",
         MOVED,
         "test_what_a_process_says",
     ),

@@ -178,7 +178,6 @@ class Judge:
 
     async def _supervisor(self, system: hf.ActorSystem, spec: Spec, node: Node) -> list[str]:
         path, found = spec.path(node.who), list[str]()
-        cell = system.node.find(path)
         children = await system.ref(path, hf.Supervisor).ask(hf.WhichChildren(), LOOK_TIMEOUT)
         told = [(info.id, info.state) for info in children]
         below = [spec.nodes[who] for who in node.below]
@@ -189,8 +188,10 @@ class Judge:
             found.append(
                 f"order: the children of {path} are {[name for name, _ in told]}, not {[n for n, _ in wanted]}"
             )
+        cell = system.node.find(path)
         actor = cell.actor if cell is not None else None
-        assert isinstance(actor, Supervisor)
+        if not isinstance(actor, Supervisor):
+            return [*found, f"between two lives: {path}"]
         flags = (actor._flags.strategy, actor._flags.intensity, actor._flags.period)
         if flags != (node.strategy, node.intensity, node.period):
             found.append(f"flags: of {path} are {flags}, not {(node.strategy, node.intensity, node.period)}")

@@ -13,6 +13,7 @@ import asyncio
 import dataclasses
 import random
 import sys
+import traceback
 from collections.abc import Callable, Coroutine
 from typing import Any, cast
 
@@ -395,6 +396,13 @@ class Run:
         return f"seed {self.seed}, hazards: {', '.join(sorted(self.hazards)) or 'none'}"
 
 
+def where(error: BaseException) -> str:
+    """The innermost places that an error comes from."""
+    return "; ".join(
+        f"{one.filename}:{one.lineno} {one.line}" for one in traceback.extract_tb(error.__traceback__)[-3:]
+    )
+
+
 async def carry_out(run: Run, plan: Plan, *, end: float = 15.0) -> None:
     """Carry out a plan in a new system. Raises Found: with what happened."""
     loop = asyncio.get_running_loop()
@@ -407,7 +415,7 @@ async def carry_out(run: Run, plan: Plan, *, end: float = 15.0) -> None:
                 await machine.plant(processes=run.processes, stops="stop" in run.verbs)
                 await machine.run(plan, end=end)
             except Exception as error:
-                faults.append(f"raises: {error!r}")
+                faults.append(f"raises: {error!r} at {where(error)}")
             leaving = loop.time()
     except hf.TreeFailed as error:
         faults.append(f"the tree failed: {error}")

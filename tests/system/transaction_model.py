@@ -78,6 +78,7 @@ class Spec:
         self.late: set[int] = set()
         """Who was added there, or bound by its spec to such a one: started only when the transaction is in force."""
         self.reworked: set[int] = set()
+        self.relocated: set[int] = set()
         """Whose state an earlier step of it has replaced."""
 
     def copy(self) -> Spec:
@@ -192,6 +193,7 @@ class Spec:
         self.left.clear()
         self.late.clear()
         self.reworked.clear()
+        self.relocated.clear()
 
     def _forget(self, who: int) -> None:
         if who not in self.nodes:
@@ -291,8 +293,6 @@ class Spec:
         node, new = self._old(who), self._supervisor(to)
         if node.above in (ROOT, to) or new.who in {one.who for one in self.walk(who)}:
             raise Cannot(f"{who} cannot be moved to {to}")
-        if any(one.is_recorded or one.isolation == "process" for one in self.walk(who)):
-            raise Cannot("its address is known elsewhere")
         if self._is_taken(new, node.name) or (new.kind == "dynamic" and (node.is_supervisor or node.is_stopped)):
             raise Cannot(f"{to} cannot take {who}")
         self._living(node.above)
@@ -326,6 +326,7 @@ class Spec:
         if self.nodes[node.above].kind == "dynamic":
             raise Cannot("its spec is not kept")
         node.isolation = isolation
+        self.relocated.add(who)  # It lives where it did until the transaction is in force.
 
     def _bind(self, owner: int, target: int) -> None:
         if owner == target:
@@ -337,6 +338,8 @@ class Spec:
         node = self._leaf_before(owner)
         if node.peer is None or node.spec_peer is not None or node.isolation == "process":
             raise Cannot("there is nothing to unbind")
+        if owner in self.relocated:
+            raise Cannot(f"{owner} lives in a process, which keeps a binding, or will")
         node.peer = None
 
     def _register(self, name: str, who: int) -> None:
