@@ -89,8 +89,8 @@ class CheckpointHandler(Part):
 
     def _consider(self, home: Switch, now: float) -> None:
         due = home.due.when(now)
-        if due is not None and due <= now and home.port is not None:
+        if due is not None and due <= now and home.life.port is not None:
             home.due.asked_at = home.due.last_at = now
-            home.port.to_life(SnapshotNow(urgent=True))
+            home.life.port.to_life(SnapshotNow(urgent=True))
             due = None
         self._at(home.path, due if due is not None else now + home.method.interval)

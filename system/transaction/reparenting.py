@@ -111,12 +111,13 @@ def unsettled(homes: Homes) -> bool:
 
 def is_unsettled(switch: Switch) -> bool:
     """Whether what it has sent may be sent again, to be compared."""
-    return bool(switch.partial) or any(turn.digests for turn in switch.turns.values())
+    return switch.ledger.has_sent
 
 
 def settle_senders(homes: Homes, asked: dict[Switch, int]) -> None:
     """Have recorded actors take a snapshot, so that no replay sends to an address of before; each turn once."""
     for switch in homes:
-        if is_unsettled(switch) and asked.get(switch) != switch.turn and switch.port is not None and switch.is_released:
+        life = switch.life
+        if is_unsettled(switch) and asked.get(switch) != switch.turn and life.port is not None and life.is_released:
             asked[switch] = switch.turn
-            switch.port.to_life(SnapshotNow())
+            life.port.to_life(SnapshotNow())
