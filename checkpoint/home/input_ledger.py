@@ -320,7 +320,9 @@ class InputLedger:
         entries += [turn.entry(number) for number, turn in self.turns.items()]
         if self.released:
             entries.append(self.released_entry(self.turn + 1))
-        return entries
+        # What was put aside once may have ended in a turn that was given up.
+        ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
+        return entries + [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
 
     def released_entry(self, turn: int) -> Entry:
         """What the journal has of a turn that has not ended."""

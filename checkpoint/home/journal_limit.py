@@ -38,7 +38,7 @@ class Limit:
         # During a replay they may still be wanted; and each look costs as much as there are turns.
         if self._home.life.is_released and abs(count - self._looked_at) >= max(16, count // 8):
             chosen = turns_to_skip(self._home)
-            for number in chosen.readonly | chosen.superseded:
+            for number in (chosen.readonly | chosen.superseded) - {ledger.turn}:  # Numbers go on from the last one.
                 ledger.give_up(number)
             self._looked_at = len(ledger.turns)
         return not self.is_reached
