@@ -146,16 +146,16 @@ class Switch:
 
     def take(self, ask: Ask | None, name: str, body: bytes, sender: str | None) -> None:
         """Admit a message for which there is room."""
+        if ask is None:
+            self.forward(self.record(MESSAGE, name, body, sender))
+            return
         origin = origin_of(ask) if isinstance(ask, SwitchAsk) else ""
         try:
             source = self.record(MESSAGE, name, body, sender, origin=origin)
         except HoldfastError as error:  # The store has no room, or has failed.
-            if ask is None:
-                raise
             ask.fail(error)
             return
-        if ask is not None:
-            source.ask, source.chain = ask, ask.chain
+        source.ask, source.chain = ask, ask.chain
         self.forward(source)
 
     def waits(self, ask: Ask) -> bool:
