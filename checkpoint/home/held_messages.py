@@ -34,7 +34,10 @@ class Holding:
 
     def __init__(self, home: Switch, inner: HomeBound | None) -> None:
         self._home, self.inner = home, inner
-        self._rules: dict[str, Held | None] = {"": home.method.held, **dict(home.method.held_topics)}
+        self._rules: dict[str, Held | None] = {
+            "": home.method.meanwhile.held,
+            **dict(home.method.meanwhile.held_topics),
+        }
         self._counted: dict[int, tuple[Input, str]] = {}  # by id, in admission order
         self._waiting: deque[tuple[Ask, str, bytes, str | None, str]] = deque()  # asks that wait
         self._senders = Senders()
@@ -293,7 +296,7 @@ def hold(home: Switch, running: int = -1) -> None:
     intake = home.intake
     if intake.holding is not None:
         intake.holding.again(running)
-    elif home.method.held is not None or home.method.held_topics:
+    elif home.method.meanwhile.held is not None or home.method.meanwhile.held_topics:
         assert not isinstance(intake.bound, Holding)
         intake.bound = intake.holding = Holding(home, intake.bound)
 
@@ -313,7 +316,7 @@ def inlet(home: Switch, topic: str) -> Cell:
     assert cell is not None
     inlets = home.intake.inlets
     if topic not in inlets:
-        if all(topic != one for one, _ in home.method.held_topics):
+        if all(topic != one for one, _ in home.method.meanwhile.held_topics):
             return cell
         inlets[topic] = Inlet(home, topic)
     inlets[topic].renew()

@@ -220,11 +220,13 @@ class ChildHere(ChildPlace):
 
     def _with_ports(self, cell: Cell) -> Method:
         """The method; where this actor's bindings lead is known here only."""
-        state = self._method.safe_state
+        meanwhile = self._method.meanwhile
+        state = meanwhile.safe_state
         if state is None:
             return self._method
         ports = tuple((port, target.path) for port, target in cell.extra().bindings.items() if port in state.to)
-        return dataclasses.replace(self._method, safe_state=dataclasses.replace(state, ports=ports))
+        told = dataclasses.replace(meanwhile, safe_state=dataclasses.replace(state, ports=ports))
+        return dataclasses.replace(self._method, meanwhile=told)
 
     def begin_here(self, record: Begin) -> None:
         port, cell = self._port, self.cell

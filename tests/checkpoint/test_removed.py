@@ -214,7 +214,7 @@ CHECKS = {
     ),
     "S1: a crash makes the receivers safe before the restart": Check(
         "checkpoint/recovery/recoveries.py",
-        '        if stage == "restart" and recovery.has_crashed and recovery.method.safe_state is not None:\n'
+        '        if stage == "restart" and recovery.has_crashed and recovery.method.meanwhile.safe_state is not None:\n'
         "            return True\n",
         "",
         "tests/checkpoint/test_controller_safe_state.py",
