@@ -181,10 +181,10 @@ class JournalHome(RecordedHome):
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it counts."""
         commits = self.homes.journal
-        before = commits.submitted
+        before = commits.last
         cell.admit(cell, item)
-        last = commits.last if commits.submitted != before else None
-        return last.accepted() if isinstance(last, Admission) else None
+        last = commits.last
+        return last.accepted() if last is not before and isinstance(last, Admission) else None
 
     def progress(self, cell: Cell) -> object:
         """How far the replay has come."""
