@@ -39,8 +39,8 @@ CHECKS = {
     ),
     "fsync: the journal is on the disk": Check(
         "checkpoint/sqlite/open_store.py",
-        "            os.fdatasync(self._wal)\n",
-        "            pass\n",
+        "        os.fdatasync(self._fd)\n",
+        "        pass\n",
         "tests/checkpoint/sqlite/test_power.py",
         "test_a_power_loss and fsync",
     ),
@@ -74,7 +74,7 @@ CHECKS = {
     ),
     "what was acknowledged is missed": Check(
         "checkpoint/sqlite/open_store.py",
-        "        self._mark.check(self.last, synced=self._fsync)\n",
+        "        self._mark.check(self.contents.last, synced=self._fsync)\n",
         "",
         "tests/checkpoint/sqlite/test_damage.py",
         "test_a_wal_that_lost_acknowledged",
@@ -102,7 +102,7 @@ CHECKS = {
     ),
     "log: what is behind a gap is cut": Check(
         "checkpoint/sqlite/open_store.py",
-        "            if batch[0][0] == self.last + 1:\n",
+        "            if batch[0][0] == self.contents.last + 1:\n",
         "            if True:\n",
         "tests/checkpoint/sqlite/test_log.py",
         "test_after_a_power_loss",
@@ -151,7 +151,7 @@ CHECKS = {
     ),
     "log: nothing moves twice": Check(
         "checkpoint/sqlite/open_store.py",
-        "        if rows and rows[0][0] <= self.last:",
+        "        if rows and rows[0][0] <= self.contents.last:",
         "        if False:",
         "tests/checkpoint/sqlite/test_log.py",
         "test_a_transaction_that_is_broken_off",

@@ -94,7 +94,7 @@ def test_many_interleaved_entries_are_dropped(path: Path) -> None:
         journal.cut(A, b"2", [], turn=2)
         assert [position for position, _ in journal.load(A).entries] == mine[-1:]
         assert len(journal.load(B).entries) == 1667
-        assert journal._store.live == 1668
+        assert journal._store.contents.live == 1668
     assert numbers(reopened(path)) == [4999]
 
 
