@@ -76,7 +76,7 @@ class RecordedGuest:
         cell.host = AddressHost(FED, LifePlace(life), self._guest.parent)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
-        life.begins_suspended = bool(options.get("suspended"))
+        life.stage.begins_suspended = bool(options.get("suspended"))
         port.begin(life, int(options["turn"]), list(options["stash"]))
 
     def host_for(self, spec: Any) -> AddressHost:
@@ -262,8 +262,8 @@ class ChildHere(ChildPlace):
         if life is None:
             return  # It has not begun yet, or is not the address's any more.
         self.say_closed(cell, cell.extra().reason)
-        if life.ignored_why is not None:
-            self.fail(StartIgnored(cell.path, life.ignored_why))
+        if life.stage.ignored_why is not None:
+            self.fail(StartIgnored(cell.path, life.stage.ignored_why))
         elif life.is_live:
             self.came_up()  # It was up, and has ended in a turn before its home could say so.
         else:

@@ -308,7 +308,7 @@ class RecordedArrival(Arrival):
         home = self._home = ArrivingHome(owner, cell, self.other, up)
         owner.page = owner.homes.page(switch)
         life = self._life = Life(self.other, home, owner.method, owner.page)
-        life.begins_suspended = suspended
+        life.stage.begins_suspended = suspended
         for record in switch.restore_records():
             life.to_life(record)
         self.other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
