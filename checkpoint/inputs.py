@@ -125,7 +125,7 @@ class Batch:
             sink.append(position)
 
     def safe(self) -> None:
-        """Let it take effect."""
+        """Let the batch take effect, in order."""
         for effect in self.after:
             effect()
 

@@ -142,7 +142,7 @@ class Shapes:
         self.fields = {name: [*all_] for name, all_ in fields.items()}
 
     def read(self, name: str, shape: Shape) -> None:
-        """What the journal says."""
+        """Take the fields of a type as the journal has them."""
         known = self.fields.setdefault(name, [])
         if shape in known:
             known.remove(shape)

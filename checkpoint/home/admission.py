@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .switch import Switch
 
 
-class Admission:
+class InputAdmission:
     """One input that stands alone in its submission."""
 
     __slots__ = ("_accepted", "_home", "_source", "entries")
@@ -64,7 +64,7 @@ def submit(home: Switch, source: Input) -> None:
     Raises:
         HoldfastError: it comes from outside, and the store takes nothing now.
     """
-    admission = Admission(home, source)
+    admission = InputAdmission(home, source)
     if source.kind != MESSAGE:
         home.journal.submit(admission)
         return

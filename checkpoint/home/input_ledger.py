@@ -125,7 +125,7 @@ class InputLedger:
     # -- admission --------------------------------------------------------------------------------------------------
 
     def admit(self, kind: str, name: str, body: bytes, time: float, sender: str | None, origin: str = "") -> Input:
-        """Number an input."""
+        """Number an input, which is open from now on."""
         key = self.next_id
         self.next_id = key + 1
         source = self.open[key] = Input(key, kind, name, body, time, sender)

@@ -23,7 +23,7 @@ from ..protocol import LifePort
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
 from ..turn_word import input_of
-from .admission import Admission
+from .admission import InputAdmission
 from .disposal import drop_all
 from .held_messages import hold, inlet, let_go
 from .homes import ENDED, Homes
@@ -184,7 +184,7 @@ class JournalHome(RecordedHome):
         before = commits.last
         cell.admit(cell, item)
         last = commits.last
-        return last.accepted() if last is not before and isinstance(last, Admission) else None
+        return last.accepted() if last is not before and isinstance(last, InputAdmission) else None
 
     def progress(self, cell: Cell) -> object:
         """How far the replay has come."""

@@ -28,7 +28,7 @@ MARK = "ask "
 """How the origin of an input begins that somebody's recorded turn has asked; the asker is its sender."""
 
 
-class Over:
+class EndedCall:
     """Stands for the future of an ask that is over."""
 
     def done(self) -> bool:
@@ -36,7 +36,7 @@ class Over:
         return True
 
 
-OVER = Over()
+OVER = EndedCall()
 
 
 class SwitchAsk(RelayedAsk, eq=False):
@@ -125,7 +125,7 @@ def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:
         ask.answer(reply)
 
 
-class Calls:
+class PendingCalls:
     """What the turns of one home wait for, and what it owes others.
 
     Attributes:

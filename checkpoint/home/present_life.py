@@ -78,7 +78,7 @@ class PresentLife:
         self.port, self.seen_turn = port, -1
 
     def come_up(self, restore_seconds: float) -> None:
-        """It has caught up."""
+        """Tell whoever waits for it that it has caught up."""
         self.live_at = time.monotonic()
         if self.live is not None and not self.live.done():
             self.live.set_result(restore_seconds)

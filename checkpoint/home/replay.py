@@ -21,7 +21,7 @@ TELL_EVERY = 1.0
 """Seconds between two events that tell how long a paced replay will still take, at least."""
 
 
-class Replay:
+class PacedReplay:
     """The replay to the present life of one home."""
 
     def __init__(self, home: Switch) -> None:

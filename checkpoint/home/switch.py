@@ -55,19 +55,19 @@ from ..protocol import (
     pieces,
 )  # fmt: skip
 from ..schema import Shapes, start_name
-from ..snapshot.snapshot_blocks import Images
-from ..snapshot.snapshot_receiver import Arrival
+from ..snapshot.snapshot_blocks import SnapshotImages
+from ..snapshot.snapshot_receiver import SnapshotReceiver
 from ..snapshot.snapshot_record import load
-from ..snapshot.snapshot_schedule import Due
+from ..snapshot.snapshot_schedule import SnapshotSchedule
 from .admission import submit, taken_up
 from .disposal import lose, put_into_quarantine
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger
 from .journal_limit import Limit
 from .outputs import Outputs, went_elsewhere
-from .pending_asks import Calls, SwitchAsk, answer_ask, origin_of
+from .pending_asks import PendingCalls, SwitchAsk, answer_ask, origin_of
 from .present_life import PresentLife
-from .replay import Replay
+from .replay import PacedReplay
 from .replay_filter import turns_to_replay
 
 if TYPE_CHECKING:
@@ -86,16 +86,16 @@ class Switch:
         self.ledger = InputLedger(cell.path)
         self.life = PresentLife()
         self.intake = Intake()
-        self.calls = Calls(self)
+        self.calls = PendingCalls(self)
         self.timers = Timers(self)
         self.topics: dict[str, None] = {}
         self.ties = Ties(self)
         self.outputs = Outputs(self)
         self.limit = Limit(self)
-        self.replay = Replay(self)
-        self.images = Images(self)
-        self.due = Due(self)
-        self.arrival = Arrival(self)
+        self.replay = PacedReplay(self)
+        self.images = SnapshotImages(self)
+        self.due = SnapshotSchedule(self)
+        self.arrival = SnapshotReceiver(self)
         self.shapes = Shapes(self)
         load(self, saved)
 
@@ -106,7 +106,7 @@ class Switch:
 
     @property
     def turn(self) -> int:
-        """The last ended turn."""
+        """The number of the last ended turn."""
         return self.ledger.turn
 
     @property
@@ -116,7 +116,7 @@ class Switch:
 
     @property
     def open(self) -> dict[int, Input]:
-        """Inputs without an end."""
+        """The inputs without an end, in admission order."""
         return self.ledger.open
 
     # -- admission --------------------------------------------------------------------------------------------------
@@ -405,7 +405,8 @@ class Switch:
                 self._lose(source, end)
             return
         batch = Batch()
-        self._take(end.turn, end.id, end.outs, batch)
+        if end.outs or ledger.released:
+            self._take(end.turn, end.id, end.outs, batch)
         was_asked = source.ask is not None and end.status == OK
         self.end_turn(source, end.turn, end.status, batch, end.state, answer_digest(end.answer) if was_asked else 0)
         if end.answer.kind == LATER:

@@ -36,7 +36,7 @@ class RestoredState:
     seconds: float = 0.0
 
     def take(self, record: Restore) -> None:
-        """Take one more piece."""
+        """Take one more piece of the state."""
         self.has_state = True
         self.traps = self.traps or record.traps
         self.variables += record.variables

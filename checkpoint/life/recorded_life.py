@@ -48,7 +48,7 @@ from ..protocol import (
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
-from .determinism_guard import Guard
+from .determinism_guard import DeterminismGuard
 from .life_state import HookTimers, LifeStage, RestoredState, SnapshotState
 from .readonly_guard import check_readonly
 from .recorded_context import RecordedContext
@@ -93,7 +93,7 @@ class Life:
         self.returned: dict[int, Fed] = {}
         self.is_live = False
         self.hook = ""  # the hook that runs, if it is one that is no turn
-        self.guard = Guard() if method.strict else None
+        self.guard = DeterminismGuard() if method.strict else None
         self.restored = RestoredState()
         self.timers = HookTimers()
         self.saving = SnapshotState()

@@ -155,7 +155,7 @@ class Port:
         self.place: ChildPlace | None = None  # of a child: it hears of its lives
 
     def take(self, frame: frames.Record) -> None:
-        """A record from home."""
+        """Take a record from the home of a life in this process."""
         record = FROM_HOME.decode(frame.body)
         match record:
             case Restore():

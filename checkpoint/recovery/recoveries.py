@@ -148,7 +148,7 @@ class Recoveries:
         self.phase(recovery, "replay", live_at)
 
     def over(self, path: str) -> None:
-        """The actor is back."""
+        """End the recovery of an actor, which is back."""
         recovery = self._by_path.get(path)
         if recovery is None or "over" in recovery.stages:
             return
@@ -299,7 +299,7 @@ class Recoveries:
             self._node.emit(self._untold.popleft())
 
     def close(self) -> None:
-        """The system ends."""
+        """Wait for nothing any more: the system ends."""
         for timer in self._timers:
             timer.cancel()
         self._timers.clear()

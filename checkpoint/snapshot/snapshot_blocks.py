@@ -25,7 +25,7 @@ MOST_GARBAGE: Final = 3
 """How many times the size of an image its packs may take before it is written anew."""
 
 
-class Images:
+class SnapshotImages:
     """The blocks of one home's snapshots."""
 
     def __init__(self, home: Switch) -> None:

@@ -31,7 +31,7 @@ class NoSuchGroup(HoldfastError, text="there is no group snapshot {name!r}; chec
     name: str
 
 
-class Image(msgspec.Struct, array_like=True, frozen=True):
+class HomeImage(msgspec.Struct, array_like=True, frozen=True):
     """One home at the cut."""
 
     path: str
@@ -39,12 +39,12 @@ class Image(msgspec.Struct, array_like=True, frozen=True):
     entries: list[list[Any]]
 
 
-class Group(msgspec.Struct, array_like=True, frozen=True):
+class GroupSnapshot(msgspec.Struct, array_like=True, frozen=True):
     """The homes of a group at one cut."""
 
     format: int
     time: float
-    images: list[Image]
+    images: list[HomeImage]
 
 
 class Groups:
@@ -66,7 +66,7 @@ class Groups:
             HoldfastError: one of them is not recorded, or the store refused.
         """
         homes = [self._recorded(path) for path in paths]
-        group = Group(FORMAT, self._homes.node.wall(), [_image(home) for home in homes])
+        group = GroupSnapshot(FORMAT, self._homes.node.wall(), [_image(home) for home in homes])
         self._homes.journal.note(_key(name), msgspec.msgpack.encode(group))
 
     def _recorded(self, path: str) -> Switch:
@@ -127,11 +127,11 @@ class Groups:
             )
         journal.note(RESTORING, None)
 
-    def _group(self, name: str) -> Group:
+    def _group(self, name: str) -> GroupSnapshot:
         data = self._homes.journal.noted(_key(name))
         if data is None:
             raise NoSuchGroup(name)
-        return msgspec.msgpack.decode(data, type=Group)
+        return msgspec.msgpack.decode(data, type=GroupSnapshot)
 
     def wait(self, paths: Iterable[str]) -> None:
         """From now on these homes hold what waits, until `let_go`: what they send would find nobody."""
@@ -157,7 +157,7 @@ def _key(name: str) -> str:
     return f"group {name}"
 
 
-def _image(home: Switch) -> Image:
+def _image(home: Switch) -> HomeImage:
     """What its store would have of it, if the root died now."""
     timers, topics = outlasting(home)
     newest = home.ledger.newest or Meta(FORMAT, -1, 0, [], {}, [], home.journal.epoch, b"")
@@ -176,7 +176,7 @@ def _image(home: Switch) -> Image:
         owed=home.calls.debts(),
         ties=home.ties.saved(),
     )
-    return Image(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in home.ledger.entries()])
+    return HomeImage(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in home.ledger.entries()])
 
 
 def _tuple(part: Any) -> Any:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..home.switch import Switch
 
 
-class Arrival:
+class SnapshotReceiver:
     """The snapshot that is on its way to one home."""
 
     def __init__(self, home: Switch) -> None:

@@ -34,7 +34,7 @@ def retry_after(failures: int, interval: float) -> float:
     return min(max(FIRST_RETRY * 2.0 ** min(failures - 1, 20), min(interval, LONGEST_RETRY)), LONGEST_RETRY)
 
 
-class Due:
+class SnapshotSchedule:
     """What one home knows of its next snapshot."""
 
     def __init__(self, home: Switch) -> None:

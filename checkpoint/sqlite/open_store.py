@@ -14,12 +14,12 @@ from typing import Final, NamedTuple
 
 from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, Entry, StaleEpoch, StoreFailed
-from .append_log import FrontLog, NoRoom, Row, Sealed
+from .append_log import FrontLog, LogSealed, NoRoom, Row
 from .database import VERSION, VERSION_WITH_LOG, connect, create_database, result_code
-from .entry_chains import Chain, Contents, Scan, create_chain
-from .in_hand import Hands
-from .ownership import Claim
-from .position_mark import Mark
+from .entry_chains import Chain, StoreContents, StoreScan, create_chain
+from .in_hand import InputsInHand
+from .ownership import StoreClaim
+from .position_mark import PositionMark
 from .snapshot_files import SnapshotFiles, sync
 from .store_parts import Parts
 
@@ -82,13 +82,13 @@ class Store:
         self.lock = threading.RLock()
         self._joint: Joint | None = None
         self.read_lock = threading.Lock()
-        self.contents = Contents({}, [], {}, 0, 0)
+        self.contents = StoreContents({}, [], {}, 0, 0)
         self.failure: HoldfastError | None = None
         self.log = FrontLog(path, is_used=not fsync)
         self._fsync = fsync
         self._look_at = 0.0
-        self._mark = Mark(path)
-        self.hands = Hands(path)
+        self._mark = PositionMark(path)
+        self.hands = InputsInHand(path)
         self.in_doubt = False
         self._wal = WalSync(f"{path}-wal")
         self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly
@@ -136,7 +136,7 @@ class Store:
         if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
             raise DamagedStore(self.path, None, None, "the file is empty")
         self.db, self.reader = connect(self.path), connect(self.path)
-        self.claim = Claim(self.db, self.parts)
+        self.claim = StoreClaim(self.db, self.parts)
 
     def _configure(self) -> None:
         self.db.execute(f"PRAGMA synchronous = {'FULL' if self._fsync else 'NORMAL'}")
@@ -144,7 +144,7 @@ class Store:
 
     def _scan(self) -> None:
         """Take into memory what is in the file."""
-        self.contents, self.in_doubt = Scan(self.db, self.path).contents(), False
+        self.contents, self.in_doubt = StoreScan(self.db, self.path).contents(), False
         rows = self.log.rows
         if rows and rows[0][0] <= self.contents.last:  # It was only broken off when all was done.
             self.log.restart()
@@ -333,7 +333,7 @@ class Store:
         """
         try:
             self.log.write(rows)
-        except Sealed as error:
+        except LogSealed as error:
             (current,) = self.db.execute("SELECT epoch FROM store").fetchone()
             raise StaleEpoch(self.path, self.claim.epoch, current) from error
         except OSError as error:
