@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Final
 
 import msgspec
 
-from .home.disposal import end_without_turn
 from .inputs import Batch, TimerState
 from .protocol import TICK, Answer, Clock, Out
 
@@ -133,7 +132,7 @@ class Timers:
         home = self._home
         for source in list(home.ledger.open.values()):
             if source.kind == TICK and source.origin == timer and source.id != running:
-                end_without_turn(home, source, Answer(), batch)
+                home.end_without_turn(source, Answer(), batch)
 
     def pause(self) -> None:
         """The address is given up: what remains runs on with the next life."""

@@ -16,7 +16,7 @@ from ...actors.kernel.mailbox import Bound, Senders
 from ...actors.overflow import DROPS, Overflow, decide
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
-from .disposal import end_without_turn, lose
+from .disposal import lose
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Ask
@@ -94,7 +94,7 @@ class HomeBound:
             if source.id not in (self._fed, home.ledger.begun):
                 self._behind.pop(source.id, None)
                 lose(home, source, self._why())
-                end_without_turn(home, source, error, batch)
+                home.end_without_turn(source, error, batch)
         batch.commit(home.journal)
 
     @property

@@ -17,18 +17,6 @@ if TYPE_CHECKING:
     from .switch import Switch
 
 
-def end_without_turn(home: Switch, source: Input, answer: Answer, batch: Batch) -> None:
-    """End an input that will not be handled: it gets an end record all the same."""
-    home.ledger.withdraw(source)
-    if home.intake.bound is not None:
-        home.intake.bound.ended(source)
-    if home.journal.durable:
-        position: list[int] = []
-        home.ledger.drop(source.positions, position)  # Perhaps they stand nowhere yet.
-        batch.add(home.path, ("drop", source.id), position)
-    home.give(source, answer, batch)
-
-
 def end_begun(home: Switch, source: Input, error: HoldfastError, batch: Batch) -> None:
     """End the turn that was in hand when the life ended: it is not gone on with.
 
@@ -83,7 +71,7 @@ def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bo
         if source.id == ledger.begun and ledger.released:
             end_begun(home, source, ended, batch)
         else:
-            end_without_turn(home, source, _failure(home, ended if source.was_cut else stopped), batch)
+            home.end_without_turn(source, _failure(home, ended if source.was_cut else stopped), batch)
     batch.commit(home.journal)
     home.calls.renounce(ended)
     home.limit.wake()

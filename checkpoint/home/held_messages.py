@@ -20,7 +20,7 @@ from ...actors.overflow import decide
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from ..recovery_settings import Held
-from .disposal import end_without_turn, lose
+from .disposal import lose
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Host
@@ -112,7 +112,7 @@ class Holding:
         for source in mine[: len(mine) - keep]:
             self.dropped += 1
             lose(home, source, _why(rule))
-            end_without_turn(home, source, answer, batch)
+            home.end_without_turn(source, answer, batch)
         batch.commit(home.journal)
 
     def blocks(self, topic: str) -> bool:

@@ -60,7 +60,7 @@ from ..snapshot.snapshot_receiver import SnapshotReceiver
 from ..snapshot.snapshot_record import load
 from ..snapshot.snapshot_schedule import SnapshotSchedule
 from .admission import submit, taken_up
-from .disposal import lose, put_into_quarantine
+from .disposal import lose, put_into_quarantine, undo_begun
 from .held_messages import Intake, let_go
 from .input_ledger import InputLedger
 from .journal_limit import Limit
@@ -423,6 +423,21 @@ class Switch:
             batch.after.append(functools.partial(self.intake.bound.ended, source))
         if self.journal.durable:
             batch.add(self.path, turn.entry(number), self.ledger.positions_of(number))
+
+    def end_without_turn(self, source: Input, answer: Answer, batch: Batch) -> None:
+        """End an input that will not be handled: it gets an end record all the same."""
+        self.ledger.withdraw(source)
+        if self.intake.bound is not None:
+            self.intake.bound.ended(source)
+        if self.journal.durable:
+            position: list[int] = []
+            self.ledger.drop(source.positions, position)  # Perhaps they stand nowhere yet.
+            batch.add(self.path, ("drop", source.id), position)
+        self.give(source, answer, batch)
+
+    def undo_begun(self, why: str) -> None:
+        """Undo the turn in hand between two lives, for the state that it began with is gone."""
+        undo_begun(self, why)
 
     def _lose(self, source: Input, end: TurnEnd) -> None:
         """What the life could make nothing of is a dead letter, if nobody waits who could hear of it."""

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from ...actors.events import RolledBack
-from ..home.disposal import undo_begun
 from ..method import OnEscalate
 from .snapshot_record import FORMAT, Meta, decode_meta, go_back, put
 
@@ -36,7 +35,7 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
         why = f"{why}; there is no older snapshot"
     if older is not None:
         home.images.fetch(older)
-    undo_begun(home, UNDONE)
+    home.undo_begun(UNDONE)
     first = home.ledger.turn
     if older is None:
         older = Meta(FORMAT, first, 0, [], {}, [], 0, b"")

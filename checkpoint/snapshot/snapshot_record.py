@@ -289,5 +289,6 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
                     home.topics[key] = None
                 case _:
                     home.topics.pop(key, None)
-        case _ if not known:
-            raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")
+        case _:
+            if not known:
+                raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")

@@ -12,7 +12,6 @@ import msgspec
 
 from ...actors.errors import AskFailed
 from ...actors.events import TurnsLost
-from ..home.disposal import undo_begun
 from ..protocol import OK, START
 from .snapshot_record import FORMAT, Meta, go_back
 
@@ -30,7 +29,7 @@ def forget_turns(home: Switch) -> None:
     Raises:
         HoldfastError: the store refused.
     """
-    undo_begun(home, LOST)
+    home.undo_begun(LOST)
     ledger = home.ledger
     if ledger.turn == ledger.state_turn:
         return

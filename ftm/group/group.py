@@ -14,7 +14,6 @@ import msgspec
 
 from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
-from ...checkpoint.home.disposal import end_without_turn
 from ...checkpoint.inputs import EXPIRED, Batch
 from ...checkpoint.protocol import (
     DROPPED,
@@ -412,7 +411,7 @@ class Group(Members):
             self.ledger.pop(end.id, None)
             if end.id in switch.open:
                 batch = Batch()
-                end_without_turn(switch, switch.open[end.id], end.answer, batch)
+                switch.end_without_turn(switch.open[end.id], end.answer, batch)
                 batch.commit(switch.journal)
             return
         if self.is_live and (end.turn <= switch.turn or end.id not in switch.open):
