@@ -412,7 +412,7 @@ async def memory_bound(run: Run) -> None:
         most = 0
         for _ in range(sent):
             await worker.send(Work())
-            most = max(most, switch.backlog(-1))
+            most = max(most, switch.ledger.backlog(-1))
         while await worker.ask(Work(), timeout=60.0) < sent:
             pass
     run.bound("messages held for a slow recorded actor, over its bound", most / capacity, unit="x", target=1.01)

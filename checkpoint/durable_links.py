@@ -55,10 +55,7 @@ class Ties:
         """These again, as a snapshot has them: what was tied since is undone, and what was untied comes back."""
         cell, node = self._home.cell, self._home.node
         undo = {verb: name for name, verb in UNDONE_BY.items()}
-        addresses = self._home.addresses
-        before, self._kept = self._kept, Counter(ties)
-        if addresses is not None:
-            self._kept = _renamed(self._kept, addresses.now)
+        before, self._kept = self._kept, _renamed(Counter(ties), self._home.homes.addresses.now)
         stand = before - self._untied
         for verb, path in (stand - self._kept).elements():
             if cell is not None:

@@ -92,7 +92,7 @@ class Timers:
     def running(self) -> dict[str, Clock]:
         """All of them, and those that have come and wait to be handled."""
         clocks = {key: (one.name, one.body, one.interval) for key, one in self._states.items()}
-        for source in self._home.open.values():
+        for source in self._home.ledger.open.values():
             if source.kind == TICK:
                 clocks.setdefault(source.origin, (source.name, source.body, 0.0))
         return clocks
@@ -101,7 +101,7 @@ class Timers:
         """Those that ran when a snapshot was taken, or had come and waited."""
         clocks = {key: (name, body, interval) for key, (name, body, _, interval) in meta.timers.items()}
         home = self._home
-        for source in (*(turn.input for turn in home.turns.values()), *home.open.values()):
+        for source in home.ledger.handled_and_open():
             if source.kind == TICK and source.id < meta.next_id:
                 clocks.setdefault(source.origin, (source.name, source.body, 0.0))
         return clocks
@@ -121,7 +121,7 @@ class Timers:
         if timer.interval > 0:
             timer.due = max(timer.due + timer.interval, home.node.loop.time())
             timer.handle = home.node.loop.call_at(timer.due, self._tick, key)
-            if any(source.origin == key for source in home.open.values() if source.kind == TICK):
+            if any(source.origin == key for source in home.ledger.open.values() if source.kind == TICK):
                 return  # One waits already.
         else:
             del self._states[key]
@@ -130,9 +130,9 @@ class Timers:
     def drop_ticks(self, timer: str, running: int, batch: Batch) -> None:
         """Ticks of a cancelled timer that wait do not come any more; the life forgets them by itself."""
         home = self._home
-        for source in list(home.open.values()):
+        for source in list(home.ledger.open.values()):
             if source.kind == TICK and source.origin == timer and source.id != running:
-                home.ends.without_turn(source, Answer(), batch)
+                home.end_without_turn(source, Answer(), batch)
 
     def pause(self) -> None:
         """The address is given up: what remains runs on with the next life."""
@@ -157,7 +157,7 @@ class Timers:
             if timer.handle is not None:
                 timer.handle.cancel()
         self._made.clear()
-        waiting = {source.origin for source in self._home.open.values() if source.kind == TICK}
+        waiting = {source.origin for source in self._home.ledger.open.values() if source.kind == TICK}
         self._states = {
             key: TimerState(name, body, max(0.0, left), interval)
             for key, (name, body, left, interval) in saved.items()

@@ -65,7 +65,7 @@ class Called:
         return self._failure is not None or (failed is not None and self._call(failed))
 
     def append(self, entries: Sequence[tuple[str, Entry]]) -> list[int]:
-        """See `Journal`."""
+        """Append entries as one; a failure is for good."""
         if self._failure is not None:
             raise StoreFailed(*self._failure.args)
         try:
@@ -79,11 +79,11 @@ class Called:
             raise self._failure from error
 
     def sync(self) -> None:
-        """See `Journal`."""
+        """Have everything outlive the machine; a failure is for good."""
         self._call_for_good(self._engine.sync)
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
-        """See `Journal`."""
+        """Keep a snapshot, and forget what it contains."""
         self._refuse_failed()
         self._call(self._engine.cut, self._key(address), snapshot, drop, turn=turn, keep=keep)
 
@@ -105,32 +105,32 @@ class Called:
             raise self._failure from error
 
     def load(self, address: str, *, older: int = False) -> Saved:
-        """See `Journal`."""
+        """Read an address back from the engine."""
         return self._call(self._engine.load, self._key(address), older=older)
 
     def erase(self, address: str) -> None:
-        """See `Journal`."""
+        """Have the engine forget an address."""
         self._refuse_failed()
         self._call(self._engine.erase, self._key(address))
 
     def keep_blocks(
         self, address: str, number: int, blocks: Sequence[tuple[int, memoryview]], compress: bool | int
     ) -> None:
-        """See `Journal`."""
+        """Have the engine keep blocks of a large snapshot."""
         self._refuse_failed()
         self._call(self._engine.keep_blocks, self._key(address), number, blocks, compress)
 
     def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
-        """See `Journal`."""
+        """Read blocks of a large snapshot back."""
         return self._call(self._engine.read_blocks, self._key(address), number, places)
 
     def forget_blocks(self, address: str, needed: Collection[int]) -> None:
-        """See `Journal`."""
+        """Have the engine remove packs that nothing needs."""
         self._refuse_failed()
         self._call(self._engine.forget_blocks, self._key(address), needed)
 
     def addresses(self) -> list[str]:
-        """See `Journal`."""
+        """The addresses of which something is stored."""
         names = {key: address for address, key in self.keys.items()}
         return sorted(names.get(key, key) for key in self._call(self._engine.addresses))
 
@@ -138,18 +138,18 @@ class Called:
         return self.keys.get(address, address)
 
     def note(self, key: str, value: bytes | None) -> None:
-        """See `Journal`."""
+        """Have the engine keep a small fact."""
         self._refuse_failed()
         self._call(self._engine.note, key, value)
 
     def noted(self, key: str) -> bytes | None:
-        """See `Journal`."""
+        """The small fact of that name, if any."""
         return self._call(self._engine.noted, key)
 
     def notes(self, prefix: str) -> dict[str, bytes]:
-        """See `Journal`."""
+        """The small facts whose keys begin so."""
         return self._call(self._engine.notes, prefix)
 
     def close(self) -> None:
-        """See `Journal`."""
+        """Close the engine; nothing is written any more."""
         self._call(self._engine.close)

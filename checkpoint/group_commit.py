@@ -13,14 +13,14 @@ import asyncio
 import contextlib
 import contextvars
 import functools
-from collections import deque
-from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from ..actors.errors import HoldfastError
 from ..actors.events import Event, JournalBlocked, JournalGoesOn, JournalStopped
+from .commit_lanes import CommitLanes, Submission
 from .journal import Entry, InHand, Journal, MemoryJournal, Saved, StoreFailed
 from .method import Durability
 
@@ -34,31 +34,6 @@ MOST = 250
 """Submissions written and let out in one go: about 2 ms of the loop's time."""
 PATIENCE_SECONDS = 0.05
 """How long the message handler may take to come, before the homes do its work themselves."""
-
-
-class Submission(Protocol):
-    """What is to be written, and what follows."""
-
-    @property
-    def entries(self) -> Sequence[tuple[str, Entry]]:
-        """What is written, by address."""
-        ...
-
-    def written(self, positions: Sequence[int]) -> None:
-        """It stands there in the journal."""
-        ...
-
-    def safe(self) -> None:
-        """It may take effect."""
-        ...
-
-    def refused(self, error: HoldfastError) -> bool:
-        """It was not written. False: it has happened, and must be written when that is possible again."""
-        ...
-
-    def abandoned(self, error: HoldfastError) -> None:
-        """It has happened, and will never be written: who waits for it is told."""
-        ...
 
 
 class Commits:
@@ -82,19 +57,11 @@ class Commits:
         where: str = "/",
     ) -> None:
         self.engine, self.durable, self.epoch = engine, engine.durable, engine.epoch
-        self.in_hand: InHand | None = getattr(engine, "in_hand", None)
         self.commits = self
         self.durability: Durability = durability if engine.durable else "memory"
         self.wake_handler: Callable[[], None] | None = None  # has the message handler come, if there is one
         self._loop, self._emit, self._where = loop, emit, where
-        self._synced_paths: set[str] = set()  # of homes that want fsync
-        self._quick_paths: set[str] = set()  # of homes that want less than the store's fsync
-        self._slow: dict[str, int] = {}  # the last submission in the slow lane, by home
-        self._pending: list[tuple[Submission, int]] = []  # not written; their number in the slow lane, 0: in the quick
-        self._is_urgent = False  # whether something among it need not be synced
-        self._unsynced: deque[tuple[int, Submission]] = deque()
-        self._ready: deque[Submission] = deque()
-        self._written = self._synced = self._count = 0  # submissions in the slow lane so far
+        self._lanes = CommitLanes()
         self._context = contextvars.copy_context()
         self._is_awake = self._is_running = False
         self._overdue: asyncio.TimerHandle | None = None
@@ -103,31 +70,22 @@ class Commits:
         self._delay = RETRY_SECONDS
         self.blocked: HoldfastError | None = None  # why nothing is written at the moment
         self.stopped: HoldfastError | None = None  # why nothing is written any more
-        self.submitted = 0
-        self.last: Submission | None = None
+        self.last: Submission | None = None  # that was submitted
+
+    @property
+    def in_hand(self) -> InHand | None:
+        """Which inputs are in hand, if the engine keeps that."""
+        return getattr(self.engine, "in_hand", None)
 
     # -- who wants what ---------------------------------------------------------------------------------------------
 
     def want(self, path: str, durability: Durability | None) -> None:
         """How safe what this home submits has to be."""
-        wanted = durability or self.durability
-        self._synced_paths.discard(path)
-        self._quick_paths.discard(path)
-        if wanted == "fsync":
-            self._synced_paths.add(path)
-        else:
-            self._quick_paths.add(path)
+        self._lanes.want(path, is_synced=(durability or self.durability) == "fsync")
 
     def rename(self, paths: Mapping[str, str]) -> None:
         """Homes have other addresses from now on; nothing of theirs waits to be written."""
-        self._synced_paths = {paths.get(path, path) for path in self._synced_paths}
-        self._quick_paths = {paths.get(path, path) for path in self._quick_paths}
-        self._slow = {paths.get(path, path): number for path, number in self._slow.items()}
-
-    def _is_slow(self, entries: Iterable[tuple[str, Entry]]) -> bool:
-        if not self._quick_paths:
-            return True
-        return any(path in self._synced_paths or self._slow.get(path, 0) > self._synced for path, _ in entries)
+        self._lanes.rename(paths)
 
     # -- submitting -------------------------------------------------------------------------------------------------
 
@@ -147,16 +105,7 @@ class Commits:
         if self.stopped is not None:  # It never leaves: what is open now is taken up again when the store is.
             submission.abandoned(self.stopped)
             return
-        number = 0
-        if self._synced_paths and self._is_slow(submission.entries):
-            self._count = number = self._count + 1
-            if self._quick_paths:
-                for path, _ in submission.entries:
-                    self._slow[path] = number
-        else:
-            self._is_urgent = True
-        self._pending.append((submission, number))
-        self.submitted += 1
+        self._lanes.submit(submission)
         self.last = submission
         if not self._is_awake:
             self._wake()
@@ -189,11 +138,16 @@ class Commits:
     def flush(self) -> None:
         """Write what was submitted, and let what is safe now take effect. (The message handler's work.)"""
         self._is_awake = False
-        if self.blocked is None and (self._is_urgent or self._syncing is None):
+        if self._may_write:
             self._write(MOST)
         self._run()
-        if self._pending and not self._is_awake and self.blocked is None and (self._is_urgent or self._syncing is None):
+        if self._lanes.pending and not self._is_awake and self._may_write:
             self._wake()  # The rest in its turn: others want the loop, too.
+
+    @property
+    def _may_write(self) -> bool:
+        """Whether it is worth writing now: what has to be synced gathers while a sync is under way."""
+        return self.blocked is None and (self._lanes.is_urgent or self._syncing is None)
 
     def barrier(self) -> None:
         """Have everything that was submitted written, now.
@@ -201,9 +155,9 @@ class Commits:
         Raises:
             HoldfastError: the store refuses.
         """
-        if self._pending:
+        if self._lanes.pending:
             self._write()
-            if self._ready and not self._is_running and not self._is_awake:
+            if self._lanes.ready and not self._is_running and not self._is_awake:
                 self._wake()
         error = self.stopped or self.blocked
         if error is not None:
@@ -211,7 +165,7 @@ class Commits:
 
     def _write(self, most: int | None = None) -> None:
         """Write what was submitted, the first `most` of it if that is given."""
-        pending = self._pending[:most]
+        pending = self._lanes.pending[:most]
         if not pending or self.stopped is not None:
             return
         entries = [entry for submission, _ in pending for entry in submission.entries]
@@ -226,19 +180,8 @@ class Commits:
         except HoldfastError as error:
             self._stop(error)
             return
-        del self._pending[: len(pending)]
-        self._is_urgent = any(not number for _, number in self._pending)
-        begin = 0
-        for submission, number in pending:
-            end = begin + len(submission.entries)
-            submission.written(positions[begin:end])
-            begin = end
-            if number:
-                self._written = number
-                self._unsynced.append((number, submission))
-            else:
-                self._ready.append(submission)
-        if self._unsynced and self._syncing is None:
+        self._lanes.take_written(len(pending), positions)
+        if self._lanes.unsynced and self._syncing is None:
             self._sync()
         if self.blocked is not None:
             self.blocked, self._delay = None, RETRY_SECONDS
@@ -249,7 +192,7 @@ class Commits:
         if self._is_running:
             return
         self._is_running = True
-        ready = self._ready
+        ready = self._lanes.ready
         try:
             while ready:
                 submission = ready.popleft()
@@ -271,9 +214,7 @@ class Commits:
         """Nothing was written: refuse what can be refused, and try again with the rest."""
         first = self.blocked is None
         self.blocked = error
-        pending, self._pending = self._pending, []
-        kept = [(submission, number) for submission, number in pending if not submission.refused(error)]
-        self._pending = [*kept, *self._pending]
+        self._lanes.refuse(error)
         if first:
             self._emit(JournalBlocked(self._where, str(error)))
         self._loop.call_later(self._delay, self._try_again, context=self._context)
@@ -282,7 +223,7 @@ class Commits:
     def _try_again(self) -> None:
         if self.blocked is None or self.stopped is not None:
             return
-        if self._pending:
+        if self._lanes.pending:
             self._write()
             self._run()
         else:  # Nothing is left that could show whether there is room: the next admission does.
@@ -294,12 +235,7 @@ class Commits:
         if self.stopped is not None:
             return
         self.stopped = error
-        waiting = [*(submission for _, submission in self._unsynced), *(submission for submission, _ in self._pending)]
-        self._unsynced.clear()
-        self._pending = []
-        for submission in waiting:
-            if not submission.refused(error):
-                submission.abandoned(error)
+        self._lanes.abandon(error)
         self._emit(JournalStopped(self._where, str(error)))
 
     # -- syncing ----------------------------------------------------------------------------------------------------
@@ -308,7 +244,7 @@ class Commits:
         """Have a thread sync all that is written so far."""
         if self._thread is None:
             self._thread = ThreadPoolExecutor(1, "holdfast-sync")
-        written = self._written
+        written = self._lanes.written
         try:
             self._syncing = self._loop.run_in_executor(self._thread, self.engine.sync)
         except RuntimeError:  # No thread can be started now: everybody waits for the disk, this once.
@@ -330,14 +266,10 @@ class Commits:
             failure = error if isinstance(error, HoldfastError) else StoreFailed(self._where, str(error))
             self._stop(failure)
             return
-        self._synced = number
-        while self._unsynced and self._unsynced[0][0] <= number:
-            self._ready.append(self._unsynced.popleft()[1])
-        if self._slow and not self._unsynced and not self._pending:
-            self._slow.clear()
+        self._lanes.take_synced(number)
         if self.blocked is None:
             self._write()  # What has gathered meanwhile.
-        if self._unsynced and self._syncing is None:
+        if self._lanes.unsynced and self._syncing is None:
             self._sync()
         self._run()
 
@@ -386,7 +318,7 @@ class Commits:
 
     def note(self, key: str, value: bytes | None) -> None:
         """Keep a small fact; see `Journal`."""
-        if self._pending:
+        if self._lanes.pending:
             self.barrier()
         self.engine.note(key, value)
 
@@ -426,7 +358,7 @@ class Commits:
 
     async def settled(self) -> None:
         """Wait until everything that was submitted has taken effect, or never will."""
-        while (self._pending or self._unsynced or self._ready) and self.stopped is None and self.blocked is None:
+        while not self._lanes.is_empty and self.stopped is None and self.blocked is None:
             if self._syncing is not None:
                 await asyncio.wait([self._syncing])
             else:
@@ -435,7 +367,7 @@ class Commits:
     def close(self) -> None:
         """Write what is left, and close the engine."""
         try:
-            if self._pending and self.blocked is None:
+            if self._lanes.pending and self.blocked is None:
                 self._write()
         finally:
             if self._thread is not None:

@@ -46,6 +46,15 @@ class Input(msgspec.Struct, gc=False, eq=False):
     held: bool = False  # not as safe yet as it has to be: it must not be fed
     was_cut: bool = False  # a life has ended in its turn
 
+    @property
+    def size(self) -> int:
+        """What it counts against the journal's limit, in bytes."""
+        return len(self.body) + OVERHEAD
+
+    def entry(self) -> Entry:
+        """Its entry in the journal."""
+        return "in", self.id, self.kind, self.name, self.body, self.time, self.sender, self.origin
+
     def feed(
         self, turn: int = -1, pipes: tuple[int, ...] = (), *, has_begun: bool = False, was_asked: bool = False
     ) -> Feed:
@@ -71,9 +80,10 @@ class Turn(msgspec.Struct, gc=False, eq=False):
     state: int = 0  # digest of the state it has left, if that is checked
     reply: int = 0  # digest of its reply, if it was asked for one
 
-    def digests_of_end(self) -> tuple[int, ...]:
-        """What its end record says of the state and the reply, as far as there is something to say."""
-        return (self.state, self.reply) if self.reply else (self.state,) if self.state else ()
+    def entry(self, number: int) -> Entry:
+        """Its entry in the journal: of the state and the reply only what there is to say."""
+        more = (self.state, self.reply) if self.reply else (self.state,) if self.state else ()
+        return "end", number, self.input.id, self.status, tuple(self.digests), *more
 
 
 class TimerState:
@@ -115,7 +125,7 @@ class Batch:
             sink.append(position)
 
     def safe(self) -> None:
-        """Let it take effect."""
+        """Let the batch take effect, in order."""
         for effect in self.after:
             effect()
 

@@ -266,14 +266,14 @@ class MemoryJournal:
         """Do nothing: the switch keeps them."""
 
     def read_blocks(self, address: str, number: int, places: Collection[tuple[int, int]]) -> Segment:
-        """Refuse: there are none."""
+        """Refuse: nothing is stored in memory."""
         raise DamagedStore("memory", address, None, "nothing is stored in memory")
 
     def forget_blocks(self, address: str, needed: Collection[int]) -> None:
-        """Do nothing."""
+        """Do nothing: the process keeps nothing beyond itself."""
 
     def erase(self, address: str) -> None:
-        """Do nothing."""
+        """Do nothing: the process keeps nothing beyond itself."""
 
     def addresses(self) -> list[str]:
         """Return nothing: no address has anything stored."""
@@ -294,4 +294,4 @@ class MemoryJournal:
         return {key: value for key, value in self._notes.items() if key.startswith(prefix)}
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing: the process keeps nothing beyond itself."""

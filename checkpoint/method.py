@@ -12,13 +12,13 @@ from ..actors.errors import SpecError, type_name
 from ..actors.kernel.actor import Actor
 from .compression import check_compress
 from .recovery_settings import (
+    NOTHING_MEANWHILE,
     SAFE_STATE_TIMEOUT,
     Held,
+    Meanwhile,
     RecoveryHooks,
     SafeState,
-    as_held,
-    as_safe_state,
-    check_seconds,
+    meanwhile,
 )
 
 Durability = Literal["memory", "os", "fsync"]
@@ -47,11 +47,7 @@ class Method:
     check_readonly: bool = False
     key_variables: tuple[str, ...] | None = None
     origin: str = ""
-    safe_state: SafeState | None = None
-    safe_state_timeout: float = SAFE_STATE_TIMEOUT
-    held: Held | None = None
-    held_topics: tuple[tuple[str, Held], ...] = ()
-    hooks: RecoveryHooks | None = None
+    meanwhile: Meanwhile = NOTHING_MEANWHILE
     every: int | None = None
     journal_bytes: int | None = None
     compress: bool | int = False
@@ -74,8 +70,7 @@ class Method:
             raise SpecError(where, f"journal_limit must be bytes > 0, not {self.journal_limit!r}")
         if not _whole(self.keep) or not 1 <= self.keep <= 100:
             raise SpecError(where, f"keep must be a whole number from 1 to 100, not {self.keep!r}")
-        for name in ("every", "journal_bytes"):
-            value = getattr(self, name)
+        for name, value in (("every", self.every), ("journal_bytes", self.journal_bytes)):
             if value is not None and (not _whole(value) or value < 1):
                 raise SpecError(where, f"{name} must be a whole number >= 1 or left out, not {value!r}")
         check_compress(where, self.compress)
@@ -85,9 +80,10 @@ class Method:
         if self.durability is not None and self.durability not in get_args(Durability):
             known = ", ".join(map(repr, get_args(Durability)))
             raise SpecError(where, f"durability must be one of {known} or left out, not {self.durability!r}")
-        for name in ("skip", "check_readonly", "strict", "check_replay"):
-            if not isinstance(getattr(self, name), bool):
-                raise SpecError(where, f"{name} must be True or False, not {getattr(self, name)!r}")
+        flags = {"skip": self.skip, "check_readonly": self.check_readonly, "strict": self.strict}
+        for name, flag in {**flags, "check_replay": self.check_replay}.items():
+            if not isinstance(flag, bool):
+                raise SpecError(where, f"{name} must be True or False, not {flag!r}")
 
     @property
     def trigger(self) -> int:
@@ -142,7 +138,8 @@ class Method:
             SpecError: the class says it is not deterministic, and this method replays; or it has no such
                 binding.
         """
-        for port in self.safe_state.to if self.safe_state is not None else ():
+        state = self.meanwhile.safe_state
+        for port in state.to if state is not None else ():
             if not port.startswith("/") and port not in kind._bindings:
                 raise SpecError(
                     where, f"safe_state: {type_name(kind)} has no binding {port!r}; addresses begin with '/'"
@@ -196,7 +193,7 @@ def checkpoint_only(
         journal_bytes=journal_bytes,
         compress=compress,
         durability=durability,
-        **_meanwhile("checkpoint_only", safe_state, safe_state_timeout, held, hooks),
+        meanwhile=meanwhile("checkpoint_only", safe_state, safe_state_timeout, held, hooks),
     )
 
 
@@ -235,7 +232,7 @@ def replay_only(
         durability=durability,
         strict=strict,
         check_replay=check_replay,
-        **_meanwhile("replay_only", safe_state, safe_state_timeout, held, hooks),
+        meanwhile=meanwhile("replay_only", safe_state, safe_state_timeout, held, hooks),
     )
 
 
@@ -314,28 +311,8 @@ def hybrid(
         durability=durability,
         strict=strict,
         check_replay=check_replay,
-        **_meanwhile("hybrid", safe_state, safe_state_timeout, held, hooks),
+        meanwhile=meanwhile("hybrid", safe_state, safe_state_timeout, held, hooks),
     )
-
-
-def _meanwhile(
-    where: str,
-    safe_state: str | Sequence[str] | SafeState | None,
-    safe_state_timeout: float,
-    held: Held | Mapping[str, Held] | None,
-    hooks: RecoveryHooks | None,
-) -> dict[str, Any]:
-    """What is done while an actor is recovered, checked."""
-    if hooks is not None and not isinstance(hooks, RecoveryHooks):
-        raise SpecError(where, f"hooks must come from recovery_hooks(...), not be {hooks!r}")
-    for_all, by_topic = as_held(where, held)
-    return {
-        "safe_state": as_safe_state(where, safe_state),
-        "safe_state_timeout": check_seconds(where, "safe_state_timeout", safe_state_timeout),
-        "held": for_all,
-        "held_topics": by_topic,
-        "hooks": hooks,
-    }
 
 
 def _number(value: Any) -> bool:

@@ -42,7 +42,7 @@ NAME = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Entry:
+class RecoveryTable:
     """One table: a method, key variables, or both."""
 
     method: Method | None
@@ -62,8 +62,8 @@ class RecoveryFile:
             tables = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:  # Which says line and column.
             raise SpecError(path, str(error)) from error
-        self._classes: dict[str, Entry] = {}
-        self._addresses: list[tuple[str, Entry]] = []
+        self._classes: dict[str, RecoveryTable] = {}
+        self._addresses: list[tuple[str, RecoveryTable]] = []
         self._unmet: dict[str, str] = {}
         for name, table in tables.items():
             is_address = name.startswith("/")
@@ -114,7 +114,7 @@ class RecoveryFile:
             return method
         return dataclasses.replace(method, key_variables=named.key_variables, origin=named.origin)
 
-    def meet(self, address: str, kind: str) -> list[Entry]:
+    def meet(self, address: str, kind: str) -> list[RecoveryTable]:
         """Somebody is started: the tables that are for it, the most telling first."""
         names = [name for name, _ in self._addresses if name == address]
         names += [name for name, _ in self._addresses if fnmatch.fnmatchcase(address, name)]
@@ -142,7 +142,7 @@ class RecoveryFile:
 
     # -- reading it ---------------------------------------------------------------------------------------------------
 
-    def _entry(self, name: str, table: dict[str, Any]) -> Entry:
+    def _entry(self, name: str, table: dict[str, Any]) -> RecoveryTable:
         chosen = table.pop("method", None)
         if chosen is not None and chosen not in METHODS:
             known = ", ".join(map(repr, METHODS))
@@ -150,7 +150,7 @@ class RecoveryFile:
         named = self._named(name, table.pop("key_variables", None))
         origin = self._where(name, "key_variables")
         if chosen is None and not table and named is not None:
-            return Entry(None, named, origin)
+            return RecoveryTable(None, named, origin)
         make = METHODS[chosen or "hybrid"]
         settings = self._typed(name, chosen or "hybrid", make, table)
         try:
@@ -158,7 +158,7 @@ class RecoveryFile:
                 settings["safe_state"] = _safe_state(settings["safe_state"])
             if "held" in settings:
                 settings["held"] = _held(settings["held"])
-            return Entry(make(**settings), named, origin)
+            return RecoveryTable(make(**settings), named, origin)
         except (SpecError, TypeError) as error:
             wrong = next((one for one in settings if one in str(error)), None)
             raise self._error(name, str(error), wrong) from error

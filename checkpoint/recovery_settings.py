@@ -190,3 +190,40 @@ def check_seconds(where: str, name: str, value: object) -> float:
     if not isinstance(value, (int, float)) or isinstance(value, bool) or not 0 < value < float("inf"):
         raise SpecError(where, f"{name} must be seconds > 0, not {value!r}")
     return float(value)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Meanwhile:
+    """What is done while an actor is recovered.
+
+    Attributes:
+        safe_state: who is to be safe.
+        safe_state_timeout: seconds after which a receiver that has not heard of the end raises the alarm.
+        held: how many messages are held.
+        held_topics: the same by topic.
+        hooks: what is called before and after the phases.
+    """
+
+    safe_state: SafeState | None = None
+    safe_state_timeout: float = SAFE_STATE_TIMEOUT
+    held: Held | None = None
+    held_topics: tuple[tuple[str, Held], ...] = ()
+    hooks: RecoveryHooks | None = None
+
+
+NOTHING_MEANWHILE = Meanwhile()
+
+
+def meanwhile(
+    where: str,
+    safe_state: str | Sequence[str] | SafeState | None,
+    safe_state_timeout: float,
+    held: Held | Mapping[str, Held] | None,
+    hooks: RecoveryHooks | None,
+) -> Meanwhile:
+    """Check what a method was given. Raises SpecError."""
+    if hooks is not None and not isinstance(hooks, RecoveryHooks):
+        raise SpecError(where, f"hooks must come from recovery_hooks(...), not be {hooks!r}")
+    for_all, by_topic = as_held(where, held)
+    timeout = check_seconds(where, "safe_state_timeout", safe_state_timeout)
+    return Meanwhile(as_safe_state(where, safe_state), timeout, for_all, by_topic, hooks)

@@ -142,7 +142,7 @@ class Shapes:
         self.fields = {name: [*all_] for name, all_ in fields.items()}
 
     def read(self, name: str, shape: Shape) -> None:
-        """What the journal says."""
+        """Take the fields of a type as the journal has them."""
         known = self.fields.setdefault(name, [])
         if shape in known:
             known.remove(shape)
@@ -184,10 +184,9 @@ class Shapes:
 
     def _waiting(self) -> set[str]:
         """The types of messages that are still to be handled, or handled again."""
-        home = self._home
-        sources = (*home.open.values(), *(turn.input for turn in home.turns.values()))
-        waiting = {source.name for source in sources if source.kind in (MESSAGE, TICK, PIPE)}
-        waiting |= {shape_name(answer) for answer in home.calls.outcomes.values()}
+        home, ledger = self._home, self._home.ledger
+        waiting = {source.name for source in ledger.handled_and_open() if source.kind in (MESSAGE, TICK, PIPE)}
+        waiting |= {shape_name(answer) for answer in ledger.outcomes.values()}
         return waiting | {name for name, *_ in home.timers.saved().values()}
 
     def _now(self, name: str) -> Shape | None:
@@ -228,5 +227,4 @@ def start_name(cell: Cell | None) -> str:
 
 def kind_in(home: Switch) -> str:
     """The class that was written with the start of an actor, of which there is no snapshot yet."""
-    sources = (*(turn.input for turn in home.turns.values()), *home.open.values())
-    return next((source.body.decode() for source in sources if source.kind == START), "")
+    return next((source.body.decode() for source in home.ledger.handled_and_open() if source.kind == START), "")

@@ -122,12 +122,12 @@ class Controls:
                 cell, start, keeps_arguments=keeps
             )  # What cannot be is refused before anything is done.
             if switch is not None and isinstance(cell.spec, ChildSpec):
-                switch.becomes = becomes
+                switch.arrival.becomes = becomes
         try:
             recipe = await self._replace(ref, ReplaceCode(start, keeps, migrate), timeout)
         finally:
             if switch is not None:
-                switch.becomes = None
+                switch.arrival.becomes = None
         if recipe is not None:
             start = unpack_recipe(recipe, imports=False)
             cell.table = start.kind._table
@@ -281,7 +281,7 @@ class Controls:
     async def _replace(self, ref: ActorRef[Any], wanted: Order, timeout: float) -> Any:
         """Carry out an order that gives a recorded actor another state; raises ControlFailed if that is not kept."""
         switch = switch_of(ref._cell)
-        before = 0 if switch is None else len(switch.unsaved)
+        before = 0 if switch is None else len(switch.arrival.unsaved)
         try:
             result = await self._order(ref, wanted, timeout)
         except HoldfastError:
@@ -301,8 +301,8 @@ def has_process(cell: Cell) -> bool:
 
 def _check_saved(switch: Switch | None, before: int, path: str, verb: str) -> None:
     """Raises ControlFailed if the home could not keep a new state: that life ends, and the old state comes back."""
-    if switch is not None and len(switch.unsaved) > before:
-        raise ControlFailed(path, verb, f"the new state could not be saved ({switch.unsaved[-1]})")
+    if switch is not None and len(switch.arrival.unsaved) > before:
+        raise ControlFailed(path, verb, f"the new state could not be saved ({switch.arrival.unsaved[-1]})")
 
 
 def _done(counts: Statistics) -> dict[str, Any]:

@@ -22,8 +22,6 @@ from ..actors.process.process_host import Outlet
 from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
 from ..checkpoint.home.recorded_home import switch_of
-from ..checkpoint.home.switch import Switch
-from ..checkpoint.protocol import STASHED
 from .clock import VirtualClockLoop
 from .schedules.processes import SimulatedWorkers
 
@@ -225,15 +223,10 @@ def _waiting(system: ActorSystem) -> list[str]:
         outlet = cell.more.outlet if cell.more is not None else None
         switch = switch_of(cell)
         if switch is not None:
-            if set(switch.open) - _put_aside(switch):
+            if set(switch.open) - switch.ledger.stashed():  # To those nothing happens by itself.
                 found.append(f"{cell.path} has {len(switch.open)} inputs in hand")
         elif isinstance(outlet, Outlet):
             outlet.trim()
             if outlet.flight:
                 found.append(f"{cell.path} has {len(outlet.flight)} messages in hand")
     return found
-
-
-def _put_aside(switch: Switch) -> set[int]:
-    """Inputs that are stashed: they are open, and nothing happens to them by itself."""
-    return {turn.input.id for turn in switch.turns.values() if turn.status == STASHED} | set(switch.stash)

@@ -19,7 +19,7 @@ from ..actors.kernel.ref import ActorRef
 from ..actors.process.process_host import WorkerPlace
 from ..actors.process.wire import frames
 from ..actors.process.worker_pool import Worker
-from ..checkpoint.group_commit import Submission
+from ..checkpoint.commit_lanes import Submission
 from ..checkpoint.home.recorded_home import switch_of
 from ..checkpoint.inputs import HomeJournal
 from ..checkpoint.journal import Saved, StoreFailed

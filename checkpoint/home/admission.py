@@ -11,24 +11,23 @@ import msgspec
 from ...actors.errors import HoldfastError
 from ...actors.exit_reasons import pack_exit
 from ...actors.kernel import links
-from ..inputs import OVERHEAD
 from ..protocol import DOWN, EXIT, MESSAGE
+from .disposal import lose
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Item
     from ..inputs import Input
-    from ..journal import Entry
     from .switch import Switch
 
 
-class Admission:
+class InputAdmission:
     """One input that stands alone in its submission."""
 
     __slots__ = ("_accepted", "_home", "_source", "entries")
 
-    def __init__(self, home: Switch, source: Input, entry: Entry) -> None:
+    def __init__(self, home: Switch, source: Input) -> None:
         self._home, self._source = home, source
-        self.entries = ((home.path, entry),)
+        self.entries = ((home.path, source.entry()),)
         self._accepted: asyncio.Future[None] | None = None
 
     def accepted(self) -> asyncio.Future[None]:
@@ -59,13 +58,13 @@ class Admission:
         """Nobody waits for what comes from the runtime itself."""
 
 
-def submit(home: Switch, source: Input, entry: Entry) -> None:
+def submit(home: Switch, source: Input) -> None:
     """Have an input journaled.
 
     Raises:
         HoldfastError: it comes from outside, and the store takes nothing now.
     """
-    admission = Admission(home, source, entry)
+    admission = InputAdmission(home, source)
     if source.kind != MESSAGE:
         home.journal.submit(admission)
         return
@@ -80,23 +79,22 @@ def take_back(home: Switch, source: Input, error: HoldfastError, *, told: bool) 
     """The store refused an input; False if it has happened all the same. `told`: its sender hears of it."""
     if source.kind != MESSAGE:
         return False
-    if source.id in home.open:
-        _forget(home, source)
+    if _forget(home, source):
         ask, source.ask = source.ask, None
         if ask is not None:
             ask.started = False
             ask.fail(error)
         elif not told:
-            home.ends.lost(source.name, source.body, str(error))
+            lose(home, source, str(error))
     return True
 
 
-def _forget(home: Switch, source: Input) -> None:
-    """An input was not admitted after all."""
-    if home.open.pop(source.id, None) is not None:
-        home.bytes -= len(source.body) + OVERHEAD
-        if home.bound is not None:
-            home.bound.ended(source)
+def _forget(home: Switch, source: Input) -> bool:
+    """An input was not admitted after all; False if it has ended meanwhile."""
+    is_open = home.ledger.withdraw(source)
+    if is_open and home.intake.bound is not None:
+        home.intake.bound.ended(source)
+    return is_open
 
 
 def taken_up(home: Switch, item: Item) -> tuple[str, str, bytes] | None:

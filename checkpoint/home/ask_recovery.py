@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 from ...actors.kernel.codec import Parcel
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer, Out
+from .input_ledger import outcome_entry
 from .pending_asks import MARK, OVER, SwitchAsk
 
 if TYPE_CHECKING:
@@ -35,20 +36,20 @@ class RejoinedAsk(SwitchAsk, eq=False):
         return codec
 
     def give(self, answer: Answer, batch: Batch | None = None) -> None:
-        """The outcome, once."""
+        """Hand over the outcome, once."""
         homes: Homes = self.homes
         switch = homes.at(self.asker)
         homes.rejoin.forget(self)
         if switch is not None:
             self.switch = switch
-            if self.turn <= switch.turn or (self.turn, self.k) in switch.calls.outcomes:
+            if self.turn <= switch.ledger.turn or (self.turn, self.k) in switch.ledger.outcomes:
                 self.is_over, self.future = True, OVER  # That turn has had another outcome, and does not wait.
             else:
                 super().give(answer, batch)
         elif not self.is_over:
             self.is_over, self.future = True, OVER
             own = batch if batch is not None else Batch()
-            own.add(self.asker, ("got", self.turn, self.k, answer.kind, answer.name, answer.body), [])
+            own.add(self.asker, outcome_entry(self.turn, self.k, answer), [])
             if batch is None:
                 own.commit(homes.journal)
 
@@ -62,12 +63,12 @@ class Rejoin:
 
     def loaded(self, home: Switch) -> None:
         """A home was taken up from what is stored: what it owes an answer."""
-        for source in home.open.values():
+        for source in home.ledger.open.values():
             if source.kind == MESSAGE and source.origin.startswith(MARK) and source.sender is not None:
                 self._owed(home, source)
-        for key, (asker, origin) in home.owed.items():
-            home.later[key] = self._of(asker, *_numbers(origin))
-        home.owed.clear()
+        for key, (asker, origin) in home.calls.owed.items():
+            home.calls.later[key] = self._of(asker, *_numbers(origin))
+        home.calls.owed.clear()
 
     def _owed(self, home: Switch, source: Input) -> None:
         assert source.sender is not None
@@ -94,7 +95,7 @@ class Rejoin:
         self._asks = {(ask.asker, ask.turn, ask.k): ask for ask in self._asks.values()}
 
     def forget(self, ask: RejoinedAsk) -> None:
-        """It has its outcome."""
+        """Wait no longer for an ask that has its outcome."""
         self._asks.pop((ask.asker, ask.turn, ask.k), None)
 
     def joins(self, home: Switch, turn: int, key: int, out: Out) -> bool:
@@ -103,7 +104,7 @@ class Rejoin:
         if ask is None and not self._homes.knows(out.to):
             return False  # Whoever was asked keeps no journal.
         ask = ask or self._of(home.path, turn, out.k)  # Its receiver's home is not open yet.
-        source = home.open.get(key)
+        source = home.ledger.open.get(key)
         ask.chain = ((home.path, key), *(source.chain if source is not None else ()))
         ask.to, ask.asked = ask.to or home.node.cell_at(out.to), out.name
         ask.timeout, ask.deadline = out.seconds, home.node.loop.time() + out.seconds

@@ -11,10 +11,12 @@ from collections import deque
 from typing import TYPE_CHECKING
 
 from ...actors.errors import MailboxFull
+from ...actors.kernel.codec import Parcel
 from ...actors.kernel.mailbox import Bound, Senders
 from ...actors.overflow import DROPS, Overflow, decide
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
+from .disposal import lose
 
 if TYPE_CHECKING:
     from ...actors.kernel.envelope import Ask
@@ -29,9 +31,9 @@ class HomeBound:
         self.capacity = chosen.capacity
         self.overflow: Overflow = chosen.overflow
         self.one_at_a_time = chosen.overflow in DROPS
-        stashed = home.stashed()
+        stashed = home.ledger.stashed()
         self._counted = {  # by id, in admission order
-            key: source for key, source in home.open.items() if source.kind == MESSAGE and key not in stashed
+            key: source for key, source in home.ledger.open.items() if source.kind == MESSAGE and key not in stashed
         }
         self.waiting: deque[tuple[Ask, str, bytes, str | None]] = deque()  # asks that wait for room
         self.senders = Senders()
@@ -44,7 +46,7 @@ class HomeBound:
         if self.one_at_a_time:
             in_hand = self._fed in self._counted
         else:
-            in_hand = self._home.is_released and bool(self._counted)
+            in_hand = self._home.life.is_released and bool(self._counted)
         return len(self._counted) - in_hand
 
     @property
@@ -71,7 +73,7 @@ class HomeBound:
             return False
         error = MailboxFull(self._home.path, self.capacity)
         if verdict == "lose":
-            self._home.ends.lost(name, body, self._why())
+            lose(self._home, Parcel(name, body), self._why())
         elif ask is None:
             raise error
         if ask is not None:
@@ -89,10 +91,10 @@ class HomeBound:
         for source in list(self._counted.values()):
             if self.count <= keep:
                 break
-            if source.id not in (self._fed, home.partial_id):
+            if source.id not in (self._fed, home.ledger.begun):
                 self._behind.pop(source.id, None)
-                home.ends.lost(source.name, source.body, self._why())
-                home.ends.without_turn(source, error, batch)
+                lose(home, source, self._why())
+                home.end_without_turn(source, error, batch)
         batch.commit(home.journal)
 
     @property
@@ -107,7 +109,7 @@ class HomeBound:
     # -- what the home tells of its inputs --------------------------------------------------------------------------
 
     def added(self, source: Input) -> None:
-        """An input was admitted."""
+        """Count an input that was admitted, if it is a message."""
         if source.kind == MESSAGE:
             self._counted[source.id] = source
 
@@ -164,5 +166,5 @@ class HomeBound:
     def _feed_next(self) -> None:
         while self._behind and self._fed < 0:
             source = self._behind.pop(next(iter(self._behind)))
-            if source.id in self._home.open:
+            if source.id in self._home.ledger.open:
                 self._home.forward(source)

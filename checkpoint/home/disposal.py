@@ -10,122 +10,97 @@ from ...actors.errors import ActorStopped, AskFailed, HoldfastError, Quarantined
 from ...actors.events import MessageQuarantined
 from ...actors.kernel.codec import Parcel
 from ..group_commit import Unkept
-from ..inputs import OVERHEAD, Batch, Input
+from ..inputs import Batch, Input
 from ..protocol import DROPPED, MESSAGE, START, TICK, Answer
 
 if TYPE_CHECKING:
     from .switch import Switch
 
 
-class Ends:
-    """How the inputs of one home end that its actor does not handle."""
+def end_begun(home: Switch, source: Input, error: HoldfastError, batch: Batch) -> None:
+    """End the turn that was in hand when the life ended: it is not gone on with.
 
-    def __init__(self, home: Switch) -> None:
-        self._home = home
+    It uses up its number: what that turn has sent, and asks it has out, are not another's.
+    """
+    home.end_turn(source, home.ledger.turn + 1, DROPPED, batch)
+    home.give(source, _failure(home, error), batch)
 
-    def without_turn(self, source: Input, answer: Answer, batch: Batch) -> None:
-        """An input that will not be handled: it gets an end record all the same."""
-        home = self._home
-        del home.open[source.id]
-        home.bytes -= len(source.body) + OVERHEAD
-        if home.bound is not None:
-            home.bound.ended(source)
-        if home.journal.durable:
-            position: list[int] = []
-            home.dropped += (source.positions, position)  # Perhaps they stand nowhere yet.
-            batch.add(home.path, ("drop", source.id), position)
-        home.give(source, answer, batch)
 
-    def begun(self, source: Input, error: HoldfastError, batch: Batch) -> None:
-        """The input of the turn that was in hand when the life ended is not gone on with.
+def put_into_quarantine(home: Switch, source: Input) -> None:
+    """Put an input aside that has ended its actor's process again and again."""
+    home.node.emit(MessageQuarantined(home.path, source.name, source.deliveries))
+    batch, error = Batch(), Quarantined(home.path, source.deliveries)
+    home.homes.quarantine.hold(home, source, batch)
+    end_begun(home, source, error, batch)
+    batch.commit(home.journal)
 
-        It uses up the number of its turn: what that has sent, and asks it has out, are not another's.
-        """
-        home = self._home
-        home.end_turn(source, home.turn + 1, DROPPED, batch)
-        home.give(source, self._failure(error), batch)
 
-    def quarantine(self, source: Input) -> None:
-        """An input that has ended its actor's process again and again."""
-        home = self._home
-        home.node.emit(MessageQuarantined(home.path, source.name, source.deliveries))
-        batch = Batch()
-        if home.quarantine is not None:
-            home.quarantine.hold(home, source, batch)
-        self.begun(source, Quarantined(home.path, source.deliveries), batch)
-        batch.commit(home.journal)
+def undo_begun(home: Switch, why: str) -> None:
+    """Undo the turn in hand, whose first state is gone: if it has let something out, it ends with that."""
+    source = home.ledger.undo_begun()
+    if source is None:
+        return
+    if source.kind == MESSAGE and source.ask is None:
+        lose(home, source, why)
+    batch = Batch()
+    end_begun(home, source, AskFailed(home.path, why), batch)
+    batch.commit(home.journal)
 
-    def undo_begun(self, why: str) -> None:
-        """The state that the turn in hand began with is gone: if it has let something out, it ends with that."""
-        home = self._home
-        source = home.open.get(home.partial_id)
-        if source is None or not home.partial:
-            home.partial, home.partial_id = [], -1
-            return
-        if source.kind == MESSAGE and source.ask is None:
-            self.lost(source.name, source.body, why)
-        batch = Batch()
-        self.begun(source, AskFailed(home.path, why), batch)
-        batch.commit(home.journal)
 
-    def drop_all(self, why: str, *, keep_tells: bool = False, keep_ticks: bool = True) -> None:
-        """Nobody lives here any more: whoever waits is told, the rest goes to dead letters.
+def drop_all(home: Switch, why: str, *, keep_tells: bool = False, keep_ticks: bool = True) -> None:
+    """End what waits where nobody lives any more: whoever waits for it is told, the rest goes to dead letters.
 
-        What has begun, and what is to be answered later, fails otherwise than what has surely not.
+    What has begun, and what is to be answered later, fails otherwise than what has surely not.
 
-        `keep_tells`: it is the actor's supervisor that has ended. Both may be started again, so what nobody waits for
-        stays for the next life.
-        `keep_ticks`: what timers have brought stays as well, as the timers do that run: the address is not erased.
-        """
-        home = self._home
-        batch, stopped = Batch(), ActorStopped(home.path, why)
-        reason = None if home.cell is None else home.cell.extra().reason
-        ended = AskFailed(home.path, why if reason is None else str(reason))
-        if home.live is not None and not home.live.done():
-            home.live.cancel()
-        home.timers.pause()
-        if home.bound is not None:
-            home.bound.release(stopped)
-        for source in list(home.open.values()):
-            if source.kind == START or (keep_tells and source.ask is None):
-                continue
-            if source.kind == TICK and keep_ticks:
-                continue
-            if source.ask is None and source.kind == MESSAGE:
-                self.lost(source.name, source.body, why)
-            if source.id == home.partial_id and home.partial:
-                self.begun(source, ended, batch)
-            else:
-                self.without_turn(source, self._failure(ended if source.was_cut else stopped), batch)
-        batch.commit(home.journal)
-        for ask in home.later.values():
-            ask.fail(ended)
-        home.later.clear()
-        home.limit.wake()
-        home.due.abandon(why)
-
-    def erased(self, why: str) -> None:
-        """All that was recorded is gone from the store; here it goes too, and nothing is written for it any more."""
-        home = self._home
-        home.journal = Unkept(home.journal.commits)
-        home.calls.abandon()
-        self.drop_all(why, keep_ticks=False)
-        home.timers.replace({})
-        home.ties.replace([])
-        home.images.close()
-        home.cell = None
-
-    def lost(self, name: str, body: bytes, why: str) -> None:
-        """A message that will not be handled, and nobody waits for."""
-        cell = self._home.cell
-        if cell is None:
-            return
-        try:
-            message = cell.node.codec.decode(cell.table.kind_named(name), body)
-        except (HoldfastError, msgspec.DecodeError):
-            cell.node.dead_letter(cell, Parcel(name, body), why)
+    `keep_tells`: it is the actor's supervisor that has ended. Both may be started again, so what nobody waits for
+    stays for the next life.
+    `keep_ticks`: what timers have brought stays as well, as the timers do that run: the address is not erased.
+    """
+    batch, stopped, ledger = Batch(), ActorStopped(home.path, why), home.ledger
+    reason = None if home.cell is None else home.cell.extra().reason
+    ended = AskFailed(home.path, why if reason is None else str(reason))
+    home.life.abandon()
+    home.timers.pause()
+    if home.intake.bound is not None:
+        home.intake.bound.release(stopped)
+    for source in list(ledger.open.values()):
+        if source.kind == START or (keep_tells and source.ask is None) or (keep_ticks and source.kind == TICK):
+            continue
+        if source.ask is None and source.kind == MESSAGE:
+            lose(home, source, why)
+        if source.id == ledger.begun and ledger.released:
+            end_begun(home, source, ended, batch)
         else:
-            cell.undelivered(message, why)
+            home.end_without_turn(source, _failure(home, ended if source.was_cut else stopped), batch)
+    batch.commit(home.journal)
+    home.calls.renounce(ended)
+    home.limit.wake()
+    home.due.abandon(why)
 
-    def _failure(self, error: HoldfastError) -> Answer:
-        return Answer(*self._home.node.codec.encode_error(error))
+
+def forget_home(home: Switch, why: str) -> None:
+    """Forget all that was recorded, which is gone from the store: nothing is written for it any more."""
+    home.journal = Unkept(home.journal.commits)
+    home.calls.abandon()
+    drop_all(home, why, keep_ticks=False)
+    home.timers.replace({})
+    home.ties.replace([])
+    home.images.close()
+    home.cell = None
+
+
+def lose(home: Switch, message: Input | Parcel, why: str) -> None:
+    """Make a dead letter of a message that will not be handled, and that nobody waits for."""
+    cell = home.cell
+    if cell is None:
+        return
+    try:
+        decoded = cell.node.codec.decode(cell.table.kind_named(message.name), message.body)
+    except (HoldfastError, msgspec.DecodeError):
+        cell.node.dead_letter(cell, Parcel(message.name, message.body), why)
+    else:
+        cell.undelivered(decoded, why)
+
+
+def _failure(home: Switch, error: HoldfastError) -> Answer:
+    return Answer(*home.node.codec.encode_error(error))

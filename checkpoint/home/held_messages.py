@@ -6,6 +6,7 @@ Stands in the place of the home's bound during isolation, so that nothing is tes
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 from collections import deque
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING, Any
@@ -13,11 +14,13 @@ from typing import TYPE_CHECKING, Any
 from ...actors.errors import MailboxFull
 from ...actors.events import HeldMessages
 from ...actors.kernel.cell import Cell
+from ...actors.kernel.codec import Parcel
 from ...actors.kernel.mailbox import Senders
 from ...actors.overflow import decide
 from ..inputs import Batch, Input
 from ..protocol import MESSAGE, Answer
 from ..recovery_settings import Held
+from .disposal import lose
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Host
@@ -31,7 +34,10 @@ class Holding:
 
     def __init__(self, home: Switch, inner: HomeBound | None) -> None:
         self._home, self.inner = home, inner
-        self._rules: dict[str, Held | None] = {"": home.method.held, **dict(home.method.held_topics)}
+        self._rules: dict[str, Held | None] = {
+            "": home.method.meanwhile.held,
+            **dict(home.method.meanwhile.held_topics),
+        }
         self._counted: dict[int, tuple[Input, str]] = {}  # by id, in admission order
         self._waiting: deque[tuple[Ask, str, bytes, str | None, str]] = deque()  # asks that wait
         self._senders = Senders()
@@ -41,7 +47,7 @@ class Holding:
 
     @property
     def capacity(self) -> int:
-        """Of the mailbox itself."""
+        """The capacity of the mailbox itself."""
         return self.inner.capacity if self.inner is not None else 0
 
     @property
@@ -53,8 +59,8 @@ class Holding:
     def again(self, running: int) -> None:
         """The actor has ended again: what it had not begun is still held."""
         home = self._home
-        begun = (running, home.partial_id)
-        self._counted = {k: one for k, one in self._counted.items() if k in home.open and k not in begun}
+        begun = (running, home.ledger.begun)
+        self._counted = {k: one for k, one in self._counted.items() if k in home.ledger.open and k not in begun}
 
     # -- admission --------------------------------------------------------------------------------------------------
 
@@ -82,7 +88,7 @@ class Holding:
         error = MailboxFull(self._home.path, rule.capacity)
         if is_lost:
             self.dropped += 1
-            self._home.ends.lost(name, body, _why(rule))
+            lose(self._home, Parcel(name, body), _why(rule))
         else:
             self.refused += 1
             if ask is None:
@@ -105,8 +111,8 @@ class Holding:
         mine = [source for source, by in self._counted.values() if by == topic]
         for source in mine[: len(mine) - keep]:
             self.dropped += 1
-            home.ends.lost(source.name, source.body, _why(rule))
-            home.ends.without_turn(source, answer, batch)
+            lose(home, source, _why(rule))
+            home.end_without_turn(source, answer, batch)
         batch.commit(home.journal)
 
     def blocks(self, topic: str) -> bool:
@@ -130,25 +136,25 @@ class Holding:
     def report(self) -> None:
         """Put what was held where the message switch finds it."""
         if self._counted or self.dropped or self.refused:
-            recoveries = self._home.recoveries
-            if recoveries is not None:
-                recoveries.held.append(HeldMessages(self._home.path, len(self._counted), self.dropped, self.refused))
-                if recoveries.on_held is not None:
-                    recoveries.on_held()
+            recoveries = self._home.homes.recoveries
+            recoveries.held.append(HeldMessages(self._home.path, len(self._counted), self.dropped, self.refused))
+            if recoveries.on_held is not None:
+                recoveries.on_held()
 
     def let_in(self) -> None:
         """What was held has been fed: now come those who have waited, in order."""
         home = self._home
         while self._waiting:
             ask, name, body, sender, _ = self._waiting.popleft()
-            if not ask.is_done and (home.bound is None or home.bound.makes_room(ask, name, body, sender)):
+            bound = home.intake.bound
+            if not ask.is_done and (bound is None or bound.makes_room(ask, name, body, sender)):
                 home.take(ask, name, body, sender)
         self._senders.release()
 
     # -- as the bound whose place this takes ------------------------------------------------------------------------
 
     def added(self, source: Input) -> None:
-        """An input was admitted."""
+        """Count an input that was admitted, if it is a message."""
         if source.kind == MESSAGE:
             self._counted[source.id] = (source, self._added or self._take_topic())
             self._added = ""
@@ -219,19 +225,24 @@ class Inlet(Cell):
     def has_room(self) -> bool:
         """Whether a message would be taken now, or lost."""
         home = self.home
-        return home.cell is None or (home.has_room and (home.holding is None or not home.holding.blocks(self.topic)))
+        return home.cell is None or (home.has_room and not self._is_blocked)
+
+    @property
+    def _is_blocked(self) -> bool:
+        holding = self.home.intake.holding
+        return holding is not None and holding.blocks(self.topic)
 
     def room(self) -> asyncio.Future[None] | None:
         """For `send`: None while there is room."""
-        home = self.home
-        if home.holding is not None and (wait := home.holding.room(self.topic)) is not None:
+        home, holding = self.home, self.home.intake.holding
+        if holding is not None and (wait := holding.room(self.topic)) is not None:
             return wait
         return home.room() if home.cell is not None else None
 
     def mark(self) -> None:
         """What is admitted next comes by this topic."""
-        if self.home.holding is not None:
-            self.home.holding.topic = self.topic
+        if self.home.intake.holding is not None:
+            self.home.intake.holding.topic = self.topic
 
 
 class InletHost:
@@ -261,24 +272,41 @@ def admit_inlet(cell: Cell, item: Any) -> None:
     try:
         home.cell.admit(home.cell, item)
     finally:
-        if home.holding is not None:
-            home.holding.topic = ""
+        if home.intake.holding is not None:
+            home.intake.holding.topic = ""
+
+
+@dataclasses.dataclass(slots=True)
+class Intake:
+    """What stands between the senders and one home.
+
+    Attributes:
+        bound: what a message has to pass; None: nothing.
+        holding: stands as the bound while the actor is recovered.
+        inlets: the topics that have a rule of their own then.
+    """
+
+    bound: HomeBound | Holding | None = None
+    holding: Holding | None = None
+    inlets: dict[str, Inlet] = dataclasses.field(default_factory=dict)
 
 
 def hold(home: Switch, running: int = -1) -> None:
     """The actor is recovered: what comes now is held by its method's rules."""
-    if home.holding is not None:
-        home.holding.again(running)
-    elif home.method.held is not None or home.method.held_topics:
-        assert not isinstance(home.bound, Holding)
-        home.bound = home.holding = Holding(home, home.bound)
+    intake = home.intake
+    if intake.holding is not None:
+        intake.holding.again(running)
+    elif home.method.meanwhile.held is not None or home.method.meanwhile.held_topics:
+        assert not isinstance(intake.bound, Holding)
+        intake.bound = intake.holding = Holding(home, intake.bound)
 
 
 def let_go(home: Switch) -> Holding | None:
     """Nothing is held any more."""
-    holding, home.holding = home.holding, None
+    intake = home.intake
+    holding, intake.holding = intake.holding, None
     if holding is not None:
-        home.bound = holding.inner
+        intake.bound = holding.inner
     return holding
 
 
@@ -286,9 +314,10 @@ def inlet(home: Switch, topic: str) -> Cell:
     """Where the messages of a topic come in: the actor's cell, unless they are held by a rule of their own."""
     cell = home.cell
     assert cell is not None
-    if topic not in home.inlets:
-        if all(topic != one for one, _ in home.method.held_topics):
+    inlets = home.intake.inlets
+    if topic not in inlets:
+        if all(topic != one for one, _ in home.method.meanwhile.held_topics):
             return cell
-        home.inlets[topic] = Inlet(home, topic)
-    home.inlets[topic].renew()
-    return home.inlets[topic]
+        inlets[topic] = Inlet(home, topic)
+    inlets[topic].renew()
+    return inlets[topic]

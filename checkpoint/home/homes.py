@@ -13,7 +13,6 @@ from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Journal, Saved
 from ..method import Durability, Method, hybrid
-from ..protocol import START
 from ..recovery.recoveries import Recoveries
 from ..recovery_file import RecoveryFile
 from ..snapshot.rollback import older_snapshot, roll_back
@@ -22,6 +21,7 @@ from ..snapshot.snapshot_schedule import nobody
 from .addresses import Addresses, renamed
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
+from .disposal import drop_all, forget_home, put_into_quarantine
 from .held_messages import Holding, let_go
 from .quarantine import PLACE, Quarantine
 from .switch import Switch
@@ -69,12 +69,10 @@ class Homes:
         switch = self._switches.get(cell.path)
         if switch is None:
             self._settle_key(cell.path)
-            switch = Switch(self.node, cell.path, method, self._journal_of(method), self.planted.get(cell.path))
-            switch.cell, switch.addresses = cell, self.addresses
+            switch = Switch(self, cell, method, self._journal_of(method), self.planted.get(cell.path))
             self._check(switch, cell)
             self.planted.pop(cell.path, None)
             self._switches[cell.path] = switch
-            switch.recoveries, switch.quarantine, switch.rejoin = self.recoveries, self.quarantine, self.rejoin
             self.rejoin.loaded(switch)
             switch.ties.rename(self.addresses.now)
             self._count_death(switch)
@@ -82,10 +80,9 @@ class Homes:
                 begin, self.on_first = self.on_first, None
                 begin()
         self.absolve(cell.path)
-        switch.use(method)
+        switch.begin_at(cell, method)
         if switch.journal.durable:
             self.journal.want(cell.path, method.durability)
-        switch.cell = cell
         self.on_home(switch)
         more = cell.extra()
         if more.bound is not None:
@@ -122,8 +119,8 @@ class Homes:
             StartFailed: the store refused.
         """
         hands = self.journal.in_hand
-        source = None if hands is None else switch.open.get(hands.begun(self.addresses.key(switch.path)))
-        if hands is None or source is None or source.kind == START:
+        source = None if hands is None else switch.ledger.blamed(hands.begun(self.addresses.key(switch.path)))
+        if hands is None or source is None:
             return
         source.deliveries += 1
         try:
@@ -132,7 +129,7 @@ class Homes:
             raise StartFailed(switch.path, str(error)) from error
         hands.word(self.addresses.key(switch.path))[0] = 0
         if source.deliveries >= switch.method.max_deliveries:
-            switch.ends.quarantine(source)
+            put_into_quarantine(switch, source)
 
     def page(self, switch: Switch) -> memoryview | None:
         """Where a life in this process says which input it has in hand, so that it is known when that one is killed."""
@@ -146,10 +143,7 @@ class Homes:
 
     def made(self, cell: Cell, method: Method) -> Switch:
         """A home for an actor that has none, which nothing reaches before it is adopted."""
-        switch = Switch(self.node, cell.path, method, self._journal_of(method))
-        switch.recoveries, switch.quarantine, switch.cell = self.recoveries, self.quarantine, cell
-        switch.addresses = self.addresses
-        return switch
+        return Switch(self, cell, method, self._journal_of(method))
 
     def adopt(self, cell: Cell, switch: Switch, method: Method) -> None:
         """From here on what is sent to the address goes there."""
@@ -198,7 +192,7 @@ class Homes:
         self._stored.add(path)
         switch = self._switches.pop(path, None)
         if switch is not None:
-            switch.ends.erased(why)
+            forget_home(switch, why)
 
     def refuses(self, method: Method) -> str:
         """Why this method cannot work here; "" if it can."""
@@ -276,7 +270,7 @@ class Homes:
         self.planted.pop(path, None)
         switch = self._switches.pop(path, None)
         if switch is not None:
-            switch.ends.erased(ERASED)
+            forget_home(switch, ERASED)
 
     def _tell_stored(self, path: str, why: str) -> None:
         """Tell whoever waits at an address where nobody has been started since the root began: it is erased."""
@@ -286,9 +280,8 @@ class Homes:
         except HoldfastError as error:
             self.node.emit(RecoveryFailed(path, f"what waits there is not told that it has been erased: {error}"))
             return
-        switch.rejoin = self.rejoin
         self.rejoin.loaded(switch)
-        switch.ends.drop_all(why)
+        drop_all(switch, why)
         switch.images.close()
 
     def blame(self, path: str) -> None:
@@ -341,11 +334,12 @@ class Homes:
 
 def _bind(switch: Switch, chosen: Bound) -> None:
     """Give a home its mailbox's bound; whoever waits for room there waits on, also in the next life."""
-    before = switch.holding.inner if switch.holding is not None else switch.bound
+    intake = switch.intake
+    before = intake.holding.inner if intake.holding is not None else intake.bound
     assert not isinstance(before, Holding)
     if before is not None and (before.capacity, before.overflow) == (chosen.capacity, chosen.overflow):
         return
     let_go(switch)
-    bound = switch.bound = HomeBound(switch, chosen)
+    bound = intake.bound = HomeBound(switch, chosen)
     if before is not None:
         bound.waiting, bound.senders = before.waiting, before.senders

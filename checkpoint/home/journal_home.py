@@ -23,7 +23,8 @@ from ..protocol import LifePort
 from ..recovery.recoveries import Recovery
 from ..snapshot.unreplayed import forget_turns
 from ..turn_word import input_of
-from .admission import Admission
+from .admission import InputAdmission
+from .disposal import drop_all
 from .held_messages import hold, inlet, let_go
 from .homes import ENDED, Homes
 from .life_ports import RemoteLife, own_records
@@ -53,7 +54,7 @@ class Clock:
         return self._marks[phase]
 
     def phases(self, restore_seconds: float) -> dict[str, float]:
-        """Seconds by phase."""
+        """How many seconds each phase took."""
         spans: dict[str, float] = {}
         before = self._marks.get("noticed")
         for phase in ("detect", "isolate", "restart", "replay", "release"):
@@ -95,7 +96,7 @@ class JournalHome(RecordedHome):
         if entered.recovering or recoveries.of(cell.path) is not None:
             self.recovery = recoveries.starts(cell.path, self.method)
             hold(entered.switch)
-            entered.switch.waits_for_release = recoveries.needs(self.recovery, "release")
+            entered.switch.life.waits_for_release = recoveries.needs(self.recovery, "release")
         return entered
 
     @property
@@ -125,7 +126,7 @@ class JournalHome(RecordedHome):
             forget_turns(switch)
         self.clock = self.clock or Clock()
         self.clock.mark("isolate")
-        return Entered(switch, switch.prepare(), not switch.is_new)
+        return Entered(switch, switch.prepare(), not switch.ledger.is_new)
 
     def subscribe(self, cell: Cell, topics: Iterable[str]) -> None:
         """Have the home admit what is published, also between two lives."""
@@ -171,9 +172,7 @@ class JournalHome(RecordedHome):
             hold(switch, running)
             self.homes.recoveries.crashed(cell.path, self.method, noticed)
         cell.extra().topics.clear()  # These would be unsubscribed with the life.
-        if switch.live is not None and not switch.live.done():
-            switch.live.set_exception(StartFailed(cell.path, why))
-            switch.live.exception()  # Nobody may be left to look.
+        switch.life.fail(StartFailed(cell.path, why))
         self.life_ended(switch, end)
 
     def life_ended(self, switch: Switch, reason: ExitReason) -> None:
@@ -182,10 +181,10 @@ class JournalHome(RecordedHome):
     def offer(self, cell: Cell, item: Any) -> Awaitable[None] | None:
         """Admit a message for a sender that waits until it counts."""
         commits = self.homes.journal
-        before = commits.submitted
+        before = commits.last
         cell.admit(cell, item)
-        last = commits.last if commits.submitted != before else None
-        return last.accepted() if isinstance(last, Admission) else None
+        last = commits.last
+        return last.accepted() if last is not before and isinstance(last, InputAdmission) else None
 
     def progress(self, cell: Cell) -> object:
         """How far the replay has come."""
@@ -196,14 +195,14 @@ class JournalHome(RecordedHome):
         return not reason.is_clean
 
     def is_open(self, cell: Cell) -> bool:
-        return self.switch is not None and self.switch.is_released
+        return self.switch is not None and self.switch.life.is_released
 
     def backlog(self, cell: Cell, running: int) -> int:
-        return 0 if self.switch is None else self.switch.backlog(running)
+        return 0 if self.switch is None else self.switch.ledger.backlog(running)
 
     def load(self, cell: Cell) -> int:
         """Messages that wait and those in hand; what the actor has put aside is among them."""
-        return 0 if self.switch is None else len(self.switch.open)
+        return 0 if self.switch is None else len(self.switch.ledger.open)
 
     def push(self, cell: Cell, item: Item) -> None:
         """What comes from others is an input; the rest is of the life in this process."""
@@ -230,14 +229,14 @@ class JournalHome(RecordedHome):
         """What a process has to know of the life that it begins."""
         switch = self.switch
         assert switch is not None
-        return {"method": self.method.data(), "turn": switch.state_turn, "stash": switch.stash}
+        return {"method": self.method.data(), "turn": switch.ledger.state_turn, "stash": switch.ledger.stash}
 
     async def goes_on(self, cell: Cell, worker: Worker, entered: Entered) -> None:
         await self.replay(cell, RemoteLife(cell.path, worker), entered)
         self.clock = None
 
     def takes_stop(self, cell: Cell) -> bool:
-        return self.switch is not None and self.switch.is_live
+        return self.switch is not None and self.switch.life.is_live
 
     def in_hand(self, worker: Worker) -> int:
         return input_of(worker.page[0])
@@ -267,7 +266,7 @@ class JournalHome(RecordedHome):
         restarting = self.parent.is_restarting(cell)
         for topic in (*self.parent.topics(cell), *self.switch.topics):
             cell.node.topics.unsubscribe(topic, inlet(self.switch, topic))
-        self.switch.ends.drop_all("it has stopped", keep_tells=restarting)
+        drop_all(self.switch, "it has stopped", keep_tells=restarting)
         let_go(self.switch)
         why = "its supervisor has ended" if restarting else "it is not started again"
         self.homes.recoveries.given_up(cell.path, why)
@@ -297,11 +296,11 @@ class JournalHome(RecordedHome):
         assert switch is not None
         try:
             restore_seconds = await entered.live
-            if switch.port is None:  # It was over before anybody came to look.
-                if switch.waits_for_release:
+            if switch.life.port is None:  # It was over before anybody came to look.
+                if switch.life.waits_for_release:
                     raise StartFailed(cell.path, ENDED)
                 return  # It was up, and has ended in a turn: that is told by its end, and no start has failed.
-            clock.mark("replay", switch.live_at)
+            clock.mark("replay", switch.life.live_at)
             await self._let_at(switch, clock, restore_seconds)
         except HoldfastError as error:
             if not isinstance(error, StartIgnored):
@@ -314,7 +313,7 @@ class JournalHome(RecordedHome):
         if entered.recovering:
             clock.mark("release")
             if node.watched:
-                node.emit(Recovered(cell.path, cell.life, switch.replayed, clock.phases(restore_seconds)))
+                node.emit(Recovered(cell.path, cell.life, switch.life.replayed, clock.phases(restore_seconds)))
         self.homes.recoveries.over(cell.path)
 
     async def _let_at(self, switch: Switch, clock: Clock, restore_seconds: float) -> None:
@@ -323,13 +322,13 @@ class JournalHome(RecordedHome):
         Raises:
             StartFailed: the life has ended meanwhile.
         """
-        recovery, port = self.recovery, switch.port
+        recovery, port = self.recovery, switch.life.port
         if recovery is None:
             return
-        self.homes.recoveries.came_up(recovery, clock.when("restart"), switch.live_at, restore_seconds)
-        if switch.waits_for_release:
+        self.homes.recoveries.came_up(recovery, clock.when("restart"), switch.life.live_at, restore_seconds)
+        if switch.life.waits_for_release:
             await self.gate("release")
-            if port is None or switch.port is not port:
+            if port is None or switch.life.port is not port:
                 raise StartFailed(switch.path, ENDED)
-            switch.waits_for_release = False
+            switch.life.waits_for_release = False
             switch.let_at()

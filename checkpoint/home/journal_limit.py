@@ -10,6 +10,7 @@ from ...actors.events import JournalFull
 from ...actors.kernel.envelope import Ask
 from ...actors.kernel.mailbox import Senders
 from ..protocol import SnapshotNow
+from .replay_filter import turns_to_skip
 
 if TYPE_CHECKING:
     from .switch import Switch
@@ -22,17 +23,24 @@ class Limit:
         self._home = home
         self._senders = Senders()
         self._is_told = False
+        self._looked_at = -1  # the number of turns kept when it was last tried to keep fewer
         self.at = home.method.trigger
         """Bytes from which on an admission has to ask here."""
 
     @property
     def is_reached(self) -> bool:
         """Whether the journal has no room."""
-        return self._home.bytes >= self._home.method.journal_limit
+        return self._home.ledger.journal_bytes >= self._home.method.journal_limit
 
     def makes_room(self) -> bool:
         """Whether there is room when what no replay needs is given up."""
-        self._home.skipping.compact()
+        ledger, count = self._home.ledger, len(self._home.ledger.turns)
+        # During a replay they may still be wanted; and each look costs as much as there are turns.
+        if self._home.life.is_released and abs(count - self._looked_at) >= max(16, count // 8):
+            chosen = turns_to_skip(self._home)
+            for number in (chosen.readonly | chosen.superseded) - {ledger.turn}:  # Numbers go on from the last one.
+                ledger.give_up(number)
+            self._looked_at = len(ledger.turns)
         return not self.is_reached
 
     def has_room(self, ask: Ask | None) -> bool:
@@ -58,9 +66,9 @@ class Limit:
         home = self._home
         if not self._is_told:
             self._is_told = True
-            home.node.emit(JournalFull(home.path, home.state_turn, home.bytes, self._way_out()))
+            home.node.emit(JournalFull(home.path, home.ledger.state_turn, home.ledger.journal_bytes, self._way_out()))
         self._want_snapshot()
-        error = MailboxFull(home.path, len(home.open))
+        error = MailboxFull(home.path, len(home.ledger.open))
         if ask is None:
             raise error
         ask.fail(error)
@@ -79,11 +87,11 @@ class Limit:
         )
 
     def _want_snapshot(self) -> None:
-        if self._home.port is not None:
-            self._home.port.to_life(SnapshotNow())
+        if self._home.life.port is not None:
+            self._home.life.port.to_life(SnapshotNow())
 
     def cut(self) -> None:
-        """There is room again."""
+        """Let everybody in again: the journal was cut."""
         self.at = self._home.method.trigger
         self._is_told = False
         self.wake()

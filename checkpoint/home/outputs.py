@@ -54,14 +54,13 @@ class Outputs:
             case "publish":
                 self._publish(turn, out, batch)
             case "reply":
-                ask = home.later.pop(int(out.to), None)
-                source = home.open.get(int(out.to))
+                ask = home.calls.later.pop(int(out.to), None)
+                source = home.ledger.open.get(int(out.to))
                 if source is not None:  # Answered before its own turn has ended.
                     ask, source.ask = source.ask, None
                 kind, _, name = out.name.partition("|")
                 if isinstance(ask, SwitchAsk):
-                    if home.journal.durable:
-                        batch.add(home.path, ("replied", turn, int(out.to)), home.positions_of(turn))
+                    home.note(turn, ("replied", turn, int(out.to)), batch)
                     ask.give(Answer(kind, name, out.body), batch)
                 elif ask is not None:
                     batch.after.append(lambda: answer_ask(home, ask, Answer(kind, name, out.body)))
@@ -78,8 +77,7 @@ class Outputs:
                 batch.after.append(lambda: self._subscribe(out))
             case "monitor" | "watch" | "demonitor" | "unwatch" | "link" | "unlink":
                 home.ties.turn(out.verb, out.to)
-                if home.journal.durable:
-                    batch.add(home.path, ("tie", turn, out.verb, out.to), home.positions_of(turn))
+                home.note(turn, ("tie", turn, out.verb, out.to), batch)
                 batch.after.append(lambda: connect(cell, node.cell_at(out.to), out.verb))
             case "pipe":
                 pass
@@ -89,34 +87,23 @@ class Outputs:
     def hooked(self, record: Hooked) -> None:
         """What a hook does that outlives it; it is done once, though a hook runs at each life."""
         home, out = self._home, record.out
-        if record.hook == STARTED and self._is_touched_since(out):
+        verbs = next((pair for pair in OPPOSITES if out.verb in pair), ())
+        digests = {Out(0, verb, out.to).digest() for verb in verbs}
+        if record.hook == STARTED and home.ledger.is_touched_since(digests):
             return  # The turns behind the snapshot have had the last word, and are handled again.
         if out.verb == "timer" and not home.timers.is_new(out):
             return
         if out.verb in ("monitor", "watch", "link") and home.ties.has(out.verb, out.to):
             return
         batch = Batch()
-        self.execute(home.turn, -1, out, batch)
+        self.execute(home.ledger.turn, -1, out, batch)
         batch.commit(home.journal)
-
-    def _is_touched_since(self, out: Out) -> bool:
-        """Whether a turn behind the snapshot has tied or untied the same."""
-        verbs = next((pair for pair in OPPOSITES if out.verb in pair), ())
-        digests = {Out(0, verb, out.to).digest() for verb in verbs}
-        home = self._home
-        turns = (turn.digests for number, turn in home.turns.items() if number > home.state_turn)
-        return bool(digests) and not all(digests.isdisjoint(known) for known in (*turns, home.partial))
 
     def work_done(self, record: PipeDone) -> None:
         """Background work has an outcome: an input, once."""
         home = self._home
-        if not record.k:
-            home.forward(home.record(PIPE, record.name, record.body, home.path))
-            return
-        done = home.pipes_done.setdefault(record.turn, set())
-        if record.k not in done:
-            done.add(record.k)
-            origin = f"{record.turn}.{record.k}"
+        origin = f"{record.turn}.{record.k}" if record.k else ""
+        if not record.k or home.ledger.admit_result(record.turn, record.k):
             home.forward(home.record(PIPE, record.name, record.body, home.path, origin=origin))
 
     def _operate(self, out: Out) -> None:
@@ -138,7 +125,7 @@ class Outputs:
         if out.verb == "timer" and not self._home.shapes.knows(out.name):
             self._home.note_shape(out.name, batch)
         entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, self._home.node.wall())
-        batch.add(self._home.path, entry, self._home.positions_of(turn))
+        self._home.note(turn, entry, batch)
 
     def _deliver(self, target: Cell, out: Out, batch: Batch, sender: str | None = None) -> None:
         """A message to another actor; to a recorded one it is journaled in the same append."""
@@ -150,7 +137,8 @@ class Outputs:
             if isinstance(target, Inlet):
                 target.mark()
             try:
-                if switch.bound is None or switch.bound.makes_room(None, out.name, out.body, cell.path):
+                bound = switch.intake.bound
+                if bound is None or bound.makes_room(None, out.name, out.body, cell.path):
                     source = switch.record(MESSAGE, out.name, out.body, cell.path, batch)
                     batch.after.append(lambda: switch.admitted(source))
             except MailboxFull as error:  # Its turn has gone on: there is nobody to raise this to.
@@ -201,7 +189,7 @@ class Outputs:
         if switch is None:
             batch.after.append(lambda: self._line_up(target, lambda: self._offer(target, out, over, wanted)))
             return
-        bound = switch.bound
+        bound = switch.intake.bound
         try:
             if bound is None or not target.has_room or bound.makes_room(None, out.name, out.body, home.path):
                 # Even if there is no room: what is journaled in this append cannot be lost, and the sender waits.
@@ -264,7 +252,7 @@ class Outputs:
     def _ask(self, turn: int, key: int, out: Out, batch: Batch) -> None:
         home = self._home
         target = home.node.cell_at(out.to)
-        source = home.open.get(key)
+        source = home.ledger.open.get(key)
         chain = ((home.path, key), *(source.chain if source is not None else ()))
         ask = SwitchAsk.made(home, turn, out, chain, target)
         home.calls.asks[turn, out.k] = ask
@@ -274,7 +262,7 @@ class Outputs:
             batch.after.append(lambda: self._send_ask(target, ask))
         elif switch.waits(ask):
             ask.give(Answer(*home.node.codec.encode_error(AskDeadlock(out.to, tuple(p for p, _ in chain)))), batch)
-        elif switch.bound is None or switch.bound.makes_room(ask, out.name, out.body, home.path):
+        elif (bound := switch.intake.bound) is None or bound.makes_room(ask, out.name, out.body, home.path):
             asked = switch.record(MESSAGE, out.name, out.body, home.path, batch, origin_of(ask))
             asked.ask, asked.chain = ask, chain
             batch.after.append(lambda: switch.admitted(asked))
@@ -293,7 +281,7 @@ class Outputs:
 
     def _forward(self, key: int, out: Out, batch: Batch) -> None:
         home = self._home
-        source = home.open.get(key)
+        source = home.ledger.open.get(key)
         ask = source.ask if source is not None else None
         target = home.node.cell_at(out.to)
         if source is None or ask is None:

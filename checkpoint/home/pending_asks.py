@@ -11,9 +11,10 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, ReplyHandle
 from ...actors.process.wire.peer import RelayedAsk
-from ..inputs import Batch
+from ..inputs import Batch, Input
 from ..protocol import REPLY, Answer, Out, Outcome
 from ..schema import shape_name
+from .input_ledger import outcome_entry
 
 if TYPE_CHECKING:
     from ...actors.kernel.codec import Codec
@@ -27,15 +28,15 @@ MARK = "ask "
 """How the origin of an input begins that somebody's recorded turn has asked; the asker is its sender."""
 
 
-class Over:
+class EndedCall:
     """Stands for the future of an ask that is over."""
 
     def done(self) -> bool:
-        """It is."""
+        """Whether there is nothing to wait for: there is not."""
         return True
 
 
-OVER = Over()
+OVER = EndedCall()
 
 
 class SwitchAsk(RelayedAsk, eq=False):
@@ -60,7 +61,7 @@ class SwitchAsk(RelayedAsk, eq=False):
 
     @property
     def codec(self) -> Codec:
-        """What encodes its outcome."""
+        """The codec that encodes its outcome."""
         codec: Codec = self.switch.node.codec
         return codec
 
@@ -79,18 +80,18 @@ class SwitchAsk(RelayedAsk, eq=False):
             self.give(Answer(REPLY, "", body))
 
     def answer_raw(self, body: bytes) -> None:
-        """An encoded reply."""
+        """Hand over an encoded reply."""
         self.give(Answer(REPLY, "", body))
 
     def fail(self, error: BaseException) -> None:
         self.give(Answer(*self.codec.encode_error(error)))
 
     def fail_raw(self, kind: str, name: str, body: bytes) -> None:
-        """An encoded error."""
+        """Hand over an encoded error."""
         self.give(Answer(kind, name, body))
 
     def give(self, answer: Answer, batch: Batch | None = None) -> None:
-        """The outcome, once."""
+        """Hand over the outcome, once."""
         if not self.is_over:
             self.is_over = True
             self.future = OVER  # Not itself any more: a cycle would keep the message until the next collection.
@@ -124,41 +125,66 @@ def answer_ask(home: Switch, ask: Ask, answer: Answer) -> None:
         ask.answer(reply)
 
 
-class Calls:
-    """What the turns of one home have asked and sent, and wait for."""
+class PendingCalls:
+    """What the turns of one home wait for, and what it owes others.
+
+    Attributes:
+        asks: asks of its own turns, by (turn, output).
+        sends: sends and publications of its own turns whose receivers have no room yet.
+        later: asks of others that are to be answered later, by input.
+        owed: the same as read back from the store: asker and origin.
+    """
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self.asks: dict[tuple[int, int], SwitchAsk] = {}
-        self.sends: set[tuple[int, int]] = set()  # whose receivers have no room yet
-        self.outcomes: dict[tuple[int, int], Answer] = {}  # since the last snapshot
+        self.sends: set[tuple[int, int]] = set()
+        self.later: dict[int, Ask] = {}
+        self.owed: dict[int, tuple[str, str]] = {}
+
+    # -- what is owed -----------------------------------------------------------------------------------------------
+
+    def owe(self, source: Input, batch: Batch) -> None:
+        """The turn of an input will answer its ask later."""
+        if source.ask is None:
+            return
+        self.later[source.id] = source.ask
+        if isinstance(source.ask, SwitchAsk):
+            self._home.note(source.turn, ("later", source.turn, source.id), batch)
+
+    def debts(self) -> dict[int, tuple[str, str]]:
+        """The asks from recorded turns that are to be answered later: asker and origin."""
+        asks = ((key, ask) for key, ask in self.later.items() if isinstance(ask, SwitchAsk) and not ask.is_over)
+        return {key: (ask.sender.path, origin_of(ask)) for key, ask in asks}
+
+    def renounce(self, error: HoldfastError) -> None:
+        """Nothing that is owed will be answered."""
+        for ask in self.later.values():
+            ask.fail(error)
+        self.later.clear()
+
+    # -- what is waited for -----------------------------------------------------------------------------------------
 
     def join(self, turn: int, key: int, out: Out) -> None:
         """An ask or send that was made before the crash: answered from the journal, or when its pending call is."""
-        k, rejoin = out.k, self._home.rejoin
-        answer = self.outcomes.get((turn, k))
+        k, home = out.k, self._home
+        answer = home.ledger.outcomes.get((turn, k))
         if answer is None and out.verb in ("send", "publish"):
             answer = None if (turn, k) in self.sends else ACCEPTED
-        elif (
-            answer is None
-            and (turn, k) not in self.asks
-            and not (rejoin is not None and rejoin.joins(self._home, turn, key, out))
-        ):
+        elif answer is None and (turn, k) not in self.asks and not home.homes.rejoin.joins(home, turn, key, out):
             # The root itself was restarted meanwhile, and whoever was asked keeps no journal.
-            answer = Answer(*self._home.node.codec.encode_error(AskTimeout("(unknown since the restart)", 0.0, None)))
-        if answer is not None and self._home.port is not None:
-            self._home.port.to_life(Outcome(turn, k, answer))
+            answer = Answer(*home.node.codec.encode_error(AskTimeout("(unknown since the restart)", 0.0, None)))
+        if answer is not None:
+            self._tell(turn, k, answer)
 
     def outcome(self, turn: int, k: int, answer: Answer, batch: Batch | None) -> None:
         """An ask of ours has its outcome: journal it, then tell the turn that waits."""
         own = batch if batch is not None else Batch()
         self.asks.pop((turn, k), None)
-        if turn > self._home.state_turn:  # Else it will not be replayed.
-            self.outcomes[turn, k] = answer
+        if self._home.ledger.note_outcome(turn, k, answer):
             if self._home.journal.durable:
                 self._home.note_shape(shape_name(answer), own)
-                entry = ("got", turn, k, answer.kind, answer.name, answer.body)
-                own.add(self._home.path, entry, self._home.positions_of(turn))
+            self._home.note(turn, outcome_entry(turn, k, answer), own)
         own.after.append(lambda: self._tell(turn, k, answer))
         if batch is None:
             own.commit(self._home.journal)
@@ -182,5 +208,5 @@ class Calls:
             self.outcome(turn, k, Answer(*self._home.node.codec.encode_error(error)), None)
 
     def _tell(self, turn: int, k: int, answer: Answer) -> None:
-        if self._home.port is not None:
-            self._home.port.to_life(Outcome(turn, k, answer))
+        if self._home.life.port is not None:
+            self._home.life.port.to_life(Outcome(turn, k, answer))

@@ -62,7 +62,7 @@ class QuarantinedMessage:
     id: int
 
 
-class Held(msgspec.Struct, array_like=True, frozen=True):
+class QuarantineEntry(msgspec.Struct, array_like=True, frozen=True):
     """One of them, as it is kept."""
 
     address: str
@@ -81,18 +81,18 @@ class Quarantine:
 
     def __init__(self, node: Node, journal: Commits) -> None:
         self._node, self._journal = node, journal
-        self._held: dict[tuple[str, int], Held] = {}
+        self._held: dict[tuple[str, int], QuarantineEntry] = {}
         self._positions: list[int] = []
         saved = journal.load(PLACE)
         if saved.snapshot is not None:
-            for one in msgspec.msgpack.decode(saved.snapshot, type=list[Held]):
+            for one in msgspec.msgpack.decode(saved.snapshot, type=list[QuarantineEntry]):
                 self._held[one.address, one.id] = one
         for position, entry in saved.entries:
             self._positions.append(position)
             values: tuple[Any, ...] = entry
             match values:
                 case ("held", *fields):
-                    one = Held(*fields)
+                    one = QuarantineEntry(*fields)
                     self._held[one.address, one.id] = one
                 case (_, address, key):
                     self._held.pop((address, key), None)
@@ -102,7 +102,7 @@ class Quarantine:
 
     def hold(self, home: Switch, source: Input, batch: Batch) -> None:
         """Put an input aside; its turn ends in the same append."""
-        one = Held(
+        one = QuarantineEntry(
             home.path, source.id, source.kind, source.name, source.body, source.sender, source.origin,
             source.deliveries, self._node.wall(),
         )  # fmt: skip
@@ -115,7 +115,7 @@ class Quarantine:
         """What is in quarantine, oldest first: all of it, or what belongs to one address."""
         return [self._shown(one) for one in self._held.values() if address in (None, one.address)]
 
-    def _shown(self, one: Held) -> QuarantinedMessage:
+    def _shown(self, one: QuarantineEntry) -> QuarantinedMessage:
         message: Any = None
         if one.name:
             message = Parcel(one.name, one.body)
@@ -179,13 +179,13 @@ class Quarantine:
             entries += [("held", *msgspec.structs.astuple(one)) for one in fresh]
             self._positions += self._journal.append([(PLACE, entry) for entry in entries])
 
-    def _one(self, asked: QuarantinedMessage) -> Held:
+    def _one(self, asked: QuarantinedMessage) -> QuarantineEntry:
         one = self._held.get((asked.address, asked.id))
         if one is None:
             raise NotQuarantined(asked.address, asked.id)
         return one
 
-    def _free(self, one: Held, durable: bool, batch: Batch) -> None:
+    def _free(self, one: QuarantineEntry, durable: bool, batch: Batch) -> None:
         del self._held[one.address, one.id]
         if durable:
             batch.add(PLACE, ("free", one.address, one.id), self._positions)

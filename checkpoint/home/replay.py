@@ -21,7 +21,7 @@ TELL_EVERY = 1.0
 """Seconds between two events that tell how long a paced replay will still take, at least."""
 
 
-class Replay:
+class PacedReplay:
     """The replay to the present life of one home."""
 
     def __init__(self, home: Switch) -> None:
@@ -55,7 +55,7 @@ class Replay:
         self._go_on(port, then)
 
     def _feed(self, port: LifePort, number: int, turn: Turn) -> None:
-        pipes = self._home.pipes_done.get(number, ())
+        pipes = self._home.ledger.pipes_done.get(number, ())
         port.to_life(turn.input.feed(number, tuple(sorted(pipes)), was_asked=turn.reply != 0))
         self._fed = number
 
@@ -66,7 +66,7 @@ class Replay:
     def _go_on(self, port: LifePort, then: Callable[[], None]) -> None:
         home, waiting = self._home, self._waiting
         self._handle = None
-        if home.port is not port:
+        if home.life.port is not port:
             return  # That life is over, or not the one any more.
         now = home.node.loop.time()
         while waiting and waiting[0][0] <= now:
@@ -77,11 +77,11 @@ class Replay:
             return
         if home.node.watched and now - self._told_at >= TELL_EVERY:
             self._told_at = now
-            home.node.emit(ReplayPaced(home.path, len(waiting), waiting[-1][0] - now, home.backlog(-1)))
+            home.node.emit(ReplayPaced(home.path, len(waiting), waiting[-1][0] - now, home.ledger.backlog(-1)))
         self._handle = home.node.loop.call_at(waiting[0][0], self._go_on, port, then)
 
     def cancel(self) -> None:
-        """That life is over."""
+        """Feed nothing more: that life is over."""
         self._waiting.clear()
         if self._handle is not None:
             self._handle.cancel()

@@ -13,10 +13,11 @@ from ...actors.errors import UnknownMessage
 from ...actors.events import TurnsSkipped
 from ...actors.kernel.actor import Actor, Handles
 from ...actors.kernel.node import cell_kind
-from ..inputs import OVERHEAD, Turn
+from ..inputs import Turn
 from ..protocol import MESSAGE, OK, STASHED, Out
 
 if TYPE_CHECKING:
+    from ...actors.kernel.codec import Codec
     from .switch import Switch
 
 PIPE_DIGEST = Out(1, "pipe", "").digest()
@@ -31,89 +32,64 @@ class Skipped(NamedTuple):
     problem: str = ""
 
 
-class Skipping:
-    """What the replays of one home leave out."""
+def turns_to_replay(home: Switch) -> list[tuple[int, Turn]]:
+    """The turns to replay, in order; an event tells of those that are not."""
+    chosen = turns_to_skip(home)
+    if home.node.watched and any(chosen):
+        counts = len(chosen.readonly), len(chosen.superseded)
+        home.node.emit(TurnsSkipped(home.path, *counts, chosen.problem))
+    return home.ledger.replayed(chosen.readonly | chosen.superseded)
 
-    def __init__(self, home: Switch) -> None:
-        self._home = home
-        self._looked_at = -1  # the number of turns kept when it was last tried to keep fewer
 
-    def choose(self) -> Skipped:
-        """The ended turns that a replay may leave out."""
-        home = self._home
-        skips = home.method.skip and not home.method.check_replay  # States in between are compared, too.
-        kind = cell_kind(home.cell) if home.cell is not None and skips else None
-        chosen = Skipped(set(), set())
-        if kind is None or not any(one.readonly or one.supersedes is not None for one in kind._declared.values()):
-            return chosen
-        problem = ""
-        later: set[Hashable] = set()  # keys that are written again before anybody looks
-        for number, turn in reversed(home.turns.items()):
-            if turn.status not in (OK, STASHED):
-                continue  # Not replayed anyway.
-            declared = self._declared(kind, turn)
-            if declared is not None and declared.readonly and PIPE_DIGEST not in turn.digests:
-                chosen.readonly.add(number)
-                continue
-            if declared is None or declared.supersedes is None or turn.digests:
-                later.clear()
-                continue
-            try:
-                key = (declared.kind, self._key(kind, turn, declared.supersedes))
-                is_written_again = key in later
-            except Exception as error:  # The user's own function, or a value that is no key.
-                problem = f"the key of {turn.input.name} cannot be had: {error!r}"
-                later.clear()
-                continue
-            if is_written_again:
-                chosen.superseded.add(number)
-            later.add(key)
-        return chosen._replace(problem=problem)
+def turns_to_skip(home: Switch) -> Skipped:
+    """The ended turns of a home that a replay may leave out."""
+    skips = home.method.skip and not home.method.check_replay  # States in between are compared, too.
+    kind = cell_kind(home.cell) if home.cell is not None and skips else None
+    if kind is None or not any(one.readonly or one.supersedes is not None for one in kind._declared.values()):
+        return Skipped(set(), set())
+    return choose(home.ledger.turns, kind, home.node.codec)
 
-    def _declared(self, kind: type[Actor], turn: Turn) -> Handles | None:
-        """What the handler of a turn has declared; None if it was no message, or was put aside."""
-        if turn.status != OK or turn.input.kind != MESSAGE:
-            return None
+
+def choose(turns: dict[int, Turn], kind: type[Actor], codec: Codec) -> Skipped:
+    """The ended turns that a replay to an actor of this class may leave out."""
+    chosen, problem = Skipped(set(), set()), ""
+    later: set[Hashable] = set()  # keys that are written again before anybody looks
+    for number, turn in reversed(turns.items()):
+        if turn.status not in (OK, STASHED):
+            continue  # Not replayed anyway.
+        declared = _declared(kind, turn)
+        if declared is not None and declared.readonly and PIPE_DIGEST not in turn.digests:
+            chosen.readonly.add(number)
+            continue
+        if declared is None or declared.supersedes is None or turn.digests:
+            later.clear()
+            continue
         try:
-            message = kind._table.kind_named(turn.input.name)
-        except UnknownMessage:  # The code has changed since; the life will say so.
-            return None
-        return next((kind._declared[base] for base in message.__mro__ if base in kind._declared), None)
+            key = (declared.kind, _key(kind, turn, declared.supersedes, codec))
+            is_written_again = key in later
+        except Exception as error:  # The user's own function, or a value that is no key.
+            problem = f"the key of {turn.input.name} cannot be had: {error!r}"
+            later.clear()
+            continue
+        if is_written_again:
+            chosen.superseded.add(number)
+        later.add(key)
+    return chosen._replace(problem=problem)
 
-    def _key(self, kind: type[Actor], turn: Turn, by: Any) -> Hashable:
-        if by is True:
-            return None
-        message = self._home.node.codec.decode(kind._table.kind_named(turn.input.name), turn.input.body)
-        return cast("Hashable", getattr(message, by) if isinstance(by, str) else by(message))
 
-    def left(self) -> list[tuple[int, Turn]]:
-        """The turns to replay, in order; an event tells of those that are not."""
-        chosen = self.choose()
-        self._tell(chosen)
-        out = chosen.readonly | chosen.superseded
-        turns = self._home.turns.items()
-        return [(number, turn) for number, turn in turns if turn.status in (OK, STASHED) and number not in out]
+def _declared(kind: type[Actor], turn: Turn) -> Handles | None:
+    """What the handler of a turn has declared; None if it was no message, or was put aside."""
+    if turn.status != OK or turn.input.kind != MESSAGE:
+        return None
+    try:
+        message = kind._table.kind_named(turn.input.name)
+    except UnknownMessage:  # The code has changed since; the life will say so.
+        return None
+    return next((kind._declared[base] for base in message.__mro__ if base in kind._declared), None)
 
-    def _tell(self, chosen: Skipped) -> None:
-        home = self._home
-        if home.node.watched and any(chosen):
-            counts = len(chosen.readonly), len(chosen.superseded)
-            home.node.emit(TurnsSkipped(home.path, *counts, chosen.problem))
 
-    def compact(self) -> None:
-        """The journal is full: give up what no replay needs. (On a disk it stays until the next snapshot.)"""
-        home = self._home
-        count = len(home.turns)
-        if not home.is_released or abs(count - self._looked_at) < max(16, count // 8):
-            return  # During a replay they may still be wanted; and each look costs as much as there are turns.
-        chosen = self.choose()
-        for number in chosen.readonly | chosen.superseded:
-            source = home.turns.pop(number).input
-            home.bytes -= len(source.body) + OVERHEAD
-            known = home.positions.pop(number, [])
-            if home.journal.durable:
-                home.dropped += (known, source.positions)
-            home.pipes_done.pop(number, None)
-            for key in [key for key in home.calls.outcomes if key[0] == number]:
-                del home.calls.outcomes[key]
-        self._looked_at = len(home.turns)
+def _key(kind: type[Actor], turn: Turn, by: Any, codec: Codec) -> Hashable:
+    if by is True:
+        return None
+    message = codec.decode(kind._table.kind_named(turn.input.name), turn.input.body)
+    return cast("Hashable", getattr(message, by) if isinstance(by, str) else by(message))

@@ -162,7 +162,7 @@ class ChildPlace(Place):
         """
         start = cell.extra().start
         assert start is not None
-        if method.hooks is not None:
+        if method.meanwhile.hooks is not None:
             why = "recovery hooks run in the root process: give them to ActorSystem(recovery_hooks=...)"
             raise StartFailed(cell.path, why)
         self.home.guest.recovery.begins(cell.path)

@@ -111,7 +111,7 @@ MADE = random.Random.__init__.__code__
 CLASS_CLOCKS = {("datetime", "now"), ("datetime", "utcnow"), ("datetime", "today"), ("date", "today")}
 
 
-class Guard:
+class DeterminismGuard:
     """Watches the turns of one strict actor."""
 
     def __init__(self) -> None:

@@ -262,7 +262,7 @@ class RecordedContext(ActorContext):
     def unstash(self) -> None:
         life = self.acting()
         if life.hook == STARTED:  # In a process, what was put aside may not be here yet.
-            life.unstashes = True
+            life.restored.unstashes = True
         stash, life.stash = life.stash, []
         again = [Fed(life, once_more(fed.feed), fed.message, fed.sender) for fed in stash]
         if life.is_live:
@@ -298,7 +298,7 @@ class RecordedContext(ActorContext):
     def postpones(self, call: Item) -> bool:
         if self.recorded.is_live:
             return False
-        self.recorded.postponed.append(call)
+        self.recorded.stage.postponed.append(call)
         return True
 
     def may_replace(self) -> None:
@@ -316,7 +316,7 @@ class RecordedContext(ActorContext):
         if self.recorded.is_live:
             super().stop(reason)
         else:  # A replayed turn: the life ends when it has caught up.
-            self.recorded.stop_wanted = reason
+            self.recorded.stage.stop_wanted = reason
 
     def close(self) -> None:
         super().close()

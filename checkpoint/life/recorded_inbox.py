@@ -80,7 +80,7 @@ class Fed(Item):
                 if more is not None and more.trap_exits:
                     return actor.on_exit(node.cell_at(data["source"]).ref, reason)
                 if reason != NORMAL:
-                    self.life.is_cut_off = True
+                    self.life.stage.is_cut_off = True
                     actor.ctx.stop(reason)
                 return None
             case "down":
@@ -111,7 +111,7 @@ class Fed(Item):
         self.end(self.life.answer_error(no) if self.feed.is_ask else Answer())
 
     def end_with(self, result: object) -> None:
-        """The handler returned."""
+        """End the turn with what the handler has returned."""
         if not self.feed.is_ask:
             self.end(Answer())
         elif isinstance(result, ReplyHandle):
@@ -123,7 +123,7 @@ class Fed(Item):
     def end(self, answer: Answer) -> None:
         """The turn is over; a stashed message stays open."""
         life = self.life
-        if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None and life.saves:
+        if self.feed.kind == START and self.feed.turn < 0 and life.cell.actor is not None and life.saving.is_needed:
             check_saved(life.cell.actor, life.method)  # What cannot be saved is refused now, not when it is needed.
         if self.is_stashed:
             life.close_turn(STASHED, Answer())
@@ -185,7 +185,7 @@ class Hook(Item):
         return self.name == "on_start"
 
     def over(self) -> None:
-        """The hook has returned."""
+        """Leave the hook, which has returned."""
         self.life.hook = ""
 
 
@@ -202,7 +202,7 @@ class GoLive(Hook):
     def run(actor: Any, item: Any) -> object:
         # Turns that failed are not replayed, but their numbers are used.
         item.life.turn = max(item.life.turn, item.go.turn)
-        item.life.gone, item.life.timers = item.go.gone, dict(item.go.timers)
+        item.life.timers.running = dict(item.go.timers)
         if item.go.recovered and type(actor).on_recovered is not Actor.on_recovered:
             return Hook.run(actor, item)
         item.over()
@@ -210,7 +210,7 @@ class GoLive(Hook):
 
     def over(self) -> None:
         super().over()
-        self.life.go_live()
+        self.life.go_live(self.go.gone)
 
 
 class TakeSnapshot(Item):
@@ -244,7 +244,7 @@ class StopRecorded(Item):
         life: Life = item.life
         life.take_snapshot(is_last=True)
         life.enter(STOP)
-        if life.is_cut_off:
+        if life.stage.is_cut_off:
             lifecycle.finish(life.cell, item.reason, is_orderly=False)
         else:
             lifecycle.stop(life.cell, item.reason, item)

@@ -10,7 +10,7 @@ import asyncio
 import time
 import types
 from collections.abc import Callable, Coroutine, Generator
-from typing import Any, Protocol, TypeVar
+from typing import Any, NoReturn, Protocol, TypeVar
 
 from ...actors.errors import ActorStopped, BadMessage, ControlFailed, HoldfastError, StartFailed, remote_crash
 from ...actors.exit_reasons import ExitReason
@@ -19,7 +19,6 @@ from ...actors.kernel.actor import Actor, Start
 from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import Message, message_name
-from ..durable_timers import said_by
 from ..method import Method
 from ..protocol import (
     FAILED,
@@ -28,7 +27,6 @@ from ..protocol import (
     START,
     STASHED,
     Answer,
-    Clock,
     Feed,
     Go,
     Hooked,
@@ -50,7 +48,8 @@ from ..protocol import (
 from ..snapshot.image_writer import Imaging
 from ..snapshot.key_variables import check_keys, restore_state, save_state, variables
 from ..turn_word import WAITS
-from .determinism_guard import Guard
+from .determinism_guard import DeterminismGuard
+from .life_state import HookTimers, LifeStage, RestoredState, SnapshotState
 from .readonly_guard import check_readonly
 from .recorded_context import RecordedContext
 from .recorded_inbox import INIT, STOP, Fed, GoLive, Hook, StopRecorded, TakeSnapshot
@@ -60,7 +59,7 @@ T = TypeVar("T")
 
 
 class HomePort(Protocol):
-    """The way home."""
+    """The way from a life to its home."""
 
     def to_home(self, record: ToHome) -> None:
         """Hand a record to the home; it is handled in order."""
@@ -71,7 +70,7 @@ class HomePort(Protocol):
         ...
 
     def closed(self) -> None:
-        """The life is over."""
+        """Take down that the life is over."""
         ...
 
 
@@ -84,7 +83,6 @@ class Life:
         self, cell: Cell, port: HomePort, method: Method, page: memoryview | None, *, may_fork: bool = False
     ) -> None:
         self.cell, self.port, self.method, self.page = cell, port, method, page
-        self.interval = method.interval if method.snapshots else 0.0  # 0: no snapshot is ever taken
         self.turn = 0
         self.feed: Feed | None = None
         self.outs: list[Out] = []
@@ -93,29 +91,13 @@ class Life:
         self.pipes = 0
         self.stash: list[Fed] = []
         self.returned: dict[int, Fed] = {}
-        self.gone: tuple[int, ...] = ()
-        self.cancelled: set[str] = set()  # timers whose ticks may still be on their way
-        self.stop_wanted: ExitReason | None = None
-        self.is_cut_off = False  # it ends by an EXIT that it does not trap
-        self.postponed: list[Item] = []  # orders from outside that wait until it is live
-        self.is_live = self.is_over = False
-        self.has_replayed = False
-        self.begins_suspended = False
+        self.is_live = False
         self.hook = ""  # the hook that runs, if it is one that is no turn
-        self.timers: dict[str, Clock] = {}  # those that run, as far as a hook has not said so
-        self.unstashes = False  # what was put aside before the snapshot is to come again
-        self.guard = Guard() if method.strict else None
-        self.is_checked = method.check_replay  # whether the state is compared under replay
-        self.ignored_why: str | None = None
-        self.saves = True  # whether its state must be one that can be saved
-        self._snapshot_turn = -1
-        self._state: list[bytes] = []
-        self._saved_variables: list[str] = []
-        self.variables: list[str] = []  # of the actor, when `__init__` had run; none if it says itself what is saved
-        self._has_state = self._traps = False
-        self._named: dict[str, int] = {}  # how many timers of hooks say this, by its checksum
-        self._restore_seconds = 0.0
-        self._snapshot_wanted = self._snapshot_postponed = False
+        self.guard = DeterminismGuard() if method.strict else None
+        self.restored = RestoredState()
+        self.timers = HookTimers()
+        self.saving = SnapshotState()
+        self.stage = LifeStage()
         self.images = Imaging(self, may_fork=may_fork)
 
     # -- beginning --------------------------------------------------------------------------------------------------
@@ -136,41 +118,45 @@ class Life:
         actor = cell.actor
         assert actor is not None
         self.turn = turn
-        if self._traps:
+        restored = self.restored
+        if restored.traps:
             cell.extra().trap_exits = True
         try:
-            check_keys(actor, self.method, first=not self._has_state)
+            check_keys(actor, self.method, first=not restored.has_state)
         except HoldfastError as error:
-            self._context_made.close()
-            cell.actor = cell.ctx = None
-            raise StartFailed(cell.path, str(error)) from error
-        self.variables = [] if hasattr(actor, "get_state") else variables(actor)
+            self._give_up(str(error), error)
+        self.saving.variables = [] if hasattr(actor, "get_state") else variables(actor)
         if self.method.check_readonly:
             check_readonly(actor, self)
-        if self._has_state:
+        if restored.has_state:
             begin = time.perf_counter()
             try:
-                data = b"".join(self._state)
+                data = restored.joined()
                 self.images.last_bytes = len(data)
-                restore_state(actor, data, (self._saved_variables, self.variables))
+                restore_state(actor, data, (restored.variables, self.saving.variables))
             except BaseException as error:
-                self._context_made.close()
-                cell.actor = cell.ctx = None
-                raise StartFailed(cell.path, f"its state could not be restored: {error}") from error
-            self._restore_seconds = time.perf_counter() - begin
-            self._snapshot_turn = turn
-        self._state.clear()
-        self._stashed_ids = frozenset(stash)
+                self._give_up(f"its state could not be restored: {error}", error)
+            restored.seconds = time.perf_counter() - begin
+            self.saving.turn = turn
+        restored.stash_ids = frozenset(stash)
         cell.state = RUNNING
-        if self._has_state and start.kind.on_start is not Actor.on_start:
+        if restored.has_state and start.kind.on_start is not Actor.on_start:
             mailbox.queue_of(cell).append(Hook(self, "on_start"))
         lifecycle.up(cell)
 
     def _context(self, cell: Cell) -> RecordedContext:
         """Made before `__init__` runs: that may use `ctx` already."""
-        self._context_made = RecordedContext(cell)
-        self._context_made.recorded = self
-        return self._context_made
+        made = RecordedContext(cell)
+        made.recorded = self
+        return made
+
+    def _give_up(self, why: str, error: BaseException) -> NoReturn:
+        """The actor was constructed, and cannot begin."""
+        cell = self.cell
+        assert cell.ctx is not None
+        cell.ctx.close()
+        cell.actor = cell.ctx = None
+        raise StartFailed(cell.path, why) from error
 
     # -- records from home ------------------------------------------------------------------------------------------
 
@@ -186,18 +172,14 @@ class Life:
             case SnapshotNow(urgent=True):
                 self.want_snapshot()
             case SnapshotNow(at_once=True):
-                self._snapshot_wanted = True
                 self._queue(TakeSnapshot(self))
             case Kept():
                 self.images.kept(record)
             case SnapshotNow():
-                self._snapshot_turn = -2  # no turn: the next one that is due is taken
+                self.image_lost()  # The next one that is due is taken.
             case Restore():
-                self._has_state = True
-                self._traps = self._traps or record.traps
-                self.timers.update(record.timers)
-                self._state.append(record.data)
-                self._saved_variables += record.variables
+                self.restored.take(record)
+                self.timers.running.update(record.timers)
             case _:
                 pass  # for whoever begins lives
 
@@ -209,10 +191,10 @@ class Life:
         else:
             sender = None if feed.sender is None else cell.node.cell_at(feed.sender)
             fed = Fed(self, feed, None, sender)
-        if feed.origin and feed.origin in self.cancelled and feed.turn < 0:
+        if feed.origin and feed.origin in self.timers.cancelled and feed.turn < 0:
             return  # Its timer was cancelled while it was on its way; the home drops it too.
-        if feed.id in self._stashed_ids and feed.turn < 0 and not self.is_live:
-            if self.unstashes:
+        if feed.id in self.restored.stash_ids and feed.turn < 0 and not self.is_live:
+            if self.restored.unstashes:
                 self.returned[feed.id] = fed
             else:
                 self.stash.append(fed)
@@ -247,7 +229,7 @@ class Life:
     def open_turn(self, feed: Feed) -> None:
         """A turn begins; a replayed one gets the number it had."""
         if feed.turn >= 0:
-            self.turn, self.has_replayed = feed.turn, True
+            self.turn, self.stage.has_replayed = feed.turn, True
         else:
             self.turn += 1
         self.feed, self.outs, self.last_k = feed, [], 0
@@ -287,7 +269,11 @@ class Life:
         feed = self.feed
         if feed is None:
             return  # The life was abandoned in this very turn: what it says does not count.
-        state = digest_of(self.cell.actor) if self.is_checked and self.cell.actor and status in (OK, STASHED) else 0
+        state = (
+            digest_of(self.cell.actor)
+            if self.method.check_replay and self.cell.actor and status in (OK, STASHED)
+            else 0
+        )
         self.feed = None
         self.port.to_home(TurnEnd(self.turn, feed.id, status, self.outs, answer, state))
         self.outs = []
@@ -296,7 +282,7 @@ class Life:
 
     def ignore(self, why: str) -> None:
         """The actor does not want to be started: turn 0 stays open for the next start."""
-        self.feed, self.outs, self.ignored_why = None, [], why
+        self.feed, self.outs, self.stage.ignored_why = None, [], why
         self.enter(STOP)  # That is what is left.
         if self.page is not None:
             self.page[0] = 0
@@ -344,24 +330,13 @@ class Life:
         self.hook, self.last_k = hook, 0
 
     def timer_of_hook(self, name: str, body: bytes, interval: float) -> str:
-        """The key of a timer that a hook wants. If one that runs says the same, it is that one.
-
-        So `on_start` may set its timers at each life. Another one is named by what it says: the next life that begins
-        at the same state gives it the same name, whatever else its hook does.
-        """
-        clock = (name, body, interval)
-        known = next((key for key, other in self.timers.items() if other == clock), None)
-        if known is not None:
-            del self.timers[known]
-            return known
-        said = said_by(*clock)
-        self._named[said] = number = self._named.get(said, 0) + 1
-        return f"{self.turn}{self.hook}{said}.{number}"
+        """The key of a timer that the hook which runs wants."""
+        return self.timers.key_for((name, body, interval), f"{self.turn}{self.hook}")
 
     def cancel_timer(self, key: str) -> None:
         """Ticks that are queued here, or on their way, are dropped here and at home."""
         self.put("cancel", key)
-        self.cancelled.add(key)
+        self.timers.cancelled.add(key)
         queue = mailbox.queue_of(self.cell)
         for index, item in enumerate(queue):  # Not removed: the run loop has counted them.
             if type(item) is Fed and item.feed.origin == key and item.feed.turn < 0:
@@ -384,29 +359,31 @@ class Life:
 
     # -- snapshots --------------------------------------------------------------------------------------------------
 
-    def go_live(self) -> None:
-        """Replay is over."""
-        self.is_live = True
-        self.stash = [fed for fed in self.stash if fed.feed.id not in self.gone]
-        for key in self.gone:
+    def go_live(self, gone: tuple[int, ...]) -> None:
+        """Take what is new, for the replay is over; what is `gone` was put aside under replay, and has ended since."""
+        self.is_live, stage = True, self.stage
+        self.stash = [fed for fed in self.stash if fed.feed.id not in gone]
+        for key in gone:
             self.returned.pop(key, None)
         if self.returned:  # Unstashed under replay, and not handled before the crash: they come first.
             queue = mailbox.queue_of(self.cell)
             queue.extendleft(reversed(self.returned.values()))
             self.returned.clear()
-        if self.begins_suspended:  # Behind what comes first: it is not handled either.
+        if stage.begins_suspended:  # Behind what comes first: it is not handled either.
             mailbox.suspend(self.cell)
-        self.port.to_home(Live(self._restore_seconds))
-        if self.has_replayed and self.interval > 0:  # A crash loop must not have to replay the same turns for ever.
+        self.port.to_home(Live(self.restored.seconds))
+        if (
+            stage.has_replayed and self.method.snapshots
+        ):  # A crash loop must not have to replay the same turns for ever.
             self.port.when_told(self._snapshot_of_replay)  # The actor is released meanwhile.
-        postponed, self.postponed = self.postponed, []
+        postponed, stage.postponed = stage.postponed, []
         for call in postponed:
             self.cell.urge(call)
-        if self.stop_wanted is not None:
-            self.cell.request_stop(self.stop_wanted)
+        if stage.stop_wanted is not None:
+            self.cell.request_stop(stage.stop_wanted)
 
     def _snapshot_of_replay(self) -> None:
-        if self.cell.actor is not None and not self.is_over:
+        if self.cell.actor is not None and not self.stage.is_over:
             self.want_snapshot()
 
     def want_snapshot(self) -> None:
@@ -418,9 +395,9 @@ class Life:
         if not self.method.snapshots:
             return
         if self.pipes:
-            self._snapshot_postponed = True
+            self.saving.is_postponed = True
             return
-        if not self.is_live or (self.turn == self._snapshot_turn and not (is_last and self.images.is_busy)):
+        if not self.is_live or (self.turn == self.saving.turn and not (is_last and self.images.is_busy)):
             return
         actor = self.cell.actor
         assert actor is not None
@@ -439,8 +416,8 @@ class Life:
     def pipe_back(self) -> None:
         """Background work has ended: a snapshot that had to wait for it can be taken."""
         self.pipes -= 1
-        if self._snapshot_postponed and not self.pipes:
-            self._snapshot_postponed = False
+        if self.saving.is_postponed and not self.pipes:
+            self.saving.is_postponed = False
             self.want_snapshot()
 
     @property
@@ -451,12 +428,11 @@ class Life:
 
     def image_taken(self, turn: int) -> None:
         """An image of the state after this turn is on its way."""
-        self._snapshot_turn = turn
-        self._snapshot_wanted = False
+        self.saving.turn = turn
 
     def image_lost(self) -> None:
         """Its home could not keep the last one."""
-        self._snapshot_turn = -2
+        self.saving.turn = -2
 
     def last_snapshot(self) -> None:
         """Save the state for a life somewhere else.
@@ -467,7 +443,7 @@ class Life:
         actor = self.cell.actor
         assert actor is not None
         begin = time.perf_counter()
-        if self.method.snapshots and (self.turn != self._snapshot_turn or self.images.is_busy):  # Else all is replayed.
+        if self.method.snapshots and (self.turn != self.saving.turn or self.images.is_busy):  # Else all is replayed.
             self._send_snapshot(save_state(actor), begin)
 
     def may_replace(self) -> str:
@@ -486,7 +462,7 @@ class Life:
         self._begin_snapshot(sum(len(piece.data) for piece in told))
         for piece in told:
             self.port.to_home(piece)
-        if self._snapshot_turn != self.turn:  # A home in another process says so later, and ends this life.
+        if self.saving.turn != self.turn:  # A home in another process says so later, and ends this life.
             raise ControlFailed(self.cell.path, "replace_state", "the new state could not be saved")
 
     def replaced_snapshot(self) -> list[Snapshot]:
@@ -504,8 +480,7 @@ class Life:
         self.images.stop()
         self.images.restart()
         self.images.last_bytes = size
-        self._snapshot_turn = self.turn  # Before it is sent: a home in this process says at once if it cannot keep it.
-        self._snapshot_wanted = False
+        self.saving.turn = self.turn  # Before it is sent: a home in this process says at once if it cannot keep it.
 
     def _snapshot(self, data: bytes, begin: float, *, is_replaced: bool) -> list[Snapshot]:
         stash = [fed.feed.id for fed in self.stash]
@@ -521,16 +496,16 @@ class Life:
     def made_by(self) -> tuple[str, list[str]]:
         """The class whose state is saved, and the variables that it had when `__init__` had run."""
         actor = self.cell.actor
-        return ("", []) if actor is None else (message_name(type(actor)), self.variables)
+        return ("", []) if actor is None else (message_name(type(actor)), self.saving.variables)
 
     def close(self) -> None:
-        """The life is over."""
-        self.is_over = True
+        """End what the life has out, for it is over."""
+        self.stage.is_over = True
         self.images.close()
         for future, _ in self.asks.values():
             future.cancel()
         self.asks.clear()
-        for call in self.postponed:  # The next life's.
+        for call in self.stage.postponed:  # The next life's.
             self.cell.urge(call)
         self.port.closed()
         self.feed, self.outs = None, []  # A turn that swallows its cancellation cannot speak for the next life.

@@ -83,7 +83,7 @@ class RecordedGuest:
         cell.host = AddressHost(FED, LifePlace(life), self._guest.parent)
         if options.get("trap_exits"):  # It was moved here.
             cell.extra().trap_exits = True
-        life.begins_suspended = bool(options.get("suspended"))
+        life.stage.begins_suspended = bool(options.get("suspended"))
         port.begin(life, int(options["turn"]), list(options["stash"]))
 
     def host_for(self, spec: Any) -> AddressHost:
@@ -162,7 +162,7 @@ class Port:
         self.place: ChildPlace | None = None  # of a child: it hears of its lives
 
     def take(self, frame: frames.Record) -> None:
-        """A record from home."""
+        """Take a record from the home of a life in this process."""
         record = FROM_HOME.decode(frame.body)
         match record:
             case Restore():
@@ -227,11 +227,13 @@ class ChildHere(ChildPlace):
 
     def _with_ports(self, cell: Cell) -> Method:
         """The method; where this actor's bindings lead is known here only."""
-        state = self._method.safe_state
+        meanwhile = self._method.meanwhile
+        state = meanwhile.safe_state
         if state is None:
             return self._method
         ports = tuple((port, target.path) for port, target in cell.extra().bindings.items() if port in state.to)
-        return dataclasses.replace(self._method, safe_state=dataclasses.replace(state, ports=ports))
+        told = dataclasses.replace(meanwhile, safe_state=dataclasses.replace(state, ports=ports))
+        return dataclasses.replace(self._method, meanwhile=told)
 
     def begin_here(self, record: Begin) -> None:
         port, cell = self._port, self.cell
@@ -267,8 +269,8 @@ class ChildHere(ChildPlace):
         if life is None:
             return  # It has not begun yet, or is not the address's any more.
         self.say_closed(cell, cell.extra().reason)
-        if life.ignored_why is not None:
-            self.fail(StartIgnored(cell.path, life.ignored_why))
+        if life.stage.ignored_why is not None:
+            self.fail(StartIgnored(cell.path, life.stage.ignored_why))
         elif life.is_live:
             self.came_up()  # It was up, and has ended in a turn before its home could say so.
         else:

@@ -352,7 +352,7 @@ class SlotPlace(Place):
         home.subscribe(cell, wanted.topics)
         for record in switch.restore_records():
             port.to_life(record)
-        port.to_life(Begin(wanted.number, cell.life, switch.state_turn, switch.stash, self._parent.slot))
+        port.to_life(Begin(wanted.number, cell.life, switch.ledger.state_turn, switch.ledger.stash, self._parent.slot))
         assert home.clock is not None
         home.clock.mark("restart")
 
@@ -411,7 +411,7 @@ class SlotPlace(Place):
         return -1 if parent.worker is None or parent.wanted is None else input_of(parent.worker.page[parent.slot])
 
     def retired(self, cell: Cell) -> None:
-        live = None if self._home.switch is None else self._home.switch.live
+        live = None if self._home.switch is None else self._home.switch.life.live
         if self._starting is not None and cell.state is GONE and (live is None or not live.done()):
             self._starting.cancel()  # Else it ends by itself, and tells how the recovery went.
 

@@ -48,7 +48,7 @@ class LifeHere(LifePlace):
         life = self.life = Life(cell, LocalHome(home, cell), home.method, home.page)
         for record in switch.restore_records():
             life.to_life(record)
-        life.begin(start, switch.state_turn, switch.stash)
+        life.begin(start, switch.ledger.state_turn, switch.ledger.stash)
         assert home.clock is not None
         home.clock.mark("restart")
 

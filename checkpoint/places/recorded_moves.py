@@ -57,28 +57,26 @@ class Detached:
     """A home whose life is at rest, and how to give it back."""
 
     def __init__(self, switch: Switch, *, stays: bool = False) -> None:
-        self._switch, self._next_id = switch, switch.next_id
+        self._switch, self._next_id = switch, switch.ledger.next_id
         self._held = {source.id for source in switch.open.values() if source.held}  # not fed yet
-        self._port: LifePort | None = switch.port
-        bound = switch.bound
+        self._port: LifePort | None = switch.life.port
+        bound = switch.intake.bound
         self._in_hand = None if bound is None else bound.in_hand()
-        switch.is_released = False
-        if not stays:
-            switch.port = None
+        if stays:
+            switch.life.is_released = False
+        else:
+            switch.life.die()
         if bound is not None:
             bound.restart()
 
     def attach_again(self, transit: Transit) -> None:
         """The old life goes on: it gets what has come since."""
-        switch = self._switch
-        if switch.diverged is not None:
+        switch, bound = self._switch, self._switch.intake.bound
+        if switch.life.diverged is not None:
             transit.is_killed = False  # That was for the life that replayed.
-        if switch.live is not None and not switch.live.done():
-            switch.live.cancel()
-        switch.diverged, switch.is_void = None, False
-        switch.port, switch.is_released = self._port, True
-        if switch.bound is not None and self._in_hand is not None:
-            switch.bound.take_up(self._in_hand)
+        switch.life.resume(self._port)
+        if bound is not None and self._in_hand is not None:
+            bound.take_up(self._in_hand)
         for source in list(switch.open.values()):
             if source.id >= self._next_id or source.id in self._held:
                 switch.forward(source)
@@ -184,7 +182,7 @@ class Beginning:
         self._is_one = False
 
     def from_life(self, record: ToHome) -> None:
-        """What it says."""
+        """Hold back what it says from when it is live, until it is the life at the address."""
         if self._is_one or not (self._unheard or isinstance(record, Live)):
             self._switch.from_life(record)
             return
@@ -260,7 +258,7 @@ class ToRecordedWorker(ToWorker):
         self.worker.connection.flush()
 
     async def went_on(self) -> None:
-        """It is known."""
+        """Do nothing: nobody has to hear of it."""
 
 
 class ToRecordedHere(Entering):
@@ -313,11 +311,11 @@ class RecordedArrival(Arrival):
         home = self._home = ArrivingHome(owner, cell, self.other, up)
         owner.page = owner.homes.page(switch)
         life = self._life = Life(self.other, home, owner.method, owner.page)
-        life.begins_suspended = suspended
+        life.stage.begins_suspended = suspended
         for record in switch.restore_records():
             life.to_life(record)
         self.other.ended().add_done_callback(lambda done: home.fail(StartFailed(cell.path, str(done.result()))))
-        life.begin(start, switch.state_turn, switch.stash)
+        life.begin(start, switch.ledger.state_turn, switch.ledger.stash)
         switch.attach(life)
         live.add_done_callback(lambda done: None if done.cancelled() else home.fail(done.exception()))
         return up
@@ -357,13 +355,13 @@ class ArrivingHome(LocalHome):
         super().to_home(record)
 
     def open(self) -> None:
-        """It is the one."""
+        """Let the home hear what was held back: it is the life at the address."""
         held, self._held, self._is_arriving = self._held or [], None, False
         for record in held:
             super().to_home(record)
 
     def fail(self, error: BaseException | None) -> None:
-        """It will never be."""
+        """Give up the arrival: it will never be the life at the address."""
         if error is not None and not self._settled.done():
             self._settled.set_exception(
                 error if isinstance(error, StartFailed) else StartFailed(self._cell.path, str(error))

@@ -13,20 +13,20 @@ from ...actors.kernel.actor import on
 from ...actors.kernel.message import Message
 from ..protocol import SnapshotNow
 from ..snapshot.snapshot_schedule import nobody
-from .part import Part
+from .part import RecoveryPart
 
 if TYPE_CHECKING:
     from ..home.homes import Homes
     from ..home.switch import Switch
 
 
-class Look(Message):
+class LookForDue(Message):
     """It is time to look at the homes that may be due: it is `when`, also if a timer fires a little early."""
 
     when: float
 
 
-class CheckpointHandler(Part):
+class CheckpointHandler(RecoveryPart):
     """Has snapshots taken: by time, number of messages, bytes of journal, and on demand."""
 
     def __init__(self, homes: Homes) -> None:
@@ -68,10 +68,10 @@ class CheckpointHandler(Part):
         self._timer = when
         if self._handle is not None:
             self._handle.cancel()  # type: ignore[attr-defined]
-        self._handle = self.ctx.tell_after(max(0.0, when - loop.time()), Look(when))
+        self._handle = self.ctx.tell_after(max(0.0, when - loop.time()), LookForDue(when))
 
-    @on(Look)
-    def look(self, message: Look) -> None:
+    @on(LookForDue)
+    def look(self, message: LookForDue) -> None:
         """Ask those who are due."""
         # Without `when`, a timer of a nanosecond would follow, and another one while the clock does not move.
         now = max(message.when, self.ctx.cell.node.loop.time())
@@ -89,8 +89,8 @@ class CheckpointHandler(Part):
 
     def _consider(self, home: Switch, now: float) -> None:
         due = home.due.when(now)
-        if due is not None and due <= now and home.port is not None:
+        if due is not None and due <= now and home.life.port is not None:
             home.due.asked_at = home.due.last_at = now
-            home.port.to_life(SnapshotNow(urgent=True))
+            home.life.port.to_life(SnapshotNow(urgent=True))
             due = None
         self._at(home.path, due if due is not None else now + home.method.interval)

@@ -13,22 +13,22 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.message import Message
 from ...actors.kernel.ref import ActorRef
 from ..recovery_settings import Hook
-from .part import Part
+from .part import RecoveryPart
 from .recoveries import ENTER, LEAVE, STAGES, Point, Recovery
 from .safe_states import Receiver
 
 
-class Look(Message):
+class LookAtRecovery(Message):
     """Something has come up: in the recovery of `address`, or ("") there are phases to tell of."""
 
     address: str
 
 
-class Seen(Message):
+class StagesSeen(Message):
     """The stages of one recovery that were asked for are done."""
 
 
-class RecoveryController(Part):
+class RecoveryController(RecoveryPart):
     """Has receivers enter and leave safe state, calls hooks, tells of phases.
 
     What it does is noted with the homes before it is done. If it dies, they go on without it, and without the hooks
@@ -39,7 +39,7 @@ class RecoveryController(Part):
         recoveries, cell = self._homes.recoveries, self.ctx.cell
 
         def wake(path: str) -> None:
-            cell.admit(cell, Look(path))
+            cell.admit(cell, LookAtRecovery(path))
 
         self._in_hand: set[tuple[int, int, str]] = set()
         recoveries.attach(wake)
@@ -52,15 +52,15 @@ class RecoveryController(Part):
             self._see_to(recovery)
         recoveries.tell()
 
-    @on(Look)
-    def _look(self, message: Look) -> None:
+    @on(LookAtRecovery)
+    def _look(self, message: LookAtRecovery) -> None:
         recovery = self._homes.recoveries.of(message.address)
         if recovery is not None:
             self._see_to(recovery)
         self._homes.recoveries.tell()
 
-    @on(Seen)
-    def _seen(self, message: Seen) -> None:
+    @on(StagesSeen)
+    def _seen(self, message: StagesSeen) -> None:
         self._homes.recoveries.tell()
 
     # -- stages -----------------------------------------------------------------------------------------------------
@@ -73,7 +73,7 @@ class RecoveryController(Part):
                 continue
             if any(self._homes.recoveries.hooks_at(recovery, point) for point in STAGES[stage]):
                 self._in_hand.add(key)
-                self.ctx.pipe_to_self(self._go_through(recovery, stage), lambda _: Seen())
+                self.ctx.pipe_to_self(self._go_through(recovery, stage), lambda _: StagesSeen())
             else:
                 for point in STAGES[stage]:
                     self._do(recovery, point)

@@ -8,17 +8,17 @@ from __future__ import annotations
 
 from ...actors.kernel.actor import on
 from ...actors.kernel.message import Message
-from .part import Part
+from .part import RecoveryPart
 
 
-class Flush(Message):
+class WriteSubmitted(Message):
     """Something was submitted since the last one."""
 
 
-FLUSH = Flush()
+FLUSH = WriteSubmitted()
 
 
-class MessageHandler(Part):
+class MessageHandler(RecoveryPart):
     """Writes what was submitted, and lets what is safe take effect."""
 
     def on_start(self, restored: bool) -> None:
@@ -28,7 +28,7 @@ class MessageHandler(Part):
         self._homes.journal.wake_handler = lambda: cell.admit(cell, FLUSH)
         self._homes.journal.come()
 
-    @on(Flush)
-    def flush(self, message: Flush) -> None:
-        """Write."""
+    @on(WriteSubmitted)
+    def flush(self, message: WriteSubmitted) -> None:
+        """Write what was submitted."""
         self._homes.journal.come()

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from ..home.homes import Homes
 
 
-class Part(Actor):
+class RecoveryPart(Actor):
     """One of the actors below `/<system>/recovery`.
 
     It keeps nothing of its own: each life begins by looking at the homes. Nothing waits for it, either: what must be

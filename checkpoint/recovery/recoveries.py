@@ -148,7 +148,7 @@ class Recoveries:
         self.phase(recovery, "replay", live_at)
 
     def over(self, path: str) -> None:
-        """The actor is back."""
+        """End the recovery of an actor, which is back."""
         recovery = self._by_path.get(path)
         if recovery is None or "over" in recovery.stages:
             return
@@ -198,13 +198,15 @@ class Recoveries:
 
     def needs(self, recovery: Recovery, stage: str) -> bool:
         """Whether there is anything to do at a stage."""
-        if stage == "restart" and recovery.has_crashed and recovery.method.safe_state is not None:
+        if stage == "restart" and recovery.has_crashed and recovery.method.meanwhile.safe_state is not None:
             return True
         return any(self.hooks_at(recovery, point) for point in STAGES[stage])
 
     def hooks_at(self, recovery: Recovery, point: Point) -> list[tuple[RecoveryHooks, Hook]]:
         """The hooks of one point: the system's, then the child's own."""
-        found = ((hooks, hooks.of(*point)) for hooks in (self.hooks, recovery.method.hooks) if hooks is not None)
+        found = (
+            (hooks, hooks.of(*point)) for hooks in (self.hooks, recovery.method.meanwhile.hooks) if hooks is not None
+        )
         return [(hooks, hook) for hooks, hook in found if hook is not None]
 
     def _ask(self, recovery: Recovery, stage: str) -> None:
@@ -261,10 +263,10 @@ class Recoveries:
 
     def enter_safe_state(self, recovery: Recovery) -> None:
         """S1, once in an attempt. Only a crash is a reason for it."""
-        state = recovery.method.safe_state
+        state = recovery.method.meanwhile.safe_state
         if state is not None and recovery.has_crashed and not recovery.is_safe:
             recovery.is_safe = True
-            self.safety.enter(recovery.path, state, recovery.method.safe_state_timeout)
+            self.safety.enter(recovery.path, state, recovery.method.meanwhile.safe_state_timeout)
             self.phase(recovery, "safe_state", time.monotonic())
 
     def calls(self, recovery: Recovery, point: Point, index: int) -> bool:
@@ -297,7 +299,7 @@ class Recoveries:
             self._node.emit(self._untold.popleft())
 
     def close(self) -> None:
-        """The system ends."""
+        """Wait for nothing any more: the system ends."""
         for timer in self._timers:
             timer.cancel()
         self._timers.clear()

@@ -112,7 +112,7 @@ class Safety:
         return tuple(receiver.path for receiver in self._receivers.values() if path in receiver.holders)
 
     def safe(self) -> list[Receiver]:
-        """Who is safe now."""
+        """The receivers that are safe now."""
         return list(self._receivers.values())
 
     def check(self, receiver: Receiver) -> None:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from ...actors.kernel.actor import on
 from ...actors.kernel.message import Message
-from .part import Part
+from .part import RecoveryPart
 
 
 class LookAtHeld(Message):
     """A home has let its actor at the messages that it held."""
 
 
-class MessageSwitch(Part):
+class MessageSwitch(RecoveryPart):
     """Tells of messages held, dropped and refused. Holding and letting in is done by the homes (`held_messages.py`)."""
 
     def on_start(self, restored: bool) -> None:

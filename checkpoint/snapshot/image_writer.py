@@ -215,7 +215,7 @@ class Imaging:
         self._is_again = False
 
     def close(self) -> None:
-        """The life is over."""
+        """Write no more images: the life is over."""
         self.stop()
         self.restart()
 

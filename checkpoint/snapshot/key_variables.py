@@ -21,7 +21,7 @@ class StateMismatch(HoldfastError, text="the state of {actor} does not fit: {pro
     problem: str
 
 
-class State(NamedTuple):
+class StateForm(NamedTuple):
     """An actor's state, still made of its own objects."""
 
     version: int
@@ -29,7 +29,7 @@ class State(NamedTuple):
     value: Any
 
 
-def state_of(actor: Actor) -> State:
+def state_of(actor: Actor) -> StateForm:
     """What is to be saved: the variables a recovery file names, else `get_state()` or the class's key variables.
 
     Raises:
@@ -37,9 +37,9 @@ def state_of(actor: Actor) -> State:
     """
     get_state = getattr(actor, "get_state", None)
     if get_state is not None and key_names(actor) is None:
-        return State(actor.schema_version, "state", get_state())
+        return StateForm(actor.schema_version, "state", get_state())
     where, root = actor.ctx.path, actor._state_root()
-    return State(actor.schema_version, "keys", {name: read_path(where, root, name) for name in variables(actor)})
+    return StateForm(actor.schema_version, "keys", {name: read_path(where, root, name) for name in variables(actor)})
 
 
 def variables(actor: Actor) -> list[str]:
@@ -51,7 +51,7 @@ def variables(actor: Actor) -> list[str]:
 
 
 def as_it_is(value: Any) -> Any:
-    """The same value."""
+    """Return the value as it is."""
     return value
 
 
@@ -75,7 +75,7 @@ def save_state(actor: Actor, told: Callable[[Any], Any] = as_it_is) -> bytes:
         raise
 
 
-def _parts(actor: Actor, state: State) -> list[tuple[str, object]]:
+def _parts(actor: Actor, state: StateForm) -> list[tuple[str, object]]:
     where = f"{actor.ctx.path}: {type_name(type(actor._state_root()))}"
     if state.form == "state":
         return [(f"{where}.get_state()", state.value)]

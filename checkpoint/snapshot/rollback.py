@@ -28,20 +28,20 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
     Raises:
         HoldfastError: the store refused, and the actor comes back as it was.
     """
-    if to == "restore" or home.is_new:
+    if to == "restore" or home.ledger.is_new:
         return
     older = older_snapshot(home) if to == "older_snapshot" else None
     if to == "older_snapshot" and older is None:
         why = f"{why}; there is no older snapshot"
     if older is not None:
         home.images.fetch(older)
-    home.ends.undo_begun(UNDONE)
-    first = home.turn
+    home.undo_begun(UNDONE)
+    first = home.ledger.turn
     if older is None:
         older = Meta(FORMAT, first, 0, [], {}, [], 0, b"")
-    meta = msgspec.structs.replace(older, turn=first, next_id=home.next_id, epoch=home.journal.epoch)
+    meta = msgspec.structs.replace(older, turn=first, next_id=home.ledger.next_id, epoch=home.journal.epoch)
     put(home, meta, 1)  # Nothing else stays: what was undone must not be what the next step back leads to.
-    home.older = None
+    home.ledger.older = None
     home.images.tidy()
     go_back(home, meta)
     home.node.emit(RolledBack(home.path, first, meta.base, why))
@@ -50,9 +50,9 @@ def roll_back(home: Switch, to: OnEscalate, why: str) -> None:
 def older_snapshot(home: Switch) -> Meta | None:
     """The snapshot before the newest, if one is kept and it is really an older state."""
     if not home.journal.durable:
-        return home.older
+        return home.ledger.older
     saved = home.journal.load(home.path, older=True)
-    newest = home.newest
+    newest = home.ledger.newest
     if saved.snapshot is None or newest is None:
         return None
     meta = decode_meta(saved.snapshot)

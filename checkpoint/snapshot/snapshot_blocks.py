@@ -16,7 +16,7 @@ from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotTaken
 from ..protocol import PIECE, Kept, Marked, Restore, Shared, Snapshot
 from .shared_blocks import Place, Segment, by_segment, open_segment
-from .snapshot_record import IMAGES, Meta, made_by, meta_now, put
+from .snapshot_record import IMAGES, Meta, keep, made_by, meta_now
 
 if TYPE_CHECKING:
     from ..home.switch import Switch
@@ -25,7 +25,7 @@ MOST_GARBAGE: Final = 3
 """How many times the size of an image its packs may take before it is written anew."""
 
 
-class Images:
+class SnapshotImages:
     """The blocks of one home's snapshots."""
 
     def __init__(self, home: Switch) -> None:
@@ -106,18 +106,15 @@ class Images:
 
     def _finish(self, meta: Meta, record: Snapshot, shared: Shared) -> None:
         home = self._home
-        older = home.newest
         try:
-            put(home, meta, home.method.keep)
+            keep(home, meta)
         except HoldfastError as error:
             self.refuse(shared, str(error))
             return
-        home.older = older if home.method.keep > 1 and not home.journal.durable else None
-        self.tidy()
         size = sum(length for _, _, length in meta.blocks)
         is_full = home.journal.durable and sum(one.size for one in self._segments.values()) > MOST_GARBAGE * size
-        if home.port is not None:
-            home.port.to_life(Kept(shared.number, True, is_full))
+        if home.life.port is not None:
+            home.life.port.to_life(Kept(shared.number, True, is_full))
         home.limit.cut()
         home.due.kept(meta.turn)
         if home.node.watched:
@@ -130,8 +127,8 @@ class Images:
         segment = self._segments.pop(shared.number, None)
         if segment is not None:
             segment.close()
-        if home.port is not None:
-            home.port.to_life(Kept(shared.number, False))
+        if home.life.port is not None:
+            home.life.port.to_life(Kept(shared.number, False))
         home.due.failed(why)
 
     def earlier(self) -> list[int]:
@@ -146,11 +143,10 @@ class Images:
 
     def tidy(self) -> None:
         """Give back the memory of blocks that no snapshot needs any more."""
-        home = self._home
-        newest = {} if home.newest is None else by_segment(home.newest.blocks)
-        self._history = [set(newest), *self._history][: home.method.keep]
-        places = [*(home.newest.blocks if home.newest is not None else ()), *(home.older.blocks if home.older else ())]
-        wanted = by_segment(places)
+        ledger = self._home.ledger
+        newest = ledger.newest.blocks if ledger.newest is not None else []
+        self._history = [set(by_segment(newest)), *self._history][: self._home.method.keep]
+        wanted = by_segment([*newest, *(ledger.older.blocks if ledger.older is not None else ())])
         for number in list(self._segments):
             if number not in wanted:
                 self._segments.pop(number).close()

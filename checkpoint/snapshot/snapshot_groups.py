@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from ...actors.errors import HoldfastError
-from ..inputs import Input
 from ..journal import Entry, Saved
-from .snapshot_record import FORMAT, Meta, outlasting, owed
+from .snapshot_record import FORMAT, Meta, outlasting
 
 if TYPE_CHECKING:
     from ..home.homes import Homes
@@ -32,7 +31,7 @@ class NoSuchGroup(HoldfastError, text="there is no group snapshot {name!r}; chec
     name: str
 
 
-class Image(msgspec.Struct, array_like=True, frozen=True):
+class HomeImage(msgspec.Struct, array_like=True, frozen=True):
     """One home at the cut."""
 
     path: str
@@ -40,12 +39,12 @@ class Image(msgspec.Struct, array_like=True, frozen=True):
     entries: list[list[Any]]
 
 
-class Group(msgspec.Struct, array_like=True, frozen=True):
-    """All of them."""
+class GroupSnapshot(msgspec.Struct, array_like=True, frozen=True):
+    """The homes of a group at one cut."""
 
     format: int
     time: float
-    images: list[Image]
+    images: list[HomeImage]
 
 
 class Groups:
@@ -67,7 +66,7 @@ class Groups:
             HoldfastError: one of them is not recorded, or the store refused.
         """
         homes = [self._recorded(path) for path in paths]
-        group = Group(FORMAT, self._homes.node.wall(), [_image(home) for home in homes])
+        group = GroupSnapshot(FORMAT, self._homes.node.wall(), [_image(home) for home in homes])
         self._homes.journal.note(_key(name), msgspec.msgpack.encode(group))
 
     def _recorded(self, path: str) -> Switch:
@@ -128,11 +127,11 @@ class Groups:
             )
         journal.note(RESTORING, None)
 
-    def _group(self, name: str) -> Group:
+    def _group(self, name: str) -> GroupSnapshot:
         data = self._homes.journal.noted(_key(name))
         if data is None:
             raise NoSuchGroup(name)
-        group = msgspec.msgpack.decode(data, type=Group)
+        group = msgspec.msgpack.decode(data, type=GroupSnapshot)
         now = self._homes.addresses.now
         images = [msgspec.structs.replace(image, path=now(image.path)) for image in group.images]
         return msgspec.structs.replace(group, images=images)
@@ -146,56 +145,41 @@ class Groups:
         for path in paths:
             self._waiting.discard(path)
             home = self._homes.at(path)
-            if home is None or not home.kept_back:
+            if home is None or not home.life.is_kept_back:
                 continue
-            home.kept_back = False
-            live = home.live
-            if home.port is None or live is None or not live.done() or live.cancelled():
-                continue  # It lets itself go when it is live.
-            if live.exception() is None and not home.is_released:
+            home.life.is_kept_back = False
+            if home.life.is_ready:  # Else it lets itself go when it is live.
                 home.let_at()
 
     def opened(self, home: Switch) -> None:
         """A home has its next cell: it holds what waits while its group is restored."""
-        home.kept_back = home.path in self._waiting
+        home.life.is_kept_back = home.path in self._waiting
 
 
 def _key(name: str) -> str:
     return f"group {name}"
 
 
-def _image(home: Switch) -> Image:
+def _image(home: Switch) -> HomeImage:
     """What its store would have of it, if the root died now."""
     timers, topics = outlasting(home)
-    newest = home.newest or Meta(FORMAT, -1, 0, [], {}, [], home.journal.epoch, b"")
+    newest = home.ledger.newest or Meta(FORMAT, -1, 0, [], {}, [], home.journal.epoch, b"")
     state = newest.state
     if newest.blocks:  # They are removed when later snapshots do not need them: a group has its own copy.
         state = b"".join(part.data for part in home.images.restore(newest.blocks))
     meta = msgspec.structs.replace(
         newest,
         format=FORMAT,
-        next_id=home.next_id,
+        next_id=home.ledger.next_id,
         timers=timers,
         topics=topics,
         state=state,
         blocks=[],
         earlier=[],
-        owed=owed(home),
+        owed=home.calls.debts(),
         ties=home.ties.saved(),
     )
-    inputs = {turn.input.id: turn.input for turn in home.turns.values()} | home.open
-    entries: list[Entry] = [_in(inputs[key]) for key in sorted(inputs)]
-    outcomes = sorted(home.calls.outcomes.items())
-    entries += [("got", turn, k, answer.kind, answer.name, answer.body) for (turn, k), answer in outcomes]
-    for number, turn in home.turns.items():
-        entries.append(("end", number, turn.input.id, turn.status, tuple(turn.digests), *turn.digests_of_end()))
-    if home.partial:
-        entries.append(("out", home.turn + 1, home.partial_id, tuple(home.partial)))
-    return Image(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in entries])
-
-
-def _in(source: Input) -> Entry:
-    return ("in", source.id, source.kind, source.name, source.body, source.time, source.sender, source.origin)
+    return HomeImage(home.path, msgspec.msgpack.encode(meta), [list(entry) for entry in home.ledger.entries()])
 
 
 def _tuple(part: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError
 from ...actors.events import SnapshotTaken
@@ -11,15 +11,18 @@ from ..protocol import Snapshot, SnapshotNow
 from .snapshot_record import cut
 
 if TYPE_CHECKING:
+    from ...actors.kernel.actor import Start
     from ..home.switch import Switch
 
 
-class Arrival:
+class SnapshotReceiver:
     """The snapshot that is on its way to one home."""
 
     def __init__(self, home: Switch) -> None:
         self._home = home
         self._pieces: list[bytes] = []
+        self.becomes: Start[Any] | None = None  # with what the next lives begin once its class's state has come
+        self.unsaved: list[str] = []  # why, for each state put in place from outside that could not be kept
 
     def cancel(self) -> None:
         """The life is over: what has come of it will not be complete."""
@@ -42,7 +45,7 @@ class Arrival:
         except HoldfastError as error:
             self._refused(record, error)
             return
-        becomes = home.becomes
+        becomes = self.becomes
         kind = "" if becomes is None or not record.is_replaced else message_name(becomes.kind)
         if becomes is not None and home.cell is not None and record.kind == kind:
             home.node.respec(home.cell, becomes)  # Now: the answer to whoever has replaced the code may never come.
@@ -55,8 +58,9 @@ class Arrival:
         """It could not be kept: the older snapshot and the whole journal are still there."""
         home = self._home
         home.due.failed(str(error))
-        if home.port is not None:
-            home.port.to_life(SnapshotNow(at_once=False))
+        if home.life.port is not None:
+            home.life.port.to_life(SnapshotNow(at_once=False))
         if record.is_replaced and home.cell is not None:
-            home.is_void, home.unsaved = True, [*home.unsaved, str(error)]
+            home.life.is_void = True
+            self.unsaved.append(str(error))
             home.cell.kill()

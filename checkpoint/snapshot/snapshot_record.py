@@ -11,11 +11,9 @@ from ...actors.events import SnapshotDamaged
 from ..compression import PLAIN, compressor, decompress
 from ..durable_links import Tie
 from ..durable_timers import Saved
-from ..home.pending_asks import SwitchAsk, origin_of
-from ..inputs import OVERHEAD, Input, Turn
 from ..journal import DamagedStore, Entry
 from ..journal import Saved as Journaled
-from ..protocol import DOWN, EXIT, PIPE, STASHED, TICK, Answer, Snapshot
+from ..protocol import DOWN, EXIT, TICK, Snapshot
 from ..schema import as_shape, kind_in
 from .shared_blocks import Place
 
@@ -105,7 +103,7 @@ def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> M
     return Meta(
         FORMAT,
         turn,
-        home.next_id,
+        home.ledger.next_id,
         stash,
         timers,
         topics,
@@ -113,10 +111,10 @@ def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> M
         state,
         turn,
         time=now,
-        owed=owed(home),
+        owed=home.calls.debts(),
         ties=home.ties.saved(),
         kind=home.shapes.kind,
-        variables=[] if home.newest is None else home.newest.variables,
+        variables=[] if home.ledger.newest is None else home.ledger.newest.variables,
     )
 
 
@@ -126,13 +124,21 @@ def cut(home: Switch, state: bytes, record: Snapshot) -> None:
     Raises:
         HoldfastError: it could not be kept; the older snapshot and the whole journal are still there.
     """
-    older = home.newest
     meta = meta_now(home, record.turn, record.stash, state)
     more = made_by(home, record)
-    meta = msgspec.structs.replace(meta, earlier=home.images.earlier(), traps=record.traps, **more)
+    keep(home, msgspec.structs.replace(meta, earlier=home.images.earlier(), traps=record.traps, **more))
+
+
+def keep(home: Switch, meta: Meta) -> None:
+    """Keep a snapshot, and as many older ones as the method says.
+
+    Raises:
+        HoldfastError: it could not be kept, and nothing has changed.
+    """
+    older = home.ledger.newest
     put(home, meta, home.method.keep)
     # In a store that lasts it is read back when it is wanted.
-    home.older = older if home.method.keep > 1 and not home.journal.durable else None
+    home.ledger.older = older if home.method.keep > 1 and not home.journal.durable else None
     home.images.tidy()
 
 
@@ -159,42 +165,19 @@ def outlasting(home: Switch) -> tuple[dict[str, Saved], list[str]]:
     return timers, list(topics)
 
 
-def owed(home: Switch) -> dict[int, tuple[str, str]]:
-    """The asks from recorded turns that are to be answered later."""
-    asks = ((key, ask) for key, ask in home.later.items() if isinstance(ask, SwitchAsk) and not ask.is_over)
-    return {key: (ask.sender.path, origin_of(ask)) for key, ask in asks}
-
-
 def put(home: Switch, meta: Meta, keep: int) -> None:
     """Have the next life begin with this, and forget the turns up to `meta.turn`; `keep` as in `Journal.cut`.
 
     Raises:
         HoldfastError: it could not be kept, and nothing has changed.
     """
-    covered = [number for number in home.turns if number <= meta.turn]
-    entries = [known for number, known in home.positions.items() if number <= meta.turn]  # of hooks, too
     if home.journal.durable:
         meta = msgspec.structs.replace(meta, shapes=home.shapes.saved())
         home.journal.barrier()  # From here on it is known where everything stands.
-        drop = [*(position for known in home.dropped for position in known)]
-        drop += [*(position for known in entries for position in known)]
-        # An image may be behind: what was stashed when it was begun may have been handled since.
-        later = {turn.input.id for number, turn in home.turns.items() if number > meta.turn}
-        for number in covered:
-            source = home.turns[number].input
-            if source.id not in home.open and source.id not in later:  # Else it is stashed, and not handled yet.
-                drop.extend(source.positions)
+        drop = home.ledger.contained_in(meta.turn)
         home.journal.cut(home.path, encode_meta(meta, home.method.compress), drop, turn=meta.turn, keep=keep)
     home.images.cancel()
-    home.dropped.clear()
-    home.newest, home.stash = meta, meta.stash
-    done = (home.turns.pop(number) for number in covered)
-    home.bytes -= sum(len(turn.input.body) + OVERHEAD for turn in done if turn.status != STASHED)
-    for known in (home.positions, home.pipes_done):
-        for number in [number for number in known if number <= meta.turn]:
-            del known[number]
-    for key in [key for key in home.calls.outcomes if key[0] <= meta.turn]:
-        del home.calls.outcomes[key]
+    home.ledger.begin_with(meta)
 
 
 def go_back(home: Switch, meta: Meta) -> None:
@@ -217,9 +200,9 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
         saved, newest = load_newest(home)
     timers: dict[str, Saved] = {}
     if newest is not None:
-        meta = home.newest = newest
-        home.turn, home.next_id, home.stash = meta.turn, meta.next_id, meta.stash
-        home.topics, home.owed = dict.fromkeys(meta.topics), dict(meta.owed)
+        meta = newest
+        home.ledger.begin_after(meta)
+        home.topics, home.calls.owed = dict.fromkeys(meta.topics), dict(meta.owed)
         home.ties.replace(meta.ties)
         home.shapes.loaded(meta.kind, {name: map(as_shape, all_) for name, all_ in meta.shapes.items()})
         timers = {
@@ -229,11 +212,6 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
     for position, entry in saved.entries:
         _reload(home, position, entry, timers)
     home.ties.loaded()
-    for source in home.open.values():
-        home.bytes += len(source.body) + OVERHEAD
-    for turn in home.turns.values():
-        if turn.status != STASHED:
-            home.bytes += len(turn.input.body) + OVERHEAD
     for key, (name, body, left, interval) in timers.items():
         home.timers.start(key, name, body, max(0.0, left), interval)
     home.shapes.kind = home.shapes.kind or kind_in(home)
@@ -273,62 +251,34 @@ def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:
 
 
 def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved]) -> None:
-    """One journal entry, read again in order."""
+    """Take one journal entry up again, in order."""
     values: tuple[Any, ...] = entry
+    ledger = home.ledger
+    known = ledger.read_entry(position, values)
     match values:
-        case ("in", key, kind, name, body, when, sender, origin):
-            source = home.open[key] = Input(key, kind, name, body, when, sender)
-            source.origin = origin
-            source.positions = [position]
-            home.next_id = max(home.next_id, key + 1)
+        case ("in", _, kind, _, body, _, _, origin):
             if kind == TICK and origin in timers and not timers[origin][3]:
                 del timers[origin]
             if kind in (EXIT, DOWN):
                 told = msgspec.msgpack.decode(body)
                 if not told.get("recovering"):
                     home.ties.over(told.get("verb", "link"), told["source"])
-            if kind == PIPE and origin:
-                turn, k = map(int, origin.split("."))
-                home.pipes_done.setdefault(turn, set()).add(k)
-        case ("end", turn, key, status, digests, *more):
-            if key not in home.open:
-                return
-            past = home.turns[turn] = Turn(home.open[key], status, list(digests), *more)
-            home.positions_of(turn).append(position)
-            past.input.turn = home.turn = turn
-            home.partial, home.partial_id = [], -1
-            if status != STASHED:
-                del home.open[key]
-        case ("out", turn, key, digests):
-            home.positions_of(turn).append(position)
-            if turn > home.turn:
-                home.partial, home.partial_id = list(digests), key
-        case ("got", turn, k, kind, name, body):
-            home.positions_of(turn).append(position)
-            home.calls.outcomes[turn, k] = Answer(kind, name, body)
-        case ("drop", key):
-            dropped = home.open.pop(key, None)
-            home.dropped += ([] if dropped is None else dropped.positions, [position])
-        case ("tried", key, count):
-            if key in home.open:
-                home.open[key].deliveries = count
-                home.open[key].positions.append(position)
         case ("shape", name, shape):
-            home.dropped.append([position])  # The next snapshot keeps it.
+            ledger.drop([position])  # The next snapshot keeps it.
             home.shapes.read(name, as_shape(shape))
         case ("tie", turn, verb, path):
-            home.positions_of(turn).append(position)
+            ledger.positions_of(turn).append(position)
             home.ties.turn(verb, path)
         case ("later", turn, key):
-            home.positions_of(turn).append(position)
-            source = home.turns[turn].input
+            ledger.positions_of(turn).append(position)
+            source = ledger.turns[turn].input
             if source.sender is not None:
-                home.owed[key] = (source.sender, source.origin)
+                home.calls.owed[key] = (source.sender, source.origin)
         case ("replied", turn, key):
-            home.positions_of(turn).append(position)
-            home.owed.pop(key, None)
+            ledger.positions_of(turn).append(position)
+            home.calls.owed.pop(key, None)
         case ("op", turn, verb, key, name, body, seconds, interval, *when):
-            home.positions_of(turn).append(position)
+            ledger.positions_of(turn).append(position)
             match verb:
                 case "timer":
                     timers[key] = (name, body, seconds - elapsed(home, *when or (0.0,)), interval)
@@ -340,4 +290,5 @@ def _reload(home: Switch, position: int, entry: Entry, timers: dict[str, Saved])
                 case _:
                     home.topics.pop(key, None)
         case _:
-            raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")
+            if not known:
+                raise HoldfastError(f"{home.path}: journal entry {position} is of an unknown kind {entry[0]!r}")

@@ -34,7 +34,7 @@ def retry_after(failures: int, interval: float) -> float:
     return min(max(FIRST_RETRY * 2.0 ** min(failures - 1, 20), min(interval, LONGEST_RETRY)), LONGEST_RETRY)
 
 
-class Due:
+class SnapshotSchedule:
     """What one home knows of its next snapshot."""
 
     def __init__(self, home: Switch) -> None:
@@ -50,7 +50,7 @@ class Due:
     def count(self, turn: int) -> None:
         """A turn has ended, of an actor that is saved every so many of them."""
         every = self._home.method.every
-        if every is not None and turn - self._home.state_turn >= every and not self.is_wanted:
+        if every is not None and turn - self._home.ledger.state_turn >= every and not self.is_wanted:
             self.want()
 
     def want(self) -> None:
@@ -64,10 +64,10 @@ class Due:
         future: asyncio.Future[None] = home.node.loop.create_future()
         if not home.method.snapshots:
             future.set_exception(CheckpointFailed(home.path, f"{home.method.name} takes no snapshots"))
-        elif home.turn <= home.state_turn:
+        elif home.ledger.turn <= home.ledger.state_turn:
             future.set_result(None)
         else:
-            self.wishes.append((home.turn, future))
+            self.wishes.append((home.ledger.turn, future))
             self.on_want(home)
         return future
 
@@ -114,7 +114,7 @@ class Due:
     def when(self, now: float) -> float | None:
         """When to ask for a snapshot: now if that has passed; None: nothing is to be saved, or one is on its way."""
         home = self._home
-        if home.port is None or not home.is_released or home.turn <= home.state_turn:
+        if home.life.port is None or not home.life.is_released or home.ledger.turn <= home.ledger.state_turn:
             return None
         if home.images.is_saving or (self.asked_at >= 0 and now - self.asked_at < home.method.interval):
             return None

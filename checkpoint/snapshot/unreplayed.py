@@ -12,8 +12,7 @@ import msgspec
 
 from ...actors.errors import AskFailed
 from ...actors.events import TurnsLost
-from ..inputs import OVERHEAD
-from ..protocol import OK, START, STASHED
+from ..protocol import OK, START
 from .snapshot_record import FORMAT, Meta, go_back
 
 if TYPE_CHECKING:
@@ -30,27 +29,19 @@ def forget_turns(home: Switch) -> None:
     Raises:
         HoldfastError: the store refused.
     """
-    home.ends.undo_begun(LOST)
-    if home.turn == home.state_turn:
+    home.undo_begun(LOST)
+    ledger = home.ledger
+    if ledger.turn == ledger.state_turn:
         return
-    count = sum(turn.status == OK and turn.input.kind != START for turn in home.turns.values())
-    for number, turn in home.turns.items():
-        source = turn.input
-        known = home.positions.pop(number, [])  # Perhaps they stand nowhere yet.
-        if home.journal.durable:
-            home.dropped.append(known)
-            if source.id not in home.open:  # Else it was put aside, and waits again.
-                home.dropped.append(source.positions)
-        if turn.status != STASHED:
-            home.bytes -= len(source.body) + OVERHEAD
-        ask = home.later.pop(source.id, None)
+    count = sum(turn.status == OK and turn.input.kind != START for turn in ledger.turns.values())
+    for number in list(ledger.turns):
+        ask = home.calls.later.pop(ledger.give_up(number).input.id, None)
         if ask is not None:  # The handle with which it would have been answered is gone with the state.
             ask.fail(AskFailed(home.path, LOST))
-    home.turns.clear()
-    home.pipes_done.clear()
-    home.calls.outcomes.clear()
-    meta = home.newest or Meta(FORMAT, home.turn, 0, [], {}, [], 0, b"")
-    home.newest = msgspec.structs.replace(meta, turn=home.turn)
+    ledger.pipes_done.clear()
+    ledger.outcomes.clear()
+    meta = ledger.newest or Meta(FORMAT, ledger.turn, 0, [], {}, [], 0, b"")
+    ledger.newest = msgspec.structs.replace(meta, turn=ledger.turn)
     go_back(home, meta)
     if count and home.node.watched:
         home.node.emit(TurnsLost(home.path, count, meta.base))

@@ -41,7 +41,7 @@ _ENTRY: Final = struct.Struct("<QQQII")  # position, address, chain, crc, length
 _CRC: Final = struct.Struct("<I")
 
 
-class Sealed(Exception):
+class LogSealed(Exception):
     """Somebody else owns the store now: nothing is acknowledged.
 
     Nothing was written either, except that a new owner that reads at this very moment may have seen it.
@@ -164,7 +164,7 @@ class FrontLog:
             raise NoRoom(errno.ENOSPC, os.strerror(errno.ENOSPC))  # The next one is written over it.
         if file.seal.at[0]:  # The file is still ours alone to write to: a new owner makes files of its own.
             os.pwrite(file.fd, bytes(len(self._head) + _RECORD.size), at)
-            raise Sealed
+            raise LogSealed
         self._at, self._crc, self._head = at + size, crc, b""
         self.size += size
         self.rows += rows

@@ -79,8 +79,8 @@ class SqliteJournal:
     def _finish(self) -> None:
         """Finish what an earlier owner began."""
         store = self._store
-        while store.erased:
-            self._finish_erase(store.erased.pop())
+        while store.contents.erased:
+            self._finish_erase(store.contents.erased.pop())
         store.files.remove_all_but(
             {name for (name,) in store.db.execute("SELECT file FROM snapshots WHERE file NOT NULL")}
         )
@@ -114,9 +114,9 @@ class SqliteJournal:
                 store.write_log(rows)
                 return [row[0] for row in rows]
             with store.transaction(size) as db:
-                first = store.last + 1
+                first = store.contents.last + 1
                 db.executemany(INSERT, self._rows(entries, packed))
-                return list(range(first, store.last + 1))
+                return list(range(first, store.contents.last + 1))
 
     def sync(self) -> None:
         """Have everything appended so far survive a power loss; see `Journal`. Appends go on meanwhile.
@@ -134,7 +134,7 @@ class SqliteJournal:
         """Give each entry its position and its place in its chain."""
         rows: list[Row] = []
         place, crc32 = PLACE.pack, zlib.crc32  # `row_crc`, but this is done for every message
-        position, address = self._store.last, entries[0][0]
+        position, address = self._store.contents.last, entries[0][0]
         chain = self._store.chain(address)
         for (where, entry), data in zip(entries, packed, strict=True):
             if where != address:
@@ -144,8 +144,8 @@ class SqliteJournal:
             chain.positions.append(position)
             key = chain.id
             rows.append((position, key, number, entry[0], data, crc32(data, crc32(place(position, key, number)))))
-        self._store.last = position
-        self._store.live += len(rows)
+        self._store.contents.last = position
+        self._store.contents.live += len(rows)
         return rows
 
     def cut(self, address: str, snapshot: bytes, drop: Sequence[int] | range, *, turn: int, keep: int = 2) -> None:
@@ -161,7 +161,7 @@ class SqliteJournal:
         try:
             with self._store.transaction(len(data or b""), note=True) as db:
                 chain = self._store.chain(address)
-                last = self._store.last  # A position that is yet to come is none that the address has.
+                last = self._store.contents.last  # A position that is yet to come is none that the address has.
                 drops = pack_positions([position for position in drop if position <= last])
                 row = (chain.id, turn, self.epoch, drops, file, digest, data)
                 number = db.execute("INSERT INTO snapshots VALUES (NULL, ?, ?, ?, ?, ?, ?, ?)", row).lastrowid
@@ -274,7 +274,7 @@ class SqliteJournal:
         chain.positions[low:high] = array("q", (position for position in window if position not in doomed))
         chain.removed += number
         chain.removed_sum = (chain.removed_sum + (total or 0)) % MODULUS
-        self._store.live -= number
+        self._store.contents.live -= number
 
     def _delete_snapshots(self, db: sqlite3.Connection, numbers: Sequence[int]) -> list[str]:
         """Delete the rows; return the files to be removed once that is committed."""
@@ -301,12 +301,12 @@ class SqliteJournal:
         """Forget everything about the address; see `Journal`."""
         with self._store.lock:
             self._store.refresh()
-            if address not in self._store.chains:
+            if address not in self._store.contents.chains:
                 self.forget_blocks(address, ())  # of a snapshot that was never cut
                 return
             with self._store.transaction(note=True) as db:
                 # From here on it is gone; if we die before the rest is done, the next opening does it.
-                chain = self._store.chains.pop(address)
+                chain = self._store.contents.chains.pop(address)
                 chain.path = None
                 chain.write(db)
         self._finish_erase(chain)
@@ -348,7 +348,7 @@ class SqliteJournal:
         """Every address that has something stored, sorted."""
         with self._store.lock:
             self._store.refresh()
-            return sorted(self._store.chains)
+            return sorted(self._store.contents.chains)
 
     def together(self) -> AbstractContextManager[None]:
         """Have all that is written meanwhile be kept completely, or not at all; see `Journal`."""
@@ -359,19 +359,19 @@ class SqliteJournal:
         """Keep a small named fact; see `Journal`."""
         with self._store.transaction(len(value or b""), note=True) as db:
             db.execute("DELETE FROM notes WHERE name = ?", (key,))
-            self._store.notes.pop(key, None)
+            self._store.contents.notes.pop(key, None)
             if value is not None:
                 db.execute("INSERT INTO notes VALUES (NULL, ?, ?, ?)", (key, value, crc_of(key, value)))
-                self._store.notes[key] = value
+                self._store.contents.notes[key] = value
 
     def noted(self, key: str) -> bytes | None:
         """The fact of that name, or `None`."""
         with self._store.lock:
             self._store.refresh()
-            return self._store.notes.get(key)
+            return self._store.contents.notes.get(key)
 
     def notes(self, prefix: str) -> dict[str, bytes]:
         """All facts whose keys begin so; see `Journal`."""
         with self._store.lock:
             self._store.refresh()
-            return {key: value for key, value in self._store.notes.items() if key.startswith(prefix)}
+            return {key: value for key, value in self._store.contents.notes.items() if key.startswith(prefix)}

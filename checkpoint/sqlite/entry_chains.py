@@ -49,7 +49,7 @@ def create_chain(db: sqlite3.Connection, address: str) -> Chain:
 
 
 @dataclass(slots=True)
-class Contents:
+class StoreContents:
     """What the file holds, apart from entries and snapshots themselves."""
 
     chains: dict[str, Chain]  # by address
@@ -59,13 +59,13 @@ class Contents:
     live: int  # rows in `entries`
 
 
-class Scan:
+class StoreScan:
     """One look at the whole file."""
 
     def __init__(self, db: sqlite3.Connection, path: str) -> None:
         self._db, self._path = db, path
 
-    def contents(self) -> Contents:
+    def contents(self) -> StoreContents:
         """Find where each address has its entries, and verify that none is missing.
 
         Raises:
@@ -82,7 +82,7 @@ class Scan:
             raise DamagedStore(self._path, None, None, reason)
         known = {chain.path: chain for chain in chains.values() if chain.path is not None}
         erased = [chain for chain in chains.values() if chain.path is None]
-        return Contents(known, erased, self._notes(), last, total)
+        return StoreContents(known, erased, self._notes(), last, total)
 
     def _addresses(self) -> dict[int, Chain]:
         chains: dict[int, Chain] = {}

@@ -22,7 +22,7 @@ _PAGE: Final = mmap.PAGESIZE
 _HEAD: Final = 16
 
 
-class Hands:
+class InputsInHand:
     """The inputs in hand of the store at `path`; open from `open` to `close`."""
 
     def __init__(self, path: str) -> None:

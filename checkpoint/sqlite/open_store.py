@@ -10,16 +10,16 @@ import uuid
 from array import array
 from collections.abc import Generator, Sequence
 from time import monotonic
-from typing import Final
+from typing import Final, NamedTuple
 
 from ...actors.errors import HoldfastError
 from ..journal import DamagedStore, Entry, StaleEpoch, StoreFailed
-from .append_log import FrontLog, NoRoom, Row, Sealed
+from .append_log import FrontLog, LogSealed, NoRoom, Row
 from .database import VERSION, VERSION_WITH_LOG, connect, create_database, result_code
-from .entry_chains import Chain, Scan, create_chain
-from .in_hand import Hands
-from .ownership import Claim
-from .position_mark import Mark
+from .entry_chains import Chain, StoreContents, StoreScan, create_chain
+from .in_hand import InputsInHand
+from .ownership import StoreClaim
+from .position_mark import PositionMark
 from .snapshot_files import SnapshotFiles, sync
 from .store_parts import Parts
 
@@ -30,16 +30,46 @@ LOOK_SECONDS: Final = 0.05
 _WAL_FRAMES: Final = 16384  # 64 MiB; beyond it a checkpoint may hold up the writers
 
 
+class Joint(NamedTuple):
+    """A transaction that others join, and the files to be removed behind it."""
+
+    db: sqlite3.Connection
+    doomed: list[str]
+
+
+class WalSync:
+    """The syncs of the WAL: one at a time, and only when something was committed since the last one."""
+
+    def __init__(self, path: str) -> None:
+        self._path, self._fd = path, -1
+        self.is_unsynced = True
+        self.lock = threading.Lock()
+
+    def begin(self) -> bool:
+        """Whether there is anything to sync; from now on what is committed is for the next one."""
+        if self._fd < 0:  # It has no locks: to close it later drops none.
+            self._fd = os.open(self._path, os.O_RDONLY | os.O_CLOEXEC)
+        is_unsynced, self.is_unsynced = self.is_unsynced, False
+        return is_unsynced
+
+    def sync(self) -> None:
+        """Bring it to the disk. Raises OSError."""
+        os.fdatasync(self._fd)
+
+    def close(self) -> None:
+        """Close it, if it was ever synced."""
+        if self._fd >= 0:
+            fd, self._fd = self._fd, -1
+            os.close(fd)
+
+
 class Store:
     """One process's hold on a store, from `opening` to `close`.
 
     Attributes:
         lock: guards the writing connection and all that memory says of the file; it may be taken again by its holder.
         read_lock: guards the reading connection.
-        chains: by address.
-        erased: chains whose erase an earlier owner began and did not finish.
-        last: newest position handed out.
-        live: rows in `entries`, and in the log in front of it.
+        contents: what the file holds, and the log in front of it.
         log: rows that are not in the database yet. Each transaction brings them there.
         in_doubt: whether memory may be behind or ahead of the file.
         failure: why everything is refused from now on.
@@ -50,23 +80,17 @@ class Store:
         self.files = SnapshotFiles(path)
         self.parts = Parts(path, (self.files.folder, f"{path}-log", f"{path}-packs"))
         self.lock = threading.RLock()
-        self._joint: sqlite3.Connection | None = None  # of the transaction that others join
-        self._doomed: list[str] = []  # files to be removed behind it
+        self._joint: Joint | None = None
         self.read_lock = threading.Lock()
-        self.chains: dict[str, Chain] = {}
-        self.notes: dict[str, bytes] = {}
-        self.erased: list[Chain] = []
-        self.last = self.live = 0
+        self.contents = StoreContents({}, [], {}, 0, 0)
         self.failure: HoldfastError | None = None
         self.log = FrontLog(path, is_used=not fsync)
         self._fsync = fsync
         self._look_at = 0.0
-        self._mark = Mark(path)
-        self.hands = Hands(path)
+        self._mark = PositionMark(path)
+        self.hands = InputsInHand(path)
         self.in_doubt = False
-        self._wal = -1  # a descriptor of the WAL, once somebody has it synced
-        self._is_unsynced = True  # Was anything committed since the last sync?
-        self._sync_lock = threading.Lock()
+        self._wal = WalSync(f"{path}-wal")
         self._unsaved_bytes = 0  # written to the WAL since the last checkpoint, roughly
         self._checkpointer: threading.Thread | None = None
 
@@ -112,7 +136,7 @@ class Store:
         if os.path.getsize(self.path) == 0:  # SQLite would take it for a new database
             raise DamagedStore(self.path, None, None, "the file is empty")
         self.db, self.reader = connect(self.path), connect(self.path)
-        self.claim = Claim(self.db, self.parts)
+        self.claim = StoreClaim(self.db, self.parts)
 
     def _configure(self) -> None:
         self.db.execute(f"PRAGMA synchronous = {'FULL' if self._fsync else 'NORMAL'}")
@@ -120,18 +144,16 @@ class Store:
 
     def _scan(self) -> None:
         """Take into memory what is in the file."""
-        found = Scan(self.db, self.path).contents()
-        self.chains, self.erased, self.notes = found.chains, found.erased, found.notes
-        self.last, self.live, self.in_doubt = found.last, found.live, False
+        self.contents, self.in_doubt = StoreScan(self.db, self.path).contents(), False
         rows = self.log.rows
-        if rows and rows[0][0] <= self.last:  # It was only broken off when all was done.
+        if rows and rows[0][0] <= self.contents.last:  # It was only broken off when all was done.
             self.log.restart()
         elif rows:
             self._take_in(rows)
 
     def _take_in(self, rows: Sequence[Row]) -> None:
         """Take into memory what is in the log."""
-        chains = {chain.id: chain for chain in self.chains.values()}
+        chains = {chain.id: chain for chain in self.contents.chains.values()}
         for position, key, number, *_ in rows:
             chain = chains.get(key)
             if chain is None:
@@ -140,8 +162,8 @@ class Store:
                 chain.damage = DamagedStore(self.path, chain.path, position, "entries are missing")
             chain.last = number
             chain.positions.append(position)
-        self.last = rows[-1][0]
-        self.live += len(rows)
+        self.contents.last = rows[-1][0]
+        self.contents.live += len(rows)
 
     def _begin_log(self) -> None:
         """Bring into the database what earlier owners have left in their logs, and begin one of our own."""
@@ -159,12 +181,12 @@ class Store:
         stale, left = (log.left(), []) if version == VERSION else ([], log.left())
         rows: list[Row] = []
         for batch in log.read(left):
-            if batch[0][0] == self.last + 1:
+            if batch[0][0] == self.contents.last + 1:
                 self._take_in(batch)
                 rows += batch
-            elif batch[-1][0] > self.last:
+            elif batch[-1][0] > self.contents.last:
                 break  # A power loss has taken what was before it: the mark knows whether it may be missing.
-        self._mark.check(self.last, synced=self._fsync)
+        self._mark.check(self.contents.last, synced=self._fsync)
         if stale:
             log.remove(stale)
         log.rows = rows
@@ -213,7 +235,7 @@ class Store:
             if clean:
                 db.executemany(INSERT, self.log.rows)
                 db.execute(f"PRAGMA user_version = {VERSION}")
-                self.claim.write(self.last, self.live)
+                self.claim.write(self.contents.last, self.contents.live)
             db.execute("COMMIT")
         if clean:
             self._mark.remove()
@@ -226,9 +248,7 @@ class Store:
         self.log.close(remove=False)
         self.hands.close(remove=False)
         self.parts.close()
-        if self._wal >= 0:
-            wal, self._wal = self._wal, -1
-            os.close(wal)
+        self._wal.close()
         for db in (self.reader, self.db):
             with contextlib.suppress(sqlite3.Error):
                 db.close()
@@ -244,7 +264,7 @@ class Store:
         """
         with self.lock:
             if self._joint is not None:  # Of the thread that has the lock.
-                yield self._joint
+                yield self._joint.db
                 return
             self.refresh()
             db, log = self.db, self.log
@@ -259,15 +279,15 @@ class Store:
                     db.executemany(INSERT, log.rows)
                 yield db
                 if note:
-                    self.last += 1
-                    self.claim.write(self.last, self.live)
+                    self.contents.last += 1
+                    self.claim.write(self.contents.last, self.contents.live)
                 db.execute("COMMIT")
-                self._is_unsynced = True
+                self._wal.is_unsynced = True
                 if log.is_due:
                     self._unsaved_bytes += log.size
                     log.restart()
                 self.in_doubt = False
-                self._mark.set(self.last)
+                self._mark.set(self.contents.last)
             except BaseException as error:
                 if db.in_transaction:
                     with contextlib.suppress(sqlite3.Error):
@@ -285,7 +305,7 @@ class Store:
         doomed: list[str] = []
         with self.lock:
             with self.transaction(note=True) as db:
-                self._joint, self._doomed = db, doomed
+                self._joint = Joint(db, doomed)
                 try:
                     yield
                 finally:
@@ -300,7 +320,7 @@ class Store:
         if monotonic() >= self._look_at:
             self._look()
         for address, _ in entries:
-            chain = self.chains.get(address)
+            chain = self.contents.chains.get(address)
             if chain is None or chain.damage is not None:
                 return False
         return True
@@ -313,13 +333,13 @@ class Store:
         """
         try:
             self.log.write(rows)
-        except Sealed as error:
+        except LogSealed as error:
             (current,) = self.db.execute("SELECT epoch FROM store").fetchone()
             raise StaleEpoch(self.path, self.claim.epoch, current) from error
         except OSError as error:
             raise self.translate(error) from error
         self.in_doubt = False
-        self._mark.set(self.last)
+        self._mark.set(self.contents.last)
 
     def sync(self) -> None:
         """Bring what was appended and committed so far to the disk.
@@ -327,16 +347,14 @@ class Store:
         Without the lock while the disk works: the WAL only grows, or begins again when all of it is in the synced
         database; and its file stays the same for as long as somebody has it open.
         """
-        with self._sync_lock:
+        with self._wal.lock:
             with self.lock:
                 self.refuse_failed()
-                last, is_unsynced, self._is_unsynced = self.last, self._is_unsynced, False
+                last, is_unsynced = self.contents.last, self._wal.begin()
                 files, kept = self.log.promise(), self.log.kept()
-                if self._wal < 0:  # It has no locks: to close it later drops none.
-                    self._wal = os.open(f"{self.path}-wal", os.O_RDONLY | os.O_CLOEXEC)
             try:
                 if is_unsynced:
-                    os.fdatasync(self._wal)
+                    self._wal.sync()
                 self.log.sync(files)
             except OSError as error:
                 with self.lock:
@@ -367,7 +385,7 @@ class Store:
         if not names:
             return
         if self._joint is not None:  # Until that is committed, rows name them.
-            self._doomed += names
+            self._joint.doomed.extend(names)
             return
         self.sync_rows()
         try:
@@ -437,9 +455,9 @@ class Store:
         Raises:
             DamagedStore: the chain is damaged.
         """
-        chain = self.chains.get(address)
+        chain = self.contents.chains.get(address)
         if chain is None:
-            chain = self.chains[address] = create_chain(self.db, address)
+            chain = self.contents.chains[address] = create_chain(self.db, address)
         elif chain.damage is not None:
             raise DamagedStore(*chain.damage.args)
         return chain
@@ -455,7 +473,7 @@ class Store:
             self.refresh()
             db.execute("BEGIN")
             (current,) = db.execute("SELECT epoch FROM store").fetchone()
-            chain = self.chains.get(address)
+            chain = self.contents.chains.get(address)
             view = None if chain is None else (chain, chain.positions[:], chain.kept[:])
         try:
             if current != self.claim.epoch:

@@ -31,7 +31,7 @@ class StoreRow(NamedTuple):
     live: int
 
 
-class Claim:
+class StoreClaim:
     """Our claim to be the owner of the store, made through one connection."""
 
     def __init__(self, db: sqlite3.Connection, parts: Parts) -> None:

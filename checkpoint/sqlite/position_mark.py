@@ -20,7 +20,7 @@ _MARK: Final = struct.Struct("=Q?36s")  # last acknowledged position, synced at 
 _SYNCED: Final = struct.Struct("=Q")  # behind it: the last position that was synced
 
 
-class Mark:
+class PositionMark:
     """The mark of the store at `path`; open from `check` to `close`."""
 
     def __init__(self, path: str) -> None:

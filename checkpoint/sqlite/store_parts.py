@@ -37,7 +37,7 @@ _HALF_MADE: Final = re.compile(r"new-\d+-\d+(-wal|-shm|-journal)?")
 _WORD: Final = "holdfast-store "
 
 
-class Identity(NamedTuple):
+class StoreIdentity(NamedTuple):
     """Which store it is; `is_pending` while not all folders are known to carry it."""
 
     id: str
@@ -174,13 +174,13 @@ class Parts:
             )
         self.compare(both)
 
-    def _query(self, options: str) -> Identity | None:
+    def _query(self, options: str) -> StoreIdentity | None:
         with contextlib.closing(sqlite3.connect(f"file:{quote(self.path)}{options}", uri=True, timeout=1.0)) as db:
             return identity_of(db, self.path)
 
     # ---- opening
 
-    def compare(self, identity: Identity | None) -> None:
+    def compare(self, identity: StoreIdentity | None) -> None:
         """Refuse folders that are not of the database's store.
 
         Raises:
@@ -277,7 +277,7 @@ class Parts:
         return ""
 
     def close(self) -> None:
-        """Give the lock back."""
+        """Give the lock on the store back."""
         if self._lock >= 0:
             fd, self._lock = self._lock, -1
             os.close(fd)
@@ -287,7 +287,7 @@ class Parts:
         return ForeignStore(self.path, part, problem, remedy)
 
 
-def identity_of(db: sqlite3.Connection, path: str) -> Identity | None:
+def identity_of(db: sqlite3.Connection, path: str) -> StoreIdentity | None:
     """The identity that the database has; None if it is of before there were any.
 
     Raises:
@@ -298,7 +298,7 @@ def identity_of(db: sqlite3.Connection, path: str) -> Identity | None:
         return None
     if not isinstance(row[0], bytes) or len(row[0]) != 17 or row[1] != crc_of(NOTE, row[0]):
         raise DamagedStore(path, None, None, "the identity of the store is damaged")
-    return Identity(str(uuid.UUID(bytes=row[0][1:])), row[0][:1] == _PENDING)
+    return StoreIdentity(str(uuid.UUID(bytes=row[0][1:])), row[0][:1] == _PENDING)
 
 
 def _write(db: sqlite3.Connection, value: bytes, crc: int) -> None:

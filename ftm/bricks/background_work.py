@@ -21,7 +21,7 @@ class Background:
 
     def note(self, turn: int, outs: list[Out]) -> None:
         """A turn has begun some."""
-        done = self._group.switch.pipes_done.get(turn, ())
+        done = self._group.switch.ledger.pipes_done.get(turn, ())
         self._out.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
 
     def back(self, record: PipeDone) -> bool:

@@ -227,7 +227,7 @@ class Group(Members):
         `careful`: a replica has died with a batch inside; if that was the fault of one of its messages, it will be
         seen which one.
         """
-        begun = self.switch.partial_id if self.switch.partial else -1
+        begun = self.switch.ledger.begun if self.switch.ledger.released else -1
         if careful and self.out is not None:
             self.careful = {one.feed.id for one in self.out.requests if one.feed.id in self.ledger}
         left = [feed for feed in self.ledger.values() if not self.is_live or feed.id in self.switch.open]
@@ -382,7 +382,7 @@ class Group(Members):
     def _is_known(self, turn: int, number: int) -> bool:
         """Whether this input was handled in this turn, as far as the home knows it."""
         past = self.switch.turns.get(turn)
-        return past.input.id == number if past is not None else number in self.switch.stashed()
+        return past.input.id == number if past is not None else number in self.switch.ledger.stashed()
 
     def _is_behind(self, turn: int) -> None:
         """Whoever leads has handled something in a turn in which the home knows something else to be handled.
@@ -411,7 +411,7 @@ class Group(Members):
             self.ledger.pop(end.id, None)
             if end.id in switch.open:
                 batch = Batch()
-                switch.ends.without_turn(switch.open[end.id], end.answer, batch)
+                switch.end_without_turn(switch.open[end.id], end.answer, batch)
                 batch.commit(switch.journal)
             return
         if self.is_live and (end.turn <= switch.turn or end.id not in switch.open):

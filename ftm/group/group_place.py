@@ -280,7 +280,7 @@ class GroupPlace(Place):
         """There was no mechanism before."""
         change = Reconfiguration(group, self.config, self.layers, REST_WITHIN)
         self._put_on_probation(cell, group, NOTHING, change)
-        group.copy = group.switch.newest
+        group.copy = group.switch.ledger.newest
 
     def _probation_over(self, probation: Probation) -> None:
         if self.probation is probation:
@@ -406,13 +406,14 @@ class GroupPlace(Place):
         protocol = group.protocol(first)
         try:
             pieces = switch.restore_records()
-            if not pieces and switch.state_turn >= 0:
+            if not pieces and switch.ledger.state_turn >= 0:
                 pieces = [Restore(b"")]  # It begins afresh, but its turns are counted on.
             traps = traps or any(piece.traps for piece in pieces)
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
                 await protocol.ask(
-                    Install(group.epoch, switch.state_turn, piece.data, switch.stash, is_last, [], traps), LED_WITHIN
+                    Install(group.epoch, switch.ledger.state_turn, piece.data, switch.ledger.stash, is_last, [], traps),
+                    LED_WITHIN,
                 )
             await protocol.ask(Lead(group.epoch, group.config), LED_WITHIN)
         except HoldfastError as error:
@@ -449,10 +450,8 @@ class GroupPlace(Place):
             cell.node.codec.decode_error(end.answer.kind, end.answer.name, end.answer.body) if end.answer.kind else ""
         )
         switch = self.home.switch
-        if switch is not None and switch.live is not None and not switch.live.done():
-            switch.live.set_exception(
-                StartFailed(cell.path, f"on_start raised {error}" if error else "on_start raised")
-            )
+        if switch is not None:
+            switch.life.fail(StartFailed(cell.path, f"on_start raised {error}" if error else "on_start raised"))
 
     # -- ending -----------------------------------------------------------------------------------------------------
 
@@ -471,9 +470,8 @@ class GroupPlace(Place):
                 reason = one.more.reason
         if self._starting is not None and not self._starting.done() and not group.is_live:
             switch = self.home.switch
-            if switch is not None and switch.live is not None and not switch.live.done():
-                switch.live.set_exception(StartFailed(cell.path, group.why))
-                switch.live.exception()  # Nobody may look: the start may have failed before it waited.
+            if switch is not None:
+                switch.life.fail(StartFailed(cell.path, group.why))
             return
         self._begin_end(cell, reason, suspect)
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Final
 
 from ...actors.errors import HoldfastError
+from ...checkpoint.home.disposal import put_into_quarantine
 from ...checkpoint.protocol import FAILED
 from ..bricks.replica_orders import Computes, Doing, EndTurn, Stalled
 from ..events import TurnHung
@@ -94,7 +95,7 @@ class Stuck:
         source = self._group.switch.open.get(end.id)
         if source is None or end.status != FAILED:
             return False
-        self._group.switch.ends.quarantine(source)
+        put_into_quarantine(self._group.switch, source)
         return True
 
 

@@ -46,31 +46,28 @@ class TransientHome(JournalHome):
 
 def forget_ended(switch: Switch) -> None:
     """Forget all ended turns of an actor that would begin afresh."""
-    put(switch, meta_now(switch, switch.turn, sorted(switch.stashed() & switch.open.keys())), 1)
+    put(switch, meta_now(switch, switch.turn, sorted(switch.ledger.stashed() & switch.open.keys())), 1)
 
 
 def begin_afresh(switch: Switch) -> None:
     """Between two lives of an actor that is not recorded: timers, subscriptions and the stash end with a life."""
-    if switch.newest is None and not switch.turns:
+    if switch.ledger.newest is None and not switch.turns:
         return
     forget_ended(switch)
-    assert switch.newest is not None
-    newest = switch.newest
-    switch.newest = type(newest)(
-        newest.format, switch.turn, newest.next_id, [], {}, [], newest.epoch, b"", switch.turn
-    )  # fmt: skip
-    switch.stash = []
+    newest = switch.ledger.newest
+    assert newest is not None
+    switch.ledger.begin_with(
+        type(newest)(newest.format, switch.turn, newest.next_id, [], {}, [], newest.epoch, b"", switch.turn)
+    )
     switch.timers.replace({})
     switch.topics.clear()
 
 
 def begin_again(switch: Switch, copy: Meta) -> bool:
     """Between two lives of an actor whose mechanism was not trusted: whether it begins with the copy of its state."""
-    return switch.newest is copy and copy.turn == switch.turn
+    return switch.ledger.newest is copy and copy.turn == switch.turn
 
 
 def forget_later(switch: Switch, why: str) -> None:
     """Replies that the ended life owed will not come."""
-    for ask in switch.later.values():
-        ask.fail(AskFailed(switch.path, why))
-    switch.later.clear()
+    switch.calls.renounce(AskFailed(switch.path, why))

@@ -115,9 +115,7 @@ class ToGroup(Entering):
             source = switch.record(MESSAGE, message_name(type(message)), body, origin)
             if isinstance(item, Ask):
                 source.ask, source.chain = item, item.chain
-        switch.turn = 0
-        switch.newest = meta_now(switch, 0, list(switch.open), luggage.data)
-        switch.stash = list(switch.open)
+        switch.ledger.begin_after(meta_now(switch, 0, list(switch.open), luggage.data))
 
     def _failed(self, live: asyncio.Future[float]) -> None:
         error = None if live.cancelled() else live.exception()
@@ -137,7 +135,7 @@ class ToGroup(Entering):
         """What waits for an actor that had no home waits there."""
         cell, more, luggage, switch = self.cell, self.cell.extra(), self.move.luggage, self._switch
         bound, topics, waiting = luggage.bound, list(more.topics), luggage.waiting
-        switch.later.update(luggage.owed)
+        switch.calls.later.update(luggage.owed)
         if bound is not None:
             waiting, bound.waiting = list(bound.waiting), deque()
         for index, (name, body, left, interval, queued) in enumerate(luggage.rest["timers"]):
@@ -190,8 +188,7 @@ class ToGroup(Entering):
         if self._recorded is None:
             switch = self._switch
             switch.timers.replace({})
-            if switch.live is not None and not switch.live.done():
-                switch.live.cancel()
+            switch.life.abandon()
 
 
 class FromRecordedGroup(Leaving):
@@ -304,7 +301,7 @@ class FromGroup(FromRecordedGroup):
         self._stash: list[int] = []
 
     async def collect(self, epoch: int, end: float) -> None:
-        group, luggage, owed = self._group, self.move.luggage, self._switch.later
+        group, luggage, owed = self._group, self.move.luggage, self._switch.calls.later
         primary = group.primary
         if primary is not None:
             ask = group.protocol(primary).ask(Export(epoch, EXPORTED_WITHIN), EXPORTED_WITHIN)
@@ -333,14 +330,14 @@ class FromGroup(FromRecordedGroup):
                 luggage.queue.append(arrived(cell, source.kind, source.body))
             else:
                 assert source.kind == START
-        homed, switch.bound = switch.bound, None
+        homed, switch.intake.bound = switch.intake.bound, None
         if homed is not None and homed.capacity:
             luggage.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
         luggage.waiting = [ask for ask, _, _, _ in getattr(homed, "waiting", ())]
         luggage.timers = [list(timer) for timer in switch.timers.saved().values()]
-        luggage.owed = dict(switch.later)
+        luggage.owed = dict(switch.calls.later)
         switch.open.clear()
-        switch.later.clear()
+        switch.calls.later.clear()
         switch.timers.replace({})
         self._homed = homed
         self._home.homes.released(cell.path)

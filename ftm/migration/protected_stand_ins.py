@@ -168,7 +168,7 @@ class RecordedChild:
         other.life -= 1  # Counted up by the life that begins; it is no other one.
         other.extra().start, other.extra().bindings = start, cell.extra().bindings
         life = Life(other, port, recovery, guest.page[slot : slot + 1], may_fork=True)
-        life.begins_suspended = told["is_suspended"]
+        life.stage.begins_suspended = told["is_suspended"]
         self._arriving = Arriving(child_here(guest, recovery), other, life, number)
 
         def ended_early(done: asyncio.Future[ExitReason]) -> None:

@@ -331,7 +331,12 @@ class ToRecordedSubtree(IntoSubtree):
         port = RemoteLife(cell.path, self.worker)
         for record in switch.restore_records():
             port.to_life(record)
-        told = {"number": parent.number, "turn": switch.state_turn, "stash": switch.stash, "slot": parent.slot}
+        told = {
+            "number": parent.number,
+            "turn": switch.ledger.state_turn,
+            "stash": switch.ledger.stash,
+            "slot": parent.slot,
+        }
         move.say_now(self.worker, "come", is_suspended=move.luggage.suspended, **told)
         switch.attach(port)
         beginning.follow(live)
@@ -367,7 +372,7 @@ class ToSubtree(IntoSubtree):
         self.parent.arriving = self._said
         move.hear(self.worker, self._heard)
         assert self._from.switch is not None
-        owed = [number for number, ask in self._from.switch.later.items() if not ask.is_done]
+        owed = [number for number, ask in self._from.switch.calls.later.items() if not ask.is_done]
         move.say_now(self.worker, "come", state=luggage.data, traps=luggage.traps, owed=owed)
         await move.within(self._up, move.timeout, lambda: "its new life was not up")
 

@@ -95,7 +95,7 @@ class Server(Reports):
             return
         self.life = None
         self.note_work(life)
-        if not self._is_stopping and self._failed is None and reason.is_clean and life.ignored_why is None:
+        if not self._is_stopping and self._failed is None and reason.is_clean and life.stage.ignored_why is None:
             self.is_over = True
             self.tell_more(Closed(0, pack_exit(reason), False))
         self.at_rest(ENDED)

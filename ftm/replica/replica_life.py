@@ -52,7 +52,7 @@ class ServerLife(Life):
         super().__init__(cell, server, method, None)
         self.server = server
         self.ended: Feed | None = None  # what the last turn has handled
-        self.saves = server.has_access
+        self.saving.is_needed = server.has_access
 
     def _context(self, cell: Cell) -> RecordedContext:
         made = self._context_made = ServerContext(cell, self.server.address)

@@ -390,7 +390,7 @@ class Points(lifecycle.HerePlace):
                 actor.get_delta()
             self.marks = []
             self.point = State(life.turn, data, [], stash, returned, life.is_live)
-        ids = () if life.is_live else sorted(life._stashed_ids)
+        ids = () if life.is_live else sorted(life.restored.stash_ids)
         self.point.traps = life.cell.extra().trap_exits
         self.point.stash_ids = [key for key in ids if all(fed.feed.id != key for fed in life.stash)]
         self._point_names = None

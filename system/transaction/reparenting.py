@@ -166,18 +166,19 @@ WAITING = "recorded actors may have to repeat what they sent to it: their snapsh
 
 def is_unsettled(switch: Switch) -> bool:
     """Whether what it has sent may be sent again, to be compared."""
-    return bool(switch.partial) or any(turn.digests for turn in switch.turns.values())
+    return switch.ledger.has_sent
 
 
 def is_saved(switch: Switch) -> bool:
     """Whether a replay would compare nothing: all that it has done is in its snapshot."""
     compared = any(turn.digests or turn.reply or turn.state for turn in switch.turns.values())
-    return not (compared or switch.partial or switch.images.is_saving)
+    return not (compared or switch.ledger.released or switch.images.is_saving)
 
 
 def settle_senders(homes: Iterable[Switch], asked: dict[Switch, int]) -> None:
     """Have recorded actors take a snapshot, so that no replay sends to an address of before; each turn once."""
     for switch in homes:
-        if is_unsettled(switch) and asked.get(switch) != switch.turn and switch.port is not None and switch.is_released:
+        life = switch.life
+        if is_unsettled(switch) and asked.get(switch) != switch.turn and life.port is not None and life.is_released:
             asked[switch] = switch.turn
-            switch.port.to_life(SnapshotNow(urgent=True))  # also if it is suspended
+            life.port.to_life(SnapshotNow(urgent=True))  # also if it is suspended

@@ -143,7 +143,7 @@ class Rework:
         if start is None:
             return
         if switch is not None:
-            switch.becomes = start  # Its snapshot is of the new class.
+            switch.arrival.becomes = start  # Its snapshot is of the new class.
         if not lives_here(cell):
             self._known_as(cell, start)
 
@@ -169,7 +169,7 @@ class Rework:
     def _over(self, cell: Cell) -> None:
         switch = switch_of(cell)
         if switch is not None:
-            switch.becomes = None
+            switch.arrival.becomes = None
         self._let_go()
 
     async def finish(self, system: ActorSystem) -> None:
@@ -178,15 +178,15 @@ class Rework:
             return
         cell = self._place.living(system.node)
         switch = switch_of(cell)
-        before = 0 if switch is None else len(switch.unsaved)
+        before = 0 if switch is None else len(switch.arrival.unsaved)
         try:
             await asyncio.shield(self._concluded)
         except (AskFailed, ActorStopped, NotSuspended):
             # That life has ended, as any may: the next one has what its home keeps, and begins as its spec says.
             if self._held == (cell, cell.life) and cell.host.is_up(cell):
                 raise
-        if switch is not None and len(switch.unsaved) > before:
-            problem = f"the new state could not be saved ({switch.unsaved[-1]})"
+        if switch is not None and len(switch.arrival.unsaved) > before:
+            problem = f"the new state could not be saved ({switch.arrival.unsaved[-1]})"
             raise ControlFailed(cell.path, "replace_state", problem)
 
     async def release(self, system: ActorSystem) -> None:

@@ -71,4 +71,4 @@ def actor_of(ref: hf.ActorRef[Any]) -> Any:
 async def snapshot_after(system: hf.ActorSystem, ref: hf.ActorRef[Any], turn: int) -> None:
     """Wait until a snapshot covers this turn."""
     switch = ref._cell.host.home.switch  # type: ignore[attr-defined]
-    await until(lambda: switch.state_turn >= turn)
+    await until(lambda: switch.ledger.state_turn >= turn)

@@ -143,7 +143,7 @@ async def test_who_waits_for_room_is_released_when_the_supervisor_has_ended(tmp_
         await until(gate.exists)
         ref.tell(Note("queued"))
         sending = asyncio.ensure_future(ref.send(Note("late")))
-        await until(lambda: bool(home(ref).bound.senders))
+        await until(lambda: bool(home(ref).intake.bound.senders))
         team.kill()
         with pytest.raises(hf.ActorStopped):
             await asyncio.wait_for(sending, 60.0)

@@ -375,13 +375,13 @@ async def test_a_snapshot_has_timers_and_topics_that_have_not_taken_effect_yet(
         home = system.homes.at(doer.path)
         assert home is not None
         await until(lambda home=home: home.turn == 1)
-        assert home.port is not None
+        assert home.life.port is not None
         assert home.timers.saved() == {}
-        home.port.to_life(SnapshotNow())
-        await until(lambda home=home: home.newest is not None and home.newest.turn == 1)
-        assert home.newest is not None
-        assert [name.rpartition(":")[2] for name, *_ in home.newest.timers.values()] == ["Tick"]
-        assert home.newest.topics == ["/news"]
+        home.life.port.to_life(SnapshotNow())
+        await until(lambda home=home: home.ledger.newest is not None and home.ledger.newest.turn == 1)
+        assert home.ledger.newest is not None
+        assert [name.rpartition(":")[2] for name, *_ in home.ledger.newest.timers.values()] == ["Tick"]
+        assert home.ledger.newest.topics == ["/news"]
         engine.let_sync.set()
     async with hf.ActorSystem("app", log=False, store=f"sqlite:{tmp_path / 'app.db'}") as system:
         doer = await system.start(hf.child("doer", hf.start(Doer), recovery=recovery))

@@ -77,7 +77,7 @@ async def test_tells_beyond_the_capacity(
             letters = [one.message.text for one in stream.take() if isinstance(one, hf.DeadLetter)]
             if store is not None:  # What a root would find that is started now.
                 home: Any = ref._cell.host.home.switch  # type: ignore[attr-defined]
-                stored = Switch(system.node, ref.path, hf.hybrid(), system.homes.journal)
+                stored = Switch(system.homes, ref._cell, hf.hybrid(), system.homes.journal)
                 assert list(stored.open) == list(home.open), "drops are journaled"
             await held.let_go(system)
             told = await event(stream, hf.HeldMessages)
@@ -152,7 +152,7 @@ async def test_a_send_from_a_recorded_turn_waits_too(isolation: str) -> None:
         ref, sender = await doer(system, isolation, held=hf.held(2)), await doer(system, "task", "sender")
         await held.strike(system, ref)
         sent = sender.ask(Do(["send a", "send b", "add done"], ref), timeout=30.0)
-        await until(lambda: ref._cell.host.home.switch.backlog(-1) >= 2)  # type: ignore[attr-defined]
+        await until(lambda: ref._cell.host.home.switch.ledger.backlog(-1) >= 2)  # type: ignore[attr-defined]
         assert not sent.done()
         await held.let_go(system)
         await sent
@@ -242,7 +242,7 @@ async def test_a_bounded_mailbox_keeps_its_own_rule_as_well(isolation: str) -> N
         with pytest.raises(hf.MailboxFull):
             ref.tell(Note("3"))
         await held.let_go(system)
-        await until(lambda: ref._cell.host.home.switch.backlog(-1) == 0)  # type: ignore[attr-defined]
+        await until(lambda: ref._cell.host.home.switch.ledger.backlog(-1) == 0)  # type: ignore[attr-defined]
         ref.tell(Note("4"))
         assert await ref.ask(Seen(), timeout=30.0) == ["1", "2", "4"]
 
@@ -292,7 +292,7 @@ async def test_nothing_of_a_dead_or_replaying_life_gets_out(
         let_through(Path(f"{gate}x"))
         await held.let_go(system)
         await unfinished
-        await until(lambda: ref._cell.host.home.switch.backlog(-1) == 0)  # type: ignore[attr-defined]
+        await until(lambda: ref._cell.host.home.switch.ledger.backlog(-1) == 0)  # type: ignore[attr-defined]
         assert await notes.ask(Notes()) == ["one", "two", "three", "four", "five"]
         while len(seen := await ref.ask(Seen(), timeout=30.0)) < 2:
             await asyncio.sleep(0.002)  # The background work was begun anew.

@@ -26,7 +26,7 @@ async def test_each_phase_is_told_of_once_with_its_time(store: str | None, isola
         await robot.ask(Note("one"))
         with system.events() as stream:
             strike(system, robot)
-            await until(lambda: robot._cell.life == 2 and robot._cell.host.home.switch.is_released)  # type: ignore[attr-defined]
+            await until(lambda: robot._cell.life == 2 and robot._cell.host.home.switch.life.is_released)  # type: ignore[attr-defined]
             await over(system)
             events = stream.take()
     told = [one for one in events if isinstance(one, hf.RecoveryPhase)]
@@ -43,7 +43,7 @@ async def test_hooks_are_called_in_order_and_the_recovery_waits_for_them(isolati
 
     def note(step: hf.RecoveryStep) -> None:
         called.append((step.when, step.phase))
-        released.append(robot._cell.host.home.switch.is_released)  # type: ignore[attr-defined]
+        released.append(robot._cell.host.home.switch.life.is_released)  # type: ignore[attr-defined]
 
     async def note_later(step: hf.RecoveryStep) -> None:
         await asyncio.sleep(0.01)

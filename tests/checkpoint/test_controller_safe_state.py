@@ -287,7 +287,7 @@ async def test_the_phases_of_a_recovery_with_safe_state(isolation: str) -> None:
         with system.events() as stream:
             strike(system, robot)
             await event(stream, hf.SafeStateEntered)
-            await until(lambda: robot._cell.host.home.switch.is_released)  # type: ignore[attr-defined]
+            await until(lambda: robot._cell.host.home.switch.life.is_released)  # type: ignore[attr-defined]
             await over(system)
             told = phases(stream.take(), robot.path)
         assert told == [(1, phase) for phase in ("safe_state", "isolate", "restart", "restore", "replay", "release")]

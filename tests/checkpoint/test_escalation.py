@@ -42,7 +42,7 @@ async def test_the_second_time_an_older_snapshot_comes_back_and_only_to_whom_it_
         await add(system, "mine", name="other")
         assert await rolled_back(system, isolation) == []
         assert await seen(system) == ["a", "b", "c"]
-        await until(lambda: at(system)._cell.host.home.switch.state_turn >= 4)  # type: ignore[attr-defined]
+        await until(lambda: at(system)._cell.host.home.switch.ledger.state_turn >= 4)  # type: ignore[attr-defined]
         (event,) = await rolled_back(system, isolation)
         assert await seen(system) == ["a", "b"]
         assert event.address == "/app/top/doer"

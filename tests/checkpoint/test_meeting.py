@@ -208,7 +208,7 @@ async def test_the_answer_to_an_ask_of_an_erased_life_is_not_taken_for_one_of_th
         let_through(gate)
         assert await peer.ask(Seen(), timeout=20.0) == ["old"]
         switch = at(system)._cell.host.home.switch  # type: ignore[attr-defined]
-        assert switch.calls.outcomes == {}
+        assert switch.ledger.outcomes == {}
         assert "got" not in {entry[0] for _, entry in switch.journal.load(switch.path).entries}
         await at(system).ask(Do(["ask new"], peer), timeout=20.0)
         assert await seen(system) == ["new:2"]

@@ -56,9 +56,9 @@ async def snapshot(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
 
     switch = home(ref)
     turn = switch.turn
-    switch.port.to_life(SnapshotNow())
+    switch.life.port.to_life(SnapshotNow())
     if switch.method.snapshots:
-        await until(lambda: switch.state_turn >= turn)
+        await until(lambda: switch.ledger.state_turn >= turn)
 
 
 async def doer(system: hf.ActorSystem, isolation: str, name: str) -> hf.ActorRef[Doer]:

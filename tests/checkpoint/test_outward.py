@@ -61,7 +61,7 @@ async def test_what_a_killed_life_says_while_it_is_cancelled_does_not_count(
         await until(gate.exists)
         for life in (2, 3):
             ref.kill()
-            await until(lambda n=life: ref._cell.life == n and ref._cell.host.home.switch.is_released)  # type: ignore[attr-defined]
+            await until(lambda n=life: ref._cell.life == n and ref._cell.host.home.switch.life.is_released)  # type: ignore[attr-defined]
         Path(f"{gate}.open").touch()
         assert await ref.ask(Seen(), timeout=30.0) == ["done"]
         assert await notes.ask(Notes()) == ["before", "after"]

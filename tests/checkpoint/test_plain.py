@@ -136,7 +136,7 @@ async def test_chosen_methods_by_fields_or_with_the_whole_message(isolation: str
         ref.tell(Turn(90))
         assert await ref.ask(Move(3, 2.0)) == 6.0
         switch = home(ref)
-        await until(lambda: switch.state_turn >= 2)
+        await until(lambda: switch.ledger.state_turn >= 2)
         strike(system, ref)
         assert await ref.ask(Move(0, 0.0), timeout=30.0) == 6.0
 

@@ -144,7 +144,7 @@ async def test_an_ask_between_two_recorded_actors_survives_both(
             strike(system, victim)
         for victim, life in lives.items():
             cell: Any = victim._cell
-            await until(lambda c=cell, n=life: c.life > n and c.host.home.switch.is_released)
+            await until(lambda c=cell, n=life: c.life > n and c.host.home.switch.life.is_released)
     let_through(gate)
     await busy
     assert await answer == "2"

@@ -179,8 +179,8 @@ async def test_snapshots_are_taken_while_turns_are_in_flight_and_cut_the_journal
     switch: Any = ref._cell.host.home.switch  # type: ignore[attr-defined]
     await snapshot_after(system, ref, switch.turn)
     assert not switch.turns
-    assert not switch.calls.outcomes
-    assert switch.bytes == 0
+    assert not switch.ledger.outcomes
+    assert switch.ledger.journal_bytes == 0
 
 
 async def test_a_snapshot_that_fails_is_told_and_tried_again(system: hf.ActorSystem, isolation: str) -> None:

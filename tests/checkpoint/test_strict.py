@@ -150,10 +150,10 @@ async def test_what_comes_from_the_context_and_what_is_not_the_turns_own_is_let_
 
 LAZY = """
 import sys, holdfast as hf, numpy
-from holdfast.checkpoint.life.determinism_guard import Guard, NotDeterministic
+from holdfast.checkpoint.life.determinism_guard import DeterminismGuard, NotDeterministic
 assert "numpy.random" not in sys.modules
 try:
-    Guard().call(lambda: numpy.random.rand())
+    DeterminismGuard().call(lambda: numpy.random.rand())
 except NotDeterministic:
     print("caught")
 """

@@ -62,7 +62,7 @@ def busy(system: hf.ActorSystem, isolation: str, gate: Path) -> Busy:
 
 def bound_of(ref: hf.ActorRef[Any]) -> Bound | HomeBound:
     home = switch_of(ref._cell)
-    bound: Any = home.bound if home is not None else ref._cell.extra().bound
+    bound: Any = home.intake.bound if home is not None else ref._cell.extra().bound
     assert bound is not None
     return bound
 

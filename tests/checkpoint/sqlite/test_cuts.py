@@ -21,7 +21,7 @@ from holdfast.checkpoint.journal import DamagedStore, Entry, StoreFailed
 from holdfast.checkpoint.sqlite import SqliteJournal
 from holdfast.checkpoint.sqlite import open_store as sqlite_store
 from holdfast.checkpoint.sqlite.entry_chains import Chain
-from holdfast.checkpoint.sqlite.ownership import Claim
+from holdfast.checkpoint.sqlite.ownership import StoreClaim
 from tests.checkpoint.sqlite.stores import A, B, disown, edit, inputs, made, numbers, reopened
 
 
@@ -94,7 +94,7 @@ def test_many_interleaved_entries_are_dropped(path: Path) -> None:
         journal.cut(A, b"2", [], turn=2)
         assert [position for position, _ in journal.load(A).entries] == mine[-1:]
         assert len(journal.load(B).entries) == 1667
-        assert journal._store.live == 1668
+        assert journal._store.contents.live == 1668
     assert numbers(reopened(path)) == [4999]
 
 
@@ -312,7 +312,7 @@ def test_a_checkpoint_that_leaves_a_long_wal_is_done_again_while_no_writer_goes_
 
 def test_a_broken_off_transaction_leaves_no_trace(store: SqliteJournal, monkeypatch: pytest.MonkeyPatch) -> None:
     positions = store.append(inputs(2))
-    for interrupted in (Chain, Claim):
+    for interrupted in (Chain, StoreClaim):
         with monkeypatch.context() as patch:
             patch.setattr(interrupted, "write", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
             with pytest.raises(KeyboardInterrupt):

@@ -1,0 +1,138 @@
+"""Which submission waits for what: two lanes, each in order, as data and decisions."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from ..actors.errors import HoldfastError
+    from .journal import Entry
+
+
+class Submission(Protocol):
+    """What is to be written, and what follows."""
+
+    @property
+    def entries(self) -> Sequence[tuple[str, Entry]]:
+        """What is written, by address."""
+        ...
+
+    def written(self, positions: Sequence[int]) -> None:
+        """It stands there in the journal."""
+        ...
+
+    def safe(self) -> None:
+        """Let it take effect: it is as safe as it has to be."""
+        ...
+
+    def refused(self, error: HoldfastError) -> bool:
+        """It was not written. False: it has happened, and must be written when that is possible again."""
+        ...
+
+    def abandoned(self, error: HoldfastError) -> None:
+        """It has happened, and will never be written: who waits for it is told."""
+        ...
+
+
+@dataclasses.dataclass(slots=True)
+class CommitLanes:
+    """What was submitted, from its submission to its effect.
+
+    Attributes:
+        synced_paths: homes that want what they submit to be synced.
+        quick_paths: homes that want less than that.
+        last_slow: the last submission of a home in the slow lane.
+        pending: what is not written, each with its number in the slow lane; 0: it is in the quick one.
+        is_urgent: whether something among it need not be synced.
+        unsynced: what is written and waits for a sync, with its number.
+        ready: what is as safe as it has to be, and has not taken effect yet.
+        submitted, written, synced: numbers in the slow lane, up to which this is so.
+    """
+
+    synced_paths: set[str] = dataclasses.field(default_factory=set)
+    quick_paths: set[str] = dataclasses.field(default_factory=set)
+    last_slow: dict[str, int] = dataclasses.field(default_factory=dict)
+    pending: list[tuple[Submission, int]] = dataclasses.field(default_factory=list)
+    is_urgent: bool = False
+    unsynced: deque[tuple[int, Submission]] = dataclasses.field(default_factory=deque)
+    ready: deque[Submission] = dataclasses.field(default_factory=deque)
+    submitted: int = 0
+    written: int = 0
+    synced: int = 0
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether everything that was submitted has taken effect."""
+        return not (self.pending or self.unsynced or self.ready)
+
+    def want(self, path: str, *, is_synced: bool) -> None:
+        """Take down how safe what a home submits has to be."""
+        self.synced_paths.discard(path)
+        self.quick_paths.discard(path)
+        (self.synced_paths if is_synced else self.quick_paths).add(path)
+
+    def rename(self, paths: Mapping[str, str]) -> None:
+        """Take down that homes have other addresses."""
+        self.synced_paths = {paths.get(path, path) for path in self.synced_paths}
+        self.quick_paths = {paths.get(path, path) for path in self.quick_paths}
+        self.last_slow = {paths.get(path, path): number for path, number in self.last_slow.items()}
+
+    def _is_slow(self, submission: Submission) -> bool:
+        if not self.quick_paths:
+            return True
+        paths, synced = self.synced_paths, self.synced
+        return any(path in paths or self.last_slow.get(path, 0) > synced for path, _ in submission.entries)
+
+    def submit(self, submission: Submission) -> None:
+        """Put a submission in its lane: whoever has something in the slow one stays there with all that follows."""
+        number = 0
+        if self.synced_paths and self._is_slow(submission):
+            self.submitted = number = self.submitted + 1
+            if self.quick_paths:
+                for path, _ in submission.entries:
+                    self.last_slow[path] = number
+        else:
+            self.is_urgent = True
+        self.pending.append((submission, number))
+
+    def take_written(self, count: int, positions: Sequence[int]) -> None:
+        """The first ones stand in the journal, each entry at its position: what need not be synced is ready."""
+        done = self.pending[:count]
+        del self.pending[:count]
+        self.is_urgent = any(not number for _, number in self.pending)
+        begin = 0
+        for submission, number in done:
+            end = begin + len(submission.entries)
+            submission.written(positions[begin:end])
+            begin = end
+            if number:
+                self.written = number
+                self.unsynced.append((number, submission))
+            else:
+                self.ready.append(submission)
+
+    def take_synced(self, number: int) -> None:
+        """All up to this number has outlived the machine: it is ready."""
+        self.synced = number
+        while self.unsynced and self.unsynced[0][0] <= number:
+            self.ready.append(self.unsynced.popleft()[1])
+        if not self.unsynced and not self.pending:
+            self.last_slow.clear()
+
+    def refuse(self, error: HoldfastError) -> None:
+        """Refuse what is not written and can be refused; the rest stays, in front of what comes meanwhile."""
+        pending, self.pending = self.pending, []
+        kept = [(submission, number) for submission, number in pending if not submission.refused(error)]
+        self.pending = [*kept, *self.pending]
+
+    def abandon(self, error: HoldfastError) -> None:
+        """Give up all that is not safe: it will never take effect."""
+        waiting = [*(submission for _, submission in self.unsynced), *(submission for submission, _ in self.pending)]
+        self.unsynced.clear()
+        self.pending = []
+        for submission in waiting:
+            if not submission.refused(error):
+                submission.abandoned(error)

@@ -1,0 +1,370 @@
+"""What one home has accepted and numbered, and what has become of it since the newest snapshot: data and decisions.
+
+Nothing here writes, sends, or reads a clock. The switch journals each change, and `read_entry` makes the same change
+from the journal's entry: a ledger that is read back equals the one that was lost.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+from ...actors.errors import DIVERGES, ReplayDiverged
+from ..inputs import NO_POSITIONS, OVERHEAD, Input, Turn
+from ..life.replay_guard import StateDiverged
+from ..protocol import DROPPED, FAILED, MESSAGE, OK, PIPE, START, STASHED, TICK, Answer, Out, TurnEnd, answer_digest
+
+if TYPE_CHECKING:
+    from ..journal import Entry
+    from ..snapshot.snapshot_record import Meta
+
+
+@dataclasses.dataclass(slots=True)
+class InputLedger:
+    """The inputs of one address, its turns, and where they stand in the journal.
+
+    Attributes:
+        path: the address.
+        next_id: the number of the next input.
+        open: inputs without an end, in admission order.
+        turn: the last ended turn; `on_start` is turn 0.
+        turns: the ended turns since the newest snapshot, by number.
+        begun: the input of the turn after `turn`, if it has released outputs.
+        released: digests of those outputs.
+        outcomes: of the asks that these turns have made, by (turn, output).
+        pipes_done: the background work of these turns that has its result, by turn.
+        journal_bytes: what is counted against the journal's limit.
+        newest: the snapshot that the next life begins with.
+        older: the one before it, if the store does not have it.
+        stash: inputs that had been put aside when the newest snapshot was made.
+        positions: in the journal, of what belongs to a turn besides its input.
+        dropped: the same of what the next snapshot need not be followed by.
+    """
+
+    path: str
+    next_id: int = 0
+    open: dict[int, Input] = dataclasses.field(default_factory=dict)
+    turn: int = -1
+    turns: dict[int, Turn] = dataclasses.field(default_factory=dict)
+    begun: int = -1
+    released: list[int] = dataclasses.field(default_factory=list)
+    outcomes: dict[tuple[int, int], Answer] = dataclasses.field(default_factory=dict)
+    pipes_done: dict[int, set[int]] = dataclasses.field(default_factory=dict)
+    journal_bytes: int = 0
+    newest: Meta | None = None
+    older: Meta | None = None
+    stash: list[int] = dataclasses.field(default_factory=list)
+    positions: dict[int, list[int]] = dataclasses.field(default_factory=dict)
+    dropped: list[list[int]] = dataclasses.field(default_factory=list)
+
+    # -- what there is ----------------------------------------------------------------------------------------------
+
+    @property
+    def has_state(self) -> bool:
+        """Whether there is a state to begin with."""
+        return self.newest is not None and self.newest.has_state
+
+    @property
+    def state_turn(self) -> int:
+        """The turn that the next life begins after, apart from what is replayed to it; -1: none."""
+        return self.newest.turn if self.newest is not None else -1
+
+    @property
+    def is_new(self) -> bool:
+        """Whether nothing was ever handled here, or all of it was undone."""
+        return self.turn == self.state_turn and not self.has_state
+
+    @property
+    def has_sent(self) -> bool:
+        """Whether a turn since the newest snapshot has sent anything."""
+        return bool(self.released) or any(turn.digests for turn in self.turns.values())
+
+    def stashed(self) -> set[int]:
+        """The inputs that the actor has put aside."""
+        return {turn.input.id for turn in self.turns.values() if turn.status == STASHED} | set(self.stash)
+
+    def handled_and_open(self) -> Iterator[Input]:
+        """The inputs of the turns since the newest snapshot, then those without an end."""
+        yield from (turn.input for turn in self.turns.values())
+        yield from self.open.values()
+
+    def start(self) -> Input | None:
+        """The start of the actor, if it has not ended."""
+        return next((source for source in self.open.values() if source.kind == START), None)
+
+    def backlog(self, running: int) -> int:
+        """Messages and ticks that wait; `running` is the input in hand, -1 if none."""
+        return sum(source.kind in (MESSAGE, TICK) and source.id != running for source in self.open.values())
+
+    def waiting(self) -> list[Input]:
+        """What a life that has caught up is fed: the input of the turn that has begun to send, then the others."""
+        stashed = self.stashed()
+        waiting = [one for one in self.open.values() if one.kind != START and one.id not in stashed and not one.held]
+        waiting.sort(key=lambda one: one.id != self.begun)
+        return waiting
+
+    def replayed(self, left_out: Collection[int]) -> list[tuple[int, Turn]]:
+        """The turns that a new life handles again, in order: failed ones have left nothing behind."""
+        return [
+            (number, turn)
+            for number, turn in self.turns.items()
+            if turn.status in (OK, STASHED) and number not in left_out
+        ]
+
+    def ended_in_the_stash(self) -> tuple[int, ...]:
+        """Inputs that are put aside under replay, though they have ended since."""
+        stashed = (turn.input.id for turn in self.turns.values() if turn.status == STASHED)
+        return tuple(key for key in stashed if key not in self.open)
+
+    def is_touched_since(self, digests: set[int]) -> bool:
+        """Whether a turn behind the newest snapshot has sent one of these."""
+        turns = (turn.digests for number, turn in self.turns.items() if number > self.state_turn)
+        return bool(digests) and not all(digests.isdisjoint(known) for known in (*turns, self.released))
+
+    # -- admission --------------------------------------------------------------------------------------------------
+
+    def admit(self, kind: str, name: str, body: bytes, time: float, sender: str | None, origin: str = "") -> Input:
+        """Number an input, which is open from now on."""
+        key = self.next_id
+        self.next_id = key + 1
+        source = self.open[key] = Input(key, kind, name, body, time, sender)
+        if origin:
+            source.origin = origin
+        self.journal_bytes += len(body) + OVERHEAD
+        return source
+
+    def withdraw(self, source: Input) -> bool:
+        """End an input without a turn; False if it has ended already."""
+        if self.open.pop(source.id, None) is None:
+            return False
+        self.journal_bytes -= source.size
+        return True
+
+    def admit_result(self, turn: int, k: int) -> bool:
+        """Whether the result of background work, output (turn, k), is the first one: only that is an input."""
+        done = self.pipes_done.setdefault(turn, set())
+        is_first = k not in done
+        done.add(k)
+        return is_first
+
+    # -- turns ------------------------------------------------------------------------------------------------------
+
+    def compare_outputs(self, turn: int, key: int, outs: Sequence[Out], is_rebound: Callable[[Out, int], bool]) -> int:
+        """How many of these outputs had left before; the others are taken down as released.
+
+        Args:
+            turn: that has sent them.
+            key: its input.
+            outs: in program order.
+            is_rebound: whether an output differs from the one of a digest only in where a binding leads.
+
+        Raises:
+            ReplayDiverged: they are not what had left.
+        """
+        is_ended = turn <= self.turn
+        if is_ended:
+            past = self.turns.get(turn)
+            known = past.digests if past is not None else []
+        elif self.begun != key:
+            if self.released:
+                raise ReplayDiverged(self.path, turn, 1)
+            self.begun, known = key, self.released
+        else:
+            known = self.released
+        count, again = len(known), 0
+        for out in outs:
+            if out.k > count:
+                if is_ended:
+                    raise ReplayDiverged(self.path, turn, out.k)
+                known.append(out.digest())
+            elif known[out.k - 1] != out.digest() and not is_rebound(out, known[out.k - 1]):
+                raise ReplayDiverged(self.path, turn, out.k)
+            else:
+                again += 1
+        return again
+
+    def end_turn(self, source: Input, number: int, status: str, state: int = 0, reply: int = 0) -> Turn:
+        """End a turn, with the outputs that it has released."""
+        turn = self.turns[number] = Turn(source, status, self.released, state, reply)
+        self.released, self.begun = [], -1
+        self.turn = source.turn = number
+        source.deliveries = 0
+        if status != STASHED:
+            del self.open[source.id]
+        return turn
+
+    def judge_replay(self, end: TurnEnd, seen: int, explain: Callable[[Answer], str]) -> None:
+        """Compare a turn that was handled again with what it was before; `seen` of its outputs have come again.
+
+        Raises:
+            ReplayDiverged: it has ended otherwise.
+        """
+        number, past = end.turn, self.turns.get(end.turn)
+        if end.status == FAILED and past is not None and past.input.kind == START and past.status != FAILED:
+            return  # It has not become anything else: its start failed, and will be tried again.
+        if past is not None and end.status in (FAILED, DROPPED) and end.status != past.status:
+            what = "handling it again raised" if end.status == FAILED else "it cannot be handled any more:"
+            hint = DIVERGES if end.status == FAILED else "the class has been changed since; what is recorded stays"
+            name, error = past.input.name or past.input.kind, explain(end.answer)
+            cause = f"{name} was handled well before the crash; {what} {error} ({hint})"
+            raise ReplayDiverged(self.path, number, seen + 1, cause)
+        if past is None or seen != len(past.digests) or end.status != past.status:
+            raise ReplayDiverged(self.path, number, seen + 1)
+        if end.state != past.state and end.state and past.state:
+            raise StateDiverged(self.path, number, past.input.name or past.input.kind)
+        if past.reply and past.reply != answer_digest(end.answer):
+            cause = f"the reply to {past.input.name} is not what it was before the crash; {DIVERGES}"
+            raise ReplayDiverged(self.path, number, seen + 1, cause)
+
+    def note_outcome(self, turn: int, k: int, answer: Answer) -> bool:
+        """Keep the outcome of the ask that was output (turn, k); False if no replay will want it."""
+        if turn <= self.state_turn:
+            return False
+        self.outcomes[turn, k] = answer
+        return True
+
+    # -- deaths -----------------------------------------------------------------------------------------------------
+
+    def blamed(self, running: int) -> Input | None:
+        """The input that a death in its turn counts against: a start is its supervisor's business."""
+        source = self.open.get(running)
+        return None if source is None or source.kind == START else source
+
+    def count_death(self, running: int, *, is_ordered: bool, most: int) -> Input | None:
+        """Count the death of a life with this input in hand, if it was not ordered.
+
+        Returns:
+            The input, if it has died of it so often that it is to be put into quarantine.
+        """
+        if running in self.open:
+            self.open[running].was_cut = True
+        source = None if is_ordered else self.blamed(running)
+        if source is None:
+            return None
+        source.deliveries += 1
+        return source if source.deliveries >= most else None
+
+    def undo_begun(self) -> Input | None:
+        """Let the turn in hand begin anew, unless it has released something: then its input is returned."""
+        source = self.open.get(self.begun)
+        if source is None or not self.released:
+            self.released, self.begun = [], -1
+            return None
+        return source
+
+    # -- cuts -------------------------------------------------------------------------------------------------------
+
+    def positions_of(self, turn: int) -> list[int]:
+        """Where in the journal a turn's own entries stand."""
+        return self.positions.setdefault(turn, [])
+
+    def drop(self, *sinks: list[int]) -> None:
+        """Have the next snapshot cut what stands there, or will stand there when it is written."""
+        self.dropped += (sink for sink in sinks if sink is not NO_POSITIONS)
+
+    def contained_in(self, turn: int) -> list[int]:
+        """The positions that need not follow a snapshot of the state after `turn`."""
+        drop = [position for known in self.dropped for position in known]
+        for number, known in self.positions.items():  # Those of hooks are among them.
+            if number <= turn:
+                drop += known
+        # An image may be behind: what was stashed when it was begun may have been handled since.
+        later = {past.input.id for number, past in self.turns.items() if number > turn}
+        for number, past in self.turns.items():
+            source = past.input
+            if number <= turn and source.id not in self.open and source.id not in later:  # Else it is only stashed.
+                drop += source.positions
+        return drop
+
+    def begin_after(self, meta: Meta) -> None:
+        """Begin with a snapshot as the store has it; its entries follow."""
+        self.newest, self.stash, self.turn, self.next_id = meta, meta.stash, meta.turn, meta.next_id
+
+    def begin_with(self, meta: Meta) -> None:
+        """Have the next life begin with this snapshot, and forget the turns that it contains."""
+        self.dropped.clear()
+        self.newest, self.stash = meta, meta.stash
+        for number in [number for number in self.turns if number <= meta.turn]:
+            turn = self.turns.pop(number)
+            if turn.status != STASHED:
+                self.journal_bytes -= turn.input.size
+        for known in (self.positions, self.pipes_done):
+            for number in [number for number in known if number <= meta.turn]:
+                del known[number]
+        self._forget_outcomes(key for key in self.outcomes if key[0] <= meta.turn)
+
+    def give_up(self, number: int) -> Turn:
+        """Forget an ended turn that nothing will replay. (In a store it stays until the next snapshot.)"""
+        turn = self.turns.pop(number)
+        self.drop(self.positions.pop(number, NO_POSITIONS))  # Perhaps they stand nowhere yet.
+        if turn.input.id not in self.open:  # Else it was put aside, and waits again.
+            self.drop(turn.input.positions)
+        if turn.status != STASHED:
+            self.journal_bytes -= turn.input.size
+        self.pipes_done.pop(number, None)
+        self._forget_outcomes(key for key in self.outcomes if key[0] == number)
+        return turn
+
+    def _forget_outcomes(self, keys: Iterable[tuple[int, int]]) -> None:
+        for key in list(keys):
+            del self.outcomes[key]
+
+    # -- the journal ------------------------------------------------------------------------------------------------
+
+    def entries(self) -> list[Entry]:
+        """All of it behind the newest snapshot, as `read_entry` takes it."""
+        inputs = {source.id: source for source in self.handled_and_open()}
+        entries = [inputs[key].entry() for key in sorted(inputs)]
+        entries += [outcome_entry(turn, k, answer) for (turn, k), answer in sorted(self.outcomes.items())]
+        entries += [turn.entry(number) for number, turn in self.turns.items()]
+        if self.released:
+            entries.append(self.released_entry(self.turn + 1))
+        # What was put aside once may have ended in a turn that was given up.
+        ended = {turn.input.id for turn in self.turns.values() if turn.status != STASHED}
+        return entries + [("drop", key) for key in dict.fromkeys(self.ended_in_the_stash()) if key not in ended]
+
+    def released_entry(self, turn: int) -> Entry:
+        """What the journal has of a turn that has not ended."""
+        return "out", turn, self.begun, tuple(self.released)
+
+    def read_entry(self, position: int, entry: tuple[Any, ...]) -> bool:
+        """Take a journal entry up again, in order; False if it is of another kind."""
+        match entry:
+            case ("in", key, kind, name, body, when, sender, origin):
+                source = self.open[key] = Input(key, kind, name, body, when, sender)
+                source.origin, source.positions = origin, [position]
+                self.next_id = max(self.next_id, key + 1)
+                self.journal_bytes += source.size
+                if kind == PIPE and origin:
+                    turn, k = map(int, origin.split("."))
+                    self.admit_result(turn, k)
+            case ("end", turn, key, status, digests, *more):
+                if key in self.open:
+                    self.positions_of(turn).append(position)
+                    self.released = list(digests)
+                    self.end_turn(self.open[key], turn, status, *more)
+            case ("out", turn, key, digests):
+                self.positions_of(turn).append(position)
+                if turn > self.turn:
+                    self.released, self.begun = list(digests), key
+            case ("got", turn, k, kind, name, body):
+                self.positions_of(turn).append(position)
+                self.outcomes[turn, k] = Answer(kind, name, body)
+            case ("drop", key):
+                self.drop([position])
+                if key in self.open:
+                    self.drop(self.open[key].positions)
+                    self.withdraw(self.open[key])
+            case ("tried", key, count):
+                if key in self.open:
+                    self.open[key].deliveries = count
+                    self.open[key].positions.append(position)
+            case _:
+                return False
+        return True
+
+
+def outcome_entry(turn: int, k: int, answer: Answer) -> Entry:
+    """What the journal has of the outcome of an ask."""
+    return "got", turn, k, answer.kind, answer.name, answer.body

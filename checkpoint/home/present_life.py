@@ -1,0 +1,117 @@
+"""The life that runs now, as its home sees it: how far it has come, and whether what it says still counts."""
+
+from __future__ import annotations
+
+import asyncio
+import dataclasses
+import time
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ...actors.errors import ReplayDiverged
+    from ..protocol import LifePort
+
+
+@dataclasses.dataclass(slots=True)
+class PresentLife:
+    """What a home knows of the life that it has, or waits for.
+
+    Attributes:
+        port: the way to it; None between two lives.
+        live: ends when it has caught up, with the seconds its restore took.
+        live_at: when it had, on the machine's clock.
+        is_released: whether it gets what is new.
+        waits_for_release: whether somebody else says when it gets that.
+        is_kept_back: whether it waits for the others of its group.
+        replayed: how many turns it is to handle again.
+        diverged: why its replay has led elsewhere: nothing that it says counts.
+        is_void: whether a state was put in place from outside and could not be saved: nothing that it says counts.
+        seen_turn: the last turn that it has handled again.
+        seen_k: how many outputs of that turn have come again.
+    """
+
+    port: LifePort | None = None
+    live: asyncio.Future[float] | None = None
+    live_at: float = 0.0
+    is_released: bool = False
+    waits_for_release: bool = False
+    is_kept_back: bool = False
+    replayed: int = 0
+    diverged: ReplayDiverged | None = None
+    is_void: bool = False
+    seen_turn: int = -1
+    seen_k: int = 0
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether somebody waits for it to catch up."""
+        return self.live is not None and not self.live.done()
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it has caught up, even if somebody else says when it gets what is new."""
+        if not (self.waits_for_release or self.is_kept_back):
+            return self.is_released
+        return self.is_released or (self.port is not None and self.live is not None and self.live.done())
+
+    @property
+    def may_be_released(self) -> bool:
+        """Whether nobody else has a say in it, and those that it may send to are there."""
+        return not self.waits_for_release and not self.is_kept_back
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether it has caught up well, and does not get yet what is new."""
+        live = self.live
+        has_come_up = live is not None and live.done() and not live.cancelled() and live.exception() is None
+        return self.port is not None and has_come_up and not self.is_released
+
+    def expect(self, live: asyncio.Future[float]) -> None:
+        """Wait for the next life: it is held back until it has caught up."""
+        self.is_released = self.waits_for_release = self.is_void = False
+        self.replayed, self.diverged = 0, None
+        self.abandon()
+        self.live = live
+
+    def attach(self, port: LifePort) -> None:
+        """Begin the replay to it."""
+        self.port, self.seen_turn = port, -1
+
+    def come_up(self, restore_seconds: float) -> None:
+        """Tell whoever waits for it that it has caught up."""
+        self.live_at = time.monotonic()
+        if self.live is not None and not self.live.done():
+            self.live.set_result(restore_seconds)
+
+    def fail(self, error: Exception) -> bool:
+        """Tell whoever waits for it that it will not catch up; False if nobody does."""
+        if self.live is None or self.live.done():
+            return False
+        self.live.set_exception(error)
+        self.live.exception()  # Whoever waited may be gone.
+        return True
+
+    def abandon(self) -> None:
+        """Nobody waits for it any more."""
+        if self.live is not None and not self.live.done():
+            self.live.cancel()
+
+    def die(self) -> None:
+        """It is over: what comes is for the next one."""
+        self.port, self.is_released = None, False
+
+    def resume(self, port: LifePort | None) -> None:
+        """Go on with a life that was at rest, in the place of one that has not become the next one."""
+        self.abandon()
+        self.diverged, self.is_void = None, False
+        self.port, self.is_released = port, True
+
+    def see_again(self, turn: int, k: int) -> None:
+        """Take down that output `k` of a replayed turn has come again; 0: none."""
+        if self.seen_turn != turn:
+            self.seen_turn, self.seen_k = turn, 0
+        self.seen_k = k or self.seen_k
+
+    def seen_of(self, turn: int) -> int:
+        """How many outputs of a turn have come again."""
+        return self.seen_k if self.seen_turn == turn else 0

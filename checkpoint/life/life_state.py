@@ -1,0 +1,121 @@
+"""What a recorded life knows besides the turn in hand: what it began with, its timers, its snapshots and its end."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING
+
+from ..durable_timers import said_by
+
+if TYPE_CHECKING:
+    from ...actors.exit_reasons import ExitReason
+    from ...actors.kernel.envelope import Item
+    from ..protocol import Clock, Restore
+
+
+@dataclasses.dataclass(slots=True)
+class RestoredState:
+    """The state that a life begins with, as its home has sent it.
+
+    Attributes:
+        pieces: what is not put back yet.
+        has_state: whether there is one; else the actor begins afresh.
+        traps: whether the actor trapped exits.
+        variables: those that its class had when `__init__` had run.
+        stash_ids: inputs that had been put aside.
+        unstashes: whether those are to come again.
+        seconds: how long it took to put the state back.
+    """
+
+    pieces: list[bytes] = dataclasses.field(default_factory=list)
+    has_state: bool = False
+    traps: bool = False
+    variables: list[str] = dataclasses.field(default_factory=list)
+    stash_ids: frozenset[int] = frozenset()
+    unstashes: bool = False
+    seconds: float = 0.0
+
+    def take(self, record: Restore) -> None:
+        """Take one more piece of the state."""
+        self.has_state = True
+        self.traps = self.traps or record.traps
+        self.variables += record.variables
+        self.pieces.append(record.data)
+
+    def joined(self) -> bytes:
+        """The whole state; its pieces are given up."""
+        pieces, self.pieces = self.pieces, []
+        return b"".join(pieces)
+
+
+@dataclasses.dataclass(slots=True)
+class HookTimers:
+    """The timers of a life, as far as it has to know them.
+
+    Attributes:
+        running: those that run at home, as far as a hook has not said so.
+        cancelled: timers whose ticks may still be on their way.
+        named: how many timers of hooks say this, by its checksum.
+    """
+
+    running: dict[str, Clock] = dataclasses.field(default_factory=dict)
+    cancelled: set[str] = dataclasses.field(default_factory=set)
+    named: dict[str, int] = dataclasses.field(default_factory=dict)
+
+    def key_for(self, clock: Clock, where: str) -> str:
+        """The key of a timer that a hook wants. If one that runs says the same, it is that one.
+
+        So `on_start` may set its timers at each life. Another one is named by what it says: the next life that begins
+        at the same state gives it the same name, whatever else its hook does.
+
+        >>> timers = HookTimers({"3.1": ("Tick", b"", 1.0)})
+        >>> [timers.key_for(("Tick", b"", 1.0), "5start") for _ in range(2)]
+        ['3.1', '5starte37cb9c8.1']
+        """
+        known = next((key for key, other in self.running.items() if other == clock), None)
+        if known is not None:
+            del self.running[known]
+            return known
+        said = said_by(*clock)
+        self.named[said] = number = self.named.get(said, 0) + 1
+        return f"{where}{said}.{number}"
+
+
+@dataclasses.dataclass(slots=True)
+class SnapshotState:
+    """What a life knows of its snapshots.
+
+    Attributes:
+        is_needed: whether the actor's state must be one that can be saved.
+        turn: after which the last one was made; -1: none, -2: the last one was lost.
+        is_postponed: whether one is to be taken when background work has come back.
+        variables: of the actor, when `__init__` had run; none if it says itself what is saved.
+    """
+
+    is_needed: bool = True
+    turn: int = -1
+    is_postponed: bool = False
+    variables: list[str] = dataclasses.field(default_factory=list)
+
+
+@dataclasses.dataclass(slots=True)
+class LifeStage:
+    """What waits until a life is live, and how it is to end.
+
+    Attributes:
+        has_replayed: whether it has handled anything again.
+        begins_suspended: whether it is suspended when it is live.
+        postponed: orders from outside that wait until it is live.
+        stop_wanted: why it is to end when it is live.
+        is_cut_off: whether it ends by an EXIT that it does not trap.
+        ignored_why: why the actor does not want to be started.
+        is_over: whether it has ended.
+    """
+
+    has_replayed: bool = False
+    begins_suspended: bool = False
+    postponed: list[Item] = dataclasses.field(default_factory=list)
+    stop_wanted: ExitReason | None = None
+    is_cut_off: bool = False
+    ignored_why: str | None = None
+    is_over: bool = False
