@@ -274,8 +274,8 @@ class Cell(_Hot):
             UnknownMessage: the class is known and handles nothing of this type. BadMessage: this is no message.
             NotGranted: it is an order, and this process may give none there.
         """
-        if isinstance(message, Order) and self.node.uplink is not None:
-            self.node.uplink.require_granted(self.path, type_name(type(message)))
+        if isinstance(message, Order) and (uplink := self.node.ports.uplink) is not None:
+            uplink.require_granted(self.path, type_name(type(message)))
         if not self.table.knows(type(message)):
             require_message(self.path, message)
             raise UnknownMessage(self.path, type_name(type(message)))

@@ -161,7 +161,7 @@ def begin(
     build(cell, start, context_type)
     cell.state = RUNNING
     node = cell.node
-    if node.watched:
+    if node.events.has_listeners:
         node.emit(ActorStarted(cell.path, cell.life))
     for topic in start.kind._topics:
         node.topics.subscribe(topic, cell)
@@ -343,7 +343,7 @@ def crash(cell: Cell, item: Any, error: BaseException) -> None:
 def tell_crash(cell: Cell, reason: ExitReason, item: object) -> None:
     """The life ends by a crash, be it that its code raised or that it says so."""
     node = cell.node
-    if node.watched:
+    if node.events.has_listeners:
         node.emit(ActorCrashed(cell.path, cell.life, reason, item))
 
 

@@ -169,7 +169,7 @@ def unpack(
             case _:
                 return watched(*value.key)
 
-    holds, values = cast("list[Any]", decode_value(state, imports=cell.node.uplink is not None))
+    holds, values = cast("list[Any]", decode_value(state, imports=cell.node.ports.uplink is not None))
     put_state(actor, lift(values, found) if holds else values)
 
 

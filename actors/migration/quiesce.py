@@ -96,7 +96,8 @@ def _busy(cell: Cell) -> str:
     more = cell.extra()
     if more.tasks:
         return "background work (pipe_to_self, create_task) is out"
-    own = cell.node.uplink if cell is cell.node.root else None  # Else what it has passed on is answered from here on.
+    # Of another actor, what it has passed on is answered from here on.
+    own = cell.node.ports.uplink if cell is cell.node.root else None
     for item in cell.queue or ():
         if isinstance(item, Piped):
             return "the result of background work waits for its turn"

@@ -39,10 +39,9 @@ class Attempt(Protocol):
 class GuestMoves:
     """The moves of the actors of a process: its own, or those below its supervisor; one attempt at a time for each."""
 
-    def __init__(self, guest: Guest) -> None:
-        self._guest = guest
+    def __init__(self, guest: Guest, child_attempt: Callable[[str, int], Attempt]) -> None:
+        self._guest, self._child_attempt = guest, child_attempt
         self._attempts: dict[str, tuple[int, Incoming, Attempt]] = {}  # by address: who arrives has no cell yet
-        self.of_child: Callable[[str, int], Attempt] | None = None  # makes one of a child of the process's supervisor
 
     def hear(self, path: str, frame: Migrate) -> None:
         """Do the next step of a move. The words of the root come in order: a new number ends an earlier attempt.
@@ -58,10 +57,10 @@ class GuestMoves:
             attempt.obey(frame.step, told)
 
     def _made(self, path: str, number: int) -> tuple[int, Incoming, Attempt]:
-        root, attempt = self._guest.node.root, None
-        if self.of_child is not None and root is not None and path != root.path:
-            attempt = self.of_child(path, number)
-        made = self._attempts[path] = number, Incoming(imports=True), attempt or GuestMove(self._guest, path, number)
+        root = self._guest.node.root
+        is_own = root is None or path == root.path  # Else it is of a child of the process's supervisor.
+        attempt = GuestMove(self._guest, path, number) if is_own else self._child_attempt(path, number)
+        self._attempts[path] = made = number, Incoming(imports=True), attempt
         return made
 
     @staticmethod

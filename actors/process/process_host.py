@@ -280,7 +280,7 @@ class FlightHome(WorkerHome):
         if cell.host.place.process(cell) is not worker:
             raise StartFailed(cell.path, str(cell.extra().reason))  # It was up, and has died before we came to it.
         node = cell.node
-        if node.watched:
+        if node.events.has_listeners:
             node.emit(ActorStarted(cell.path, cell.life))
         outlet: Outlet = cell.extra().outlet
         outlet.worker = worker
@@ -566,7 +566,7 @@ def keep(worker: Worker, frame: frames.Command) -> None:
         BadFrame: there is nothing like it to be done.
     """
     node, path, answer = worker.node, frame.data["path"], frame.data.get("answer")
-    keeper, problem = node.keeper, None
+    keeper, problem = node.ports.keeper, None
     try:
         match frame.data["what"]:
             case "erase":

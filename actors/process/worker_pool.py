@@ -102,7 +102,7 @@ class Worker(Peer):
         self.reserve(cell, limits, died)
         self._is_reserved = False
         self._workers.by_cell[cell] = self
-        if self.node.watched:
+        if self.node.events.has_listeners:
             self.node.emit(ProcessStarted(cell.path, self.pid))
 
     async def launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
@@ -287,7 +287,7 @@ class Worker(Peer):
         self._workers.on_note(self, frame)
 
     def _on_line(self, stream: str, text: str) -> None:
-        if self.node.watched:
+        if self.node.events.has_listeners:
             path = self.cell.path if self.cell is not None else f"process {self.pid}"
             self.node.emit(LogLine(path, stream, text))
 
@@ -343,7 +343,7 @@ class Worker(Peer):
         if self._watch is not None:
             self._watch.close()
         cell = self.cell
-        if cell is not None and self.node.watched:
+        if cell is not None and self.node.events.has_listeners:
             self.node.emit(ProcessDied(cell.path, self.pid, reason))
         for up in self._launches.values():
             if not up.done():
@@ -553,7 +553,7 @@ class Workers:
             cell = self.node.find(event.address)
             if cell is not None and cell.more is not None and cell.more.tap is not None:
                 cell.more.tap.hub.emit(event)
-        elif event is not None and self.node.watched:
+        elif event is not None and self.node.events.has_listeners:
             self.node.emit(event)
 
     def processes(self) -> dict[str, int]:

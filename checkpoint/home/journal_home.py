@@ -309,11 +309,11 @@ class JournalHome(RecordedHome):
             raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
         except asyncio.CancelledError:
             raise StartFailed(cell.path, "it was stopped while it started") from None
-        if node.watched:
+        if node.events.has_listeners:
             node.emit(ActorStarted(cell.path, cell.life))
         if entered.recovering:
             clock.mark("release")
-            if node.watched:
+            if node.events.has_listeners:
                 node.emit(Recovered(cell.path, cell.life, switch.replayed, clock.phases(restore_seconds)))
         self.homes.recoveries.over(cell.path)
 

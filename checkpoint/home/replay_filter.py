@@ -96,7 +96,7 @@ class Skipping:
 
     def _tell(self, chosen: Skipped) -> None:
         home = self._home
-        if home.node.watched and any(chosen):
+        if home.node.events.has_listeners and any(chosen):
             counts = len(chosen.readonly), len(chosen.superseded)
             home.node.emit(TurnsSkipped(home.path, *counts, chosen.problem))
 

@@ -213,7 +213,7 @@ class Switch:
         """Number and journal an input."""
         key = self.next_id
         self.next_id = key + 1
-        source = Input(key, kind, name, body, self.node.wall(), sender)
+        source = Input(key, kind, name, body, self.node.clock.wall(), sender)
         if origin:
             source.origin = origin
         self.open[key] = source

@@ -43,6 +43,7 @@ class RecordedGuest:
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
         self._ports: dict[str, Port] = {}
+        self.keeper = GuestKeeper(guest)
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
@@ -57,9 +58,7 @@ class RecordedGuest:
 
     def begins(self, path: str) -> None:
         """A life is about to begin at an address."""
-        keeper = self._guest.node.keeper
-        if isinstance(keeper, GuestKeeper):
-            keeper.begins(path)
+        self.keeper.begins(path)
 
     def vacated(self, path: str) -> None:
         """Nobody lives at an address any more: whoever does so again is given a new way."""
@@ -84,15 +83,22 @@ class RecordedGuest:
         if spec.recovery is not None and spec.recovery.records:
             place = child_here(self._guest, spec.recovery)
             return AddressHost(place.home, place, NEAR)
-        here: AddressHost = self._guest.node.here
+        here: AddressHost = self._guest.node.ports.here
         return here
 
 
 class GuestKeeper:
     """The root's keeper, as the supervisors of this process speak to it: in order with everything else they say."""
 
-    def __init__(self, guest: Guest, notes: dict[str, bytes], known: list[str]) -> None:
-        self._guest, self._notes, self._known = guest, dict(notes), set(known)
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+        self._notes: dict[str, bytes] = {}
+        self._known: set[str] = set()
+
+    def learn(self, notes: dict[str, bytes], known: list[str]) -> None:
+        """Take in what the root has kept of the addresses of this process so far."""
+        self._notes.update(notes)
+        self._known.update(known)
 
     def _say(self, what: str, path: str, **data: Any) -> None:
         root = self._guest.node.root

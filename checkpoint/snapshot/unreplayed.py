@@ -52,5 +52,5 @@ def forget_turns(home: Switch) -> None:
     meta = home.newest or Meta(FORMAT, home.turn, 0, [], {}, [], 0, b"")
     home.newest = msgspec.structs.replace(meta, turn=home.turn)
     go_back(home, meta)
-    if count and home.node.watched:
+    if count and home.node.events.has_listeners:
         home.node.emit(TurnsLost(home.path, count, meta.base))

@@ -68,7 +68,7 @@ class PlainChild:
 
     def _come_to_rest(self) -> None:
         cell = self._guest.node.find(self._path)
-        if cell is None or cell.state is not RUNNING or cell.host is not self._guest.node.here:
+        if cell is None or cell.state is not RUNNING or cell.host is not self._guest.node.ports.here:
             self._say("refused", why="it is being restarted; try again")
             return
         take = Take(_owe, self._at_rest, lambda why: self._say("refused", why=why))
@@ -130,7 +130,7 @@ class PlainChild:
         for watch in [one for one in more.watching if one.life == cell.life]:
             watch.cancel()
             guest.command(watch.target, "monitor", {"watcher": cell.path, "for_good": watch.for_good})
-        more.monitors = [one for one in more.monitors if one.watcher.host is guest.node.here]
+        more.monitors = [one for one in more.monitors if one.watcher.host is guest.node.ports.here]
         for topic in list(more.topics):
             Topics.unsubscribe(guest.node.topics, topic, cell)
 
@@ -205,7 +205,7 @@ class PlainChild:
         chosen = place.home.bound
         has_ended = arrival.other.state is not RUNNING  # by its background work
         guest.recovery.port_of(self._path).place = None
-        cell.host = guest.node.here
+        cell.host = guest.node.ports.here
         bound = None if chosen is None else Bound(chosen.capacity, chosen.overflow)
         queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])
         commands = arrival.take_over(queue, stash, bound, suspended=bool(told["is_suspended"]))

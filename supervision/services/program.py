@@ -180,7 +180,7 @@ class Program(Actor):
         self._lines.append(text)
         self._parts.pop(stream, None)
         node = self.ctx.cell.node
-        if node.watched:
+        if node.events.has_listeners:
             node.emit(LogLine(self.ctx.path, stream, text))
         if self._sign is not None:
             self._sign.line(text)

@@ -80,7 +80,7 @@ class Peer:
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
         self._last_id = key = self._last_id + 1
-        until = ask.deadline if self.node.is_monotonic else monotonic() + ask.deadline - self.node.loop.time()
+        until = self.node.clock.on_machine(ask.deadline)
         to = connection.name_out(path)
         name, body = self._payload(ask.message)
         sender = None if ask.sender is None else connection.name_out(ask.sender.path)

@@ -62,7 +62,7 @@ class Worker(hf.Actor):
     @hf.on(Names)
     def names(self, message: Names) -> int:
         gc.collect()
-        return len(self.ctx.cell.node.uplink._outside)
+        return len(self.ctx.cell.node.ports.uplink._outside)
 
 
 class Job(hf.Actor):
@@ -119,7 +119,7 @@ async def test_links_outlive_the_forgetting_of_names(system: hf.ActorSystem) -> 
     """Names begin anew while asks are open and messages are on their way, in order."""
     worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process"))
     for at in range(MOST_NAMES + 10):
-        cell = Cell(system.node, None, f"/app/nobody-{at}", system.node.here)
+        cell = Cell(system.node, None, f"/app/nobody-{at}", system.node.ports.here)
         system._workers.by_cell[worker._cell].connection.name_out(cell.path)
     asks = [worker.ask(Ping(), timeout=SECONDS) for _ in range(100)]
     assert [await ask for ask in asks] == [1] * 100
