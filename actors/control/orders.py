@@ -376,8 +376,8 @@ def status_of(cell: Cell) -> Status:
         cell.host.backlog(cell),
         None if turn is None else type_name(type(message_in(item))),
         0.0 if turn is None else cell.node.loop.time() - turn.since,
-        0 if more is None else len(more.links),
-        0 if more is None else len(more.monitors),
+        0 if more is None else len(more.ties.links),
+        0 if more is None else len(more.ties.monitors),
         os.getpid(),
         {} if more is None else {port: target.path for port, target in more.bindings.items()},
     )

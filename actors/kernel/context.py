@@ -453,7 +453,7 @@ class ActorContext:
 
     def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
         """A task of this life, which knows in what turn it was begun."""
-        tasks, context = self.cell.extra().tasks, copy_context()
+        tasks, context = self.cell.extra().belongings.tasks, copy_context()
         context.run(begun_in.set, self.item)
         task = self.cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
         tasks.add(task)

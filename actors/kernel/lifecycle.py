@@ -513,18 +513,19 @@ def _undo(cell: Cell) -> None:
     The stash goes back to the queue.
     """
     more = cell.extra()
-    if more.has_ties:
-        for timer in list(more.timers):
+    if more.has_more:
+        own = more.belongings
+        for timer in list(own.timers):
             timer.cancel()
-        for task in more.tasks:
+        for task in own.tasks:
             task.cancel()
-        more.tasks.clear()
-        for topic in list(more.topics):
+        own.tasks.clear()
+        for topic in list(own.topics):
             cell.node.topics.unsubscribe(topic, cell)
-        for name in more.names:
+        for name in own.names:
             cell.node.names.pop(name, None)
-        more.names.clear()
-        more.watching.clear()
+        own.names.clear()
+        more.ties.watching.clear()
     more.suspended, more.trap_exits = 0, False
     queue = cell.queue
     if queue:
@@ -565,8 +566,8 @@ def retire(cell: Cell, why: object) -> None:
             more.bound.release()
         links.announce(cell, more.reason, recovering=False)  # Links of a recorded actor wait for this.
         links.gone(cell, more.reason)
-        commands: list[Item] = [*(more.calls if more.has_ties else ()), *(more.urgent or ())]
-        if more.has_ties:
+        commands: list[Item] = [*(more.calls if more.has_more else ()), *(more.urgent or ())]
+        if more.has_more:
             more.calls = []
         more.urgent = None
         for command in commands:

@@ -304,13 +304,13 @@ class Node(RunLoop):
         if cell.state is not RUNNING:
             raise ActorStopped(cell.path)
         self.names[name] = cell
-        cell.extra().names.append(name)
+        cell.extra().belongings.names.append(name)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
         cell = self.names.pop(name, None)
         if cell is not None:
-            cell.extra().names.remove(name)
+            cell.extra().belongings.names.remove(name)
 
     def bind(self, cell: Cell, port: str, target: Cell, *, is_claimed: bool = False) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on.

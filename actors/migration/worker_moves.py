@@ -145,15 +145,15 @@ class GuestMove:
         watches = [self._watch(cell, path, for_good) for path, for_good in rest["watches"]]
         for path in rest["links"]:
             peer = self._guest.node.cell_at(path)
-            cell.extra().links[peer] = peer.extra().links[cell] = None
+            cell.extra().ties.links[peer] = peer.extra().ties.links[cell] = None
         unpack(actor, luggage["state"], rest, self._owed, lambda path, for_good: _found(watches, path, for_good))
         return await_up(cell, start)
 
     def _watch(self, cell: Cell, path: str, for_good: bool) -> Monitor:
         """A watch that the root keeps already."""
         watch = Monitor(cell, self._guest.node.cell_at(path), for_good)
-        watch.target.extra().monitors.append(watch)
-        cell.extra().watching[watch] = None
+        watch.target.extra().ties.monitors.append(watch)
+        cell.extra().ties.watching[watch] = None
         return watch
 
     def _owed(self, key: int) -> Ask:
@@ -217,7 +217,7 @@ class GuestMove:
 def _leave(cell: Cell, reason: ExitReason) -> None:
     """The actor lives elsewhere: what is left here ends, and tells nobody."""
     more = cell.extra()
-    for kept in (more.links, more.topics, more.monitors):
+    for kept in (more.ties.links, more.belongings.topics, more.ties.monitors):
         kept.clear()
     if cell.queue is not None:
         cell.queue.clear()

@@ -91,7 +91,7 @@ class Inner:
         cell.host.parent.leaves(is_restarting=with_parent)
         more = cell.extra()
         more.reason = reason
-        for topic in list(more.topics):
+        for topic in list(more.belongings.topics):
             self._node.topics.unsubscribe(topic, cell)
         lifecycle.retire(cell, reason)
         links.announce(cell, reason, recovering=False)

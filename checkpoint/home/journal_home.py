@@ -170,7 +170,7 @@ class JournalHome(RecordedHome):
         if recovers:
             hold(switch, running)
             self.homes.recoveries.crashed(cell.path, self.method, noticed)
-        cell.extra().topics.clear()  # These would be unsubscribed with the life.
+        cell.extra().belongings.topics.clear()  # These would be unsubscribed with the life.
         if switch.live is not None and not switch.live.done():
             switch.live.set_exception(StartFailed(cell.path, why))
             switch.live.exception()  # Nobody may be left to look.

@@ -125,13 +125,13 @@ class PlainChild:
     def _hand_ties_over(self, cell: Cell) -> None:
         """Links, and monitors that reach out of this process, are the root's from now on; so are subscriptions."""
         more, guest = cell.extra(), self._guest
-        for peer in more.links:
+        for peer in more.ties.links:
             guest.command(cell, "link", {"peer": peer.path})
-        for watch in [one for one in more.watching if one.life == cell.life]:
+        for watch in [one for one in more.ties.watching if one.life == cell.life]:
             watch.cancel()
             guest.command(watch.target, "monitor", {"watcher": cell.path, "for_good": watch.for_good})
-        more.monitors = [one for one in more.monitors if one.watcher.host is guest.node.ports.here]
-        for topic in list(more.topics):
+        more.ties.monitors = [one for one in more.ties.monitors if one.watcher.host is guest.node.ports.here]
+        for topic in list(more.belongings.topics):
             Topics.unsubscribe(guest.node.topics, topic, cell)
 
     # -- coming back ------------------------------------------------------------------------------------------------
