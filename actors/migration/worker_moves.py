@@ -15,7 +15,7 @@ from ..kernel.cell import RUNNING, Cell
 from ..kernel.context import ActorContext
 from ..kernel.envelope import Ask, Item
 from ..kernel.links import Monitor
-from ..process.wire.connection import BadFrame
+from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Arrived, RelayedAsk
 from ..process.wire.start_codec import unpack_recipe
 from .luggage import pack_items, pack_rest, unpack

@@ -12,7 +12,7 @@ from ..kernel.bindings import claim
 from ..kernel.cell import RUNNING, Cell, Host
 from ..kernel.codec import Parcel
 from ..kernel.node import cell_kind
-from .wire.connection import BadFrame
+from .wire.frames import BadFrame
 from .wire.peer import OutsideHost, Peer
 from .wire.start_codec import loaded
 

@@ -33,7 +33,8 @@ from ..kernel.topics import Topics
 from ..migration.worker_moves import Attempt, GuestMoves
 from ..persistence import Keeper
 from .wire import frames
-from .wire.connection import BadFrame, Connection
+from .wire.connection import Connection
+from .wire.frames import BadFrame
 from .wire.peer import Arrived, OutsideHost, Peer, RelayedAsk, named, obey
 from .wire.start_codec import unpack_recipe
 from .wire.worker_gate import is_at_or_below, is_granted
@@ -199,7 +200,7 @@ class Guest(Peer):
             frames.Launch: self._launch,
             frames.Command: lambda frame: self._command(self._target(frame.to), frame),
             frames.Record: self.on_record,
-            frames.Migrate: lambda frame: self.moves.hear(self.connection.name_in(frame.to), frame),
+            frames.Migrate: lambda frame: self.moves.hear(self.connection.names.from_wire(frame.to), frame),
             frames.Forget: self.on_forget,
         }
 
@@ -234,14 +235,14 @@ class Guest(Peer):
         """Publish through the root; the future ends when every subscriber has accepted."""
         connection = self.connection
         name, body = self._payload(message)
-        source = None if sender is None else connection.name_out(sender.path)
+        source = None if sender is None else connection.names.to_wire(sender.path)
         key, accepted = self.acceptance()
         connection.send(frames.Publish(key, topic, name, body, source), topic)
         return accepted
 
     def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """Tell the root something about an address."""
-        self.connection.send(frames.Command(self.connection.name_out(cell.path), verb, data))
+        self.connection.send(frames.Command(self.connection.names.to_wire(cell.path), verb, data))
 
     def address_retired(self, cell: Cell) -> None:
         """An address of this process is free. The process's own is kept at the root, and the process ends with it."""
@@ -353,14 +354,14 @@ class Guest(Peer):
         """The cell at an address of this process."""
         if type(to) is int and (cell := self._targets.get(to)) is not None:
             return cell
-        path = self.connection.name_in(to)
+        path = self.connection.names.from_wire(to)
         cell = self.node.cell_at(path)
         if cell is self.node.root:  # Cells of a subtree come and go; ours stays.
-            self._targets[self.connection.number_in(to)] = cell
+            self._targets[self.connection.names.number_of(to)] = cell
         return cell
 
     def _launch(self, frame: frames.Launch) -> None:
-        path = self.connection.name_in(frame.to)
+        path = self.connection.names.from_wire(frame.to)
         if frame.options.get("prepare"):
             self._prepare(frame)
             return
@@ -431,7 +432,7 @@ class Guest(Peer):
         told = pack_exit(reason if reason is not None else exit_reasons.SHUTDOWN)
         sys.stdout.flush()
         sys.stderr.flush()
-        self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
+        self.connection.send(frames.Ended(self.connection.names.to_wire(cell.path), cell.life, told))
         self.connection.flush()
         # The root ends us when it has read this. If we closed, and it wrote to us just then, it would read no more.
         self.node.loop.call_later(ENDED_WITHIN, self.connection.close)

@@ -246,7 +246,7 @@ class JournalHome(RecordedHome):
         """Keep everything, and count deaths in the same turn."""
         if worker is None or cell.state is not RUNNING:
             return None
-        running, noticed, ordered = self.in_hand(worker), worker.noticed_at, reason == KILLED
+        running, noticed, ordered = self.in_hand(worker), worker.end.noticed_at, reason == KILLED
 
         def over(recovers: bool | None) -> None:
             self.over(

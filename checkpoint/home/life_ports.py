@@ -9,7 +9,7 @@ import msgspec
 
 from ...actors.process.fork.child_processes import parent_of
 from ...actors.process.wire import frames
-from ...actors.process.wire.connection import BadFrame
+from ...actors.process.wire.frames import BadFrame
 from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
 
 if TYPE_CHECKING:
@@ -60,4 +60,4 @@ class RemoteLife:
         self._path, self._connection = path, worker.connection
 
     def to_life(self, record: ToLife) -> None:
-        self._connection.send(frames.Record(self._connection.name_out(self._path), record), self._path)  # type: ignore[arg-type]  # encoded in place
+        self._connection.send(frames.Record(self._connection.names.to_wire(self._path), record), self._path)  # type: ignore[arg-type]  # encoded in place

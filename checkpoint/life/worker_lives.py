@@ -196,7 +196,7 @@ class Port:
 
     def to_home(self, record: ToHome) -> None:
         connection = self._guest.connection
-        connection.send(frames.Record(connection.name_out(self._path), cast("Any", record)), self._path)
+        connection.send(frames.Record(connection.names.to_wire(self._path), cast("Any", record)), self._path)
 
     def when_told(self, then: Callable[[], None]) -> None:
         self._guest.node.loop.call_soon(then)  # Behind the flush, which was called for before.

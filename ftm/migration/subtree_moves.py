@@ -423,7 +423,7 @@ class ToSubtree(IntoSubtree):
         cell, worker = self.cell, self.worker
         for port, target in unclaimed(cell).items():
             data = {"port": port, "target": target.path}
-            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), "bind", data))
+            worker.connection.send(frames.Command(worker.connection.names.to_wire(cell.path), "bind", data))
         self.move.gone_on_at = now()
 
     def settled(self) -> None:

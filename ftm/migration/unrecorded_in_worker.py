@@ -23,7 +23,7 @@ from ...actors.migration.here import Arrival
 from ...actors.migration.luggage import check_sendable, pack_rest
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
-from ...actors.process.wire.connection import BadFrame
+from ...actors.process.wire.frames import BadFrame
 from ...checkpoint.protocol import Respec
 from .protected_stand_ins import ChildAtRoot, child_at_root, respec
 from .unrecorded_luggage import EarlyAsk, pack, pack_owed, refuse, restore_owing, save_owing, unpack
