@@ -169,7 +169,7 @@ def begin(
         up(cell)
         return None
     started: asyncio.Future[None] = node.loop.create_future()
-    if cell.more is not None or getattr(start.kind, "_supervises", False):
+    if cell.more is not None or start.kind._supervises:
         cell.extra().starting = started  # Somebody waits, also if the life ends before its first turn has.
     mailbox.queue_of(cell).appendleft(FirstTurn(restored, started))
     up(cell)
@@ -333,7 +333,7 @@ def crash(cell: Cell, item: Any, error: BaseException) -> None:
         item.fail(remote_crash(error))
     if isinstance(item, FirstTurn):
         start_fails(cell, item, StartFailed(cell.path, str(reason)))
-        if isinstance(error, StartFailed) and getattr(type(cell.actor), "_supervises", False):
+        if isinstance(error, StartFailed) and cell.actor is not None and cell.actor._supervises:
             finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).
             return
     tell_crash(cell, reason, item)
@@ -472,7 +472,7 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     if more is not None:
         more.reason = reason
     if ctx is not None:
-        if not getattr(type(cell.actor), "_keeps_promises", False):
+        if cell.actor is None or not cell.actor._keeps_promises:
             for ask in ctx.promised():  # Nobody else can answer these.
                 ask.fail(AskFailed(cell.path, str(reason)))
         ctx.close()

@@ -435,7 +435,7 @@ class WorkerPlace(Place):
         """Ask the actor to end in good order; while it starts, when it is up. A supervisor can end while it starts."""
         worker = self.workers.of(cell)
         start = cell.extra().start
-        supervises = start is not None and getattr(start.kind, "_supervises", False)
+        supervises = start is not None and start.kind._supervises
         if worker is not None and (supervises or self.home.takes_stop(cell)):
             self.send_stop(worker, cell, reason)
         else:

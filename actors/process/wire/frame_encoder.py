@@ -59,4 +59,4 @@ class OpenRun:
     def __init__(self) -> None:
         self.bodies: list[bytes] = []
         self.size = 0
-        self.head = (0, 0, 0)  # address, type name, first number
+        self.head: tuple[int, int, int] = (0, 0, 0)  # address, type name, first number
