@@ -439,8 +439,9 @@ class EventStream:
 class EventHub:
     """Hands each event to the listeners there are."""
 
-    def __init__(self, watch: Callable[[bool], None]) -> None:
-        self._watch = watch  # told whether there is anybody at all
+    def __init__(self, changed: Callable[[bool], None] = lambda anybody: None) -> None:
+        self._changed = changed  # told whether there is anybody at all
+        self.has_listeners = False  # else events are not even made
         self._streams: list[EventStream] = []
         self._sinks: list[Callable[[Event], None]] = []
 
@@ -454,20 +455,24 @@ class EventHub:
     def add_sink(self, sink: Callable[[Event], None]) -> None:
         """Call `sink` with every event, at once."""
         self._sinks.append(sink)
-        self._watch(True)
+        self._count()
 
     def listen(self, most: int = 10_000) -> EventStream:
         """A new stream; the oldest of more than `most` unread events are dropped and counted in `missed`."""
         stream = EventStream(self, most)
         self._streams.append(stream)
-        self._watch(True)
+        self._count()
         return stream
 
     def remove(self, stream: EventStream) -> None:
         """Forget a stream."""
         if stream in self._streams:
             self._streams.remove(stream)
-        self._watch(bool(self._streams or self._sinks))
+        self._count()
+
+    def _count(self) -> None:
+        self.has_listeners = bool(self._streams or self._sinks)
+        self._changed(self.has_listeners)
 
     def close(self) -> None:
         """End every stream."""

@@ -104,8 +104,8 @@ def _renamed(ties: Counter[Tie], now: Callable[[str], str]) -> Counter[Tie]:
 def tied(cell: Cell, other: Cell, verb: str) -> int:
     """How many ties of a kind there are now."""
     if verb == "link":
-        return int(cell.more is not None and other in cell.more.links)
-    watches = () if other.more is None else other.more.monitors
+        return int(cell.more is not None and other in cell.more.ties.links)
+    watches = () if other.more is None else other.more.ties.monitors
     return sum(one.watcher is cell and one.for_good is (verb == "watch") for one in watches)
 
 

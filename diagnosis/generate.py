@@ -143,7 +143,7 @@ def _wired(cell: Cell, names: dict[str, str], heard: dict[str, set[str]]) -> Wir
         kind="" if kind is None else f"{kind.__module__}.{kind.__qualname__}",
         supervisor=None if cell.parent is None else cell.parent.path,
         publishes=tuple(sorted(heard.get(cell.path, ()))),
-        subscribes=tuple(sorted(set(more.topics) - OURS if more is not None else ())),
+        subscribes=tuple(sorted(set(more.belongings.topics) - OURS if more is not None else ())),
         bound={port: names[target.path] for port, target in sorted(bound.items()) if target.path in names},
     )
 

@@ -103,7 +103,7 @@ def opened(value: Any, node: Node) -> Any:
     """
     if not isinstance(value, Packed):
         return value.value if isinstance(value, Boxed) else value
-    if node.uplink is None:
+    if node.ports.uplink is None:
         raise SpecError(
             "supervisor", "a child spec from an actor process is not taken here: start from a template with plain args"
         )

@@ -95,7 +95,7 @@ def succession(supervisor: Supervisor, known: dict[str, Child], plan: Plan) -> d
 
 def check_place(where: str, specs: Iterable[ChildSpec], node: Node) -> None:
     """Whether children can be below a supervisor that lives here. Raises SpecError: see `check_subtree`."""
-    if node.uplink is not None:
+    if node.ports.uplink is not None:
         check_subtree(where, specs)
 
 

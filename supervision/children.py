@@ -51,7 +51,7 @@ class Child:
 
 def complete(own: Cell, spec: ChildSpec) -> ChildSpec:
     """A child's spec with what is said of it elsewhere. Raises SpecError: the two do not go together."""
-    completed: ChildSpec = own.node.complete(spec, f"{own.path}/{spec.id}")
+    completed: ChildSpec = own.node.ports.complete(spec, f"{own.path}/{spec.id}")
     return completed
 
 
@@ -68,12 +68,12 @@ def new_cell(own: Cell, one: Child) -> Cell:
         if target is None:
             missing = NoSuchActor(spec.bindings[port])
             raise StartFailed(f"{own.path}/{spec.id}", f"binding {port!r}: {missing}") from missing
-    cell = node.cell_below(own, spec.id, node.host_for(spec))
+    cell = node.cell_below(own, spec.id, node.ports.host_for(spec))
     cell.spec = spec
     cell.extra().start = spec.start
     if spec.mailbox is not None:
         node.bound(cell, spec.mailbox)
-    is_claimed = node.uplink is not None  # The root has not bound it, though it may have named it in a recipe.
+    is_claimed = node.ports.uplink is not None  # The root has not bound it, though it may have named it in a recipe.
     for port, target in targets.items():
         assert target is not None
         node.bind(cell, port, target, is_claimed=is_claimed)

@@ -56,7 +56,7 @@ class DynamicSupervisor(Supervisor):
         """Start empty, or with the children that were there before, if there is a journal of them."""
         node, where = self.ctx.cell.node, child_key(self.ctx.path, "")
         noted: list[Child] = []
-        for key, data in node.keeper.notes(where).items():
+        for key, data in node.ports.keeper.notes(where).items():
             name = key.removeprefix(where)
             if "/" in name:
                 continue  # It is the child of a supervisor below us.
@@ -79,7 +79,7 @@ class DynamicSupervisor(Supervisor):
 
     def _lose(self, name: str) -> None:
         """A child is over whose id nobody will use again: whoever waits for it is told, what was recorded is erased."""
-        path, keeper = f"{self.ctx.path}/{name}", self.ctx.cell.node.keeper
+        path, keeper = f"{self.ctx.path}/{name}", self.ctx.cell.node.ports.keeper
         try:
             keeper.erase(path, below=True)
             keeper.note(child_key(self.ctx.path, name), None)
@@ -100,9 +100,9 @@ class DynamicSupervisor(Supervisor):
         if self._flags.journal:  # First: what is started must come back, also if we die in the middle of the start.
             given = one.spec if self._template is None else (*_added(self._template, one.spec), one.spec.made_up)
             data = pack_data(given, f"child {one.spec.id!r}")
-            self.ctx.cell.node.keeper.note(child_key(self.ctx.path, one.spec.id), data)
+            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, one.spec.id), data)
         elif one.spec.made_up and self._is_recorded(one):
-            self.ctx.cell.node.keeper.note(child_key(self.ctx.path, one.spec.id), MADE_UP)
+            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, one.spec.id), MADE_UP)
         super()._enlist(one)
 
     def _is_recorded(self, one: Child) -> bool:
@@ -116,7 +116,7 @@ class DynamicSupervisor(Supervisor):
         is_lost = one.spec.made_up and self._is_recorded(one)  # Nobody starts an id again that was made up.
         if self._flags.journal:
             try:
-                node.keeper.note(key, MADE_UP if is_lost else None)
+                node.ports.keeper.note(key, MADE_UP if is_lost else None)
             except HoldfastError as error:  # It is over all the same, but will come back with us.
                 node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
                 return
@@ -166,7 +166,7 @@ class DynamicSupervisor(Supervisor):
             self._count += 1
             name = f"{prefix}-{self._count}"
             # Whoever had it once may be recorded, and is not to come back as somebody else.
-            is_known = self.ctx.cell.node.keeper.knows(f"{self.ctx.path}/{name}")
+            is_known = self.ctx.cell.node.ports.keeper.knows(f"{self.ctx.path}/{name}")
             if not is_known and name not in self._children and name not in (self.ctx.cell.children or ()):
                 return name
 
@@ -203,7 +203,7 @@ class DynamicSupervisor(Supervisor):
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
         """A stopped child is forgotten here by itself; what was recorded of it is forgotten now."""
-        path, keeper = f"{self.ctx.path}/{message.id}", self.ctx.cell.node.keeper
+        path, keeper = f"{self.ctx.path}/{message.id}", self.ctx.cell.node.ports.keeper
         is_there = message.id in self._children or message.id in (self.ctx.cell.children or ())
         if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
             try:

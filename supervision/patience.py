@@ -13,6 +13,7 @@ from ..actors.kernel.cell import DOWN, GONE, Cell
 from ..actors.kernel.lifecycle import GRACE
 
 if TYPE_CHECKING:
+    from ..actors.kernel.actor import Actor
     from .spec import ChildSpec
 
 SLACK = 5.0
@@ -55,7 +56,8 @@ def most_below(cell: Cell | None, spec: ChildSpec | None) -> float:
     """Seconds that the children of a supervisor may take to end: one after another, or all at once."""
     limits = list(_limits(cell, spec))
     actor = None if cell is None else cell.actor
-    at_once = getattr(actor if actor is not None else None if spec is None else spec.start.kind, "_is_dynamic", False)
+    kind: type[Actor] | None = type(actor) if actor is not None else None if spec is None else spec.start.kind
+    at_once = kind is not None and kind._is_dynamic
     return max(limits, default=0.0) if at_once else sum(limits)
 
 

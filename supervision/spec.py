@@ -258,7 +258,7 @@ def child(
         MechanismRefused: the class does not have what the mechanism needs.
         SpecError: naming the child, the option, and what it may be.
     """
-    is_supervisor = isinstance(start, Start) and bool(getattr(start.kind, "_supervises", False))
+    is_supervisor = isinstance(start, Start) and start.kind._supervises
     if shutdown is None:
         shutdown = "infinity" if is_supervisor else PATIENCE
     return ChildSpec(

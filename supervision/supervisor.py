@@ -246,7 +246,7 @@ class Supervisor(Inquiries):
         if one.cell is not None:
             one.ignored_life = one.cell.life
         node = self.ctx.cell.node
-        if node.watched:
+        if node.events.has_listeners:
             reason = error.reason if isinstance(error, StartFailed) else str(error)
             node.emit(ChildStartFailed(self._path_of(one), reason))
 
@@ -294,7 +294,7 @@ class Supervisor(Inquiries):
         """Tell that a child has ended without having been told to."""
         one.ignored_life = life
         node = self.ctx.cell.node
-        if node.watched and is_reported(one.spec.restart, reason):
+        if node.events.has_listeners and is_reported(one.spec.restart, reason):
             allowed, period = self._flags.intensity, self._flags.period
             restarts = len(recent_restarts(self._restarts, node.loop.time(), period))
             node.emit(ChildTerminated(self._path_of(one), reason, restarts, allowed))
@@ -359,8 +359,8 @@ class Supervisor(Inquiries):
             return
         self._restarts = window
         if one.spec.is_supervisor:  # Perhaps it has ended because of somebody below it: that one comes back as it says.
-            node.keeper.returned(self._path_of(one), flags.period)
-        if node.watched:
+            node.ports.keeper.returned(self._path_of(one), flags.period)
+        if node.events.has_listeners:
             node.emit(ChildRestarted(self._path_of(one), reason, len(window), flags.intensity))
         order = list(self._children.values())
         group = affected(flags.strategy, order, order.index(one))
@@ -382,7 +382,7 @@ class Supervisor(Inquiries):
 
     def _blame(self, one: Child) -> None:
         """We end because of this child."""
-        self.ctx.cell.node.keeper.blame(self._path_of(one))
+        self.ctx.cell.node.ports.keeper.blame(self._path_of(one))
 
     def _path_of(self, one: Child) -> str:
         return f"{self.ctx.path}/{one.spec.id}"
@@ -393,7 +393,7 @@ class Supervisor(Inquiries):
             lifecycle.retire(one.cell, "it begins afresh")
         one.spec = complete(self.ctx.cell, one.spec)
         if one.spec.is_supervisor or one.spec.has_home:
-            self.ctx.cell.node.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
+            self.ctx.cell.node.ports.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
 
     async def _restart_group(self, failed: Child, group: list[Child], reason: ExitReason) -> None:
         """Stop the others newest first, then start all of them in order; siblings wait for one that takes its time."""
@@ -608,7 +608,7 @@ class Supervisor(Inquiries):
         problem: HoldfastError | None = None
         if message.older:
             try:
-                rolled_back = self.ctx.cell.node.keeper.roll_back(self._path_of(one), "it was asked for")
+                rolled_back = self.ctx.cell.node.ports.keeper.roll_back(self._path_of(one), "it was asked for")
                 if rolled_back is not None:
                     await rolled_back
             except HoldfastError as error:

@@ -102,7 +102,7 @@ class Moves:
             move = await self._moved(
                 cell, timeout, lambda: self._made(cell, spec, timeout), lambda: replace_place(cell, spec), gate
             )
-            if self._node.watched:
+            if self._node.events.has_listeners:
                 self._node.emit(Moved(cell.path, origin, isolation, move.gone_on_at - move.rest_at))
 
     async def protect(
@@ -157,7 +157,7 @@ class Moves:
             if is_by_way_of_a_task:
                 await self._settle_in(cell, "process", before.limits, timeout)
             raise
-        if self._node.watched:
+        if self._node.events.has_listeners:
             names = tuple(layer.name for layer in move.entering.host.place.layers)
             self._node.emit(MechanismAttached(cell.path, names, move.gone_on_at - move.rest_at))
 
@@ -191,11 +191,11 @@ class Moves:
         move = await self._moved(
             cell,
             timeout,
-            lambda: out_of_group(cell, self._entering(self._node.host_for(wanted), wanted.limits), timeout),
+            lambda: out_of_group(cell, self._entering(self._node.ports.host_for(wanted), wanted.limits), timeout),
             moved,
             gate,
         )
-        if self._node.watched:
+        if self._node.events.has_listeners:
             names = tuple(layer.name for layer in compose(before.mechanism))
             self._node.emit(MechanismDetached(cell.path, names, move.gone_on_at - move.rest_at))
         if is_by_way_of_a_task:
@@ -242,7 +242,7 @@ class Moves:
             except CannotAdapt:
                 if (cell.life == life and host.is_up(cell)) or cell.is_dead or self._node.loop.time() > end:
                     raise
-        if self._node.watched:
+        if self._node.events.has_listeners:
             was, names = (tuple(layer.name for layer in layers) for layers in (old, change.layers))
             seconds = change.gone_on_at - change.rest_at
             self._node.emit(MechanismChanged(cell.path, was, names, change.config, seconds))
@@ -314,7 +314,7 @@ class Moves:
             from ..ftm.migration.subtree_moves import move_below
 
             return move_below(cell, parent, spec, timeout)
-        return Move(cell, leaving(cell), self._entering(self._node.host_for(spec), spec.limits), timeout)
+        return Move(cell, leaving(cell), self._entering(self._node.ports.host_for(spec), spec.limits), timeout)
 
     @staticmethod
     def _entering(host: AddressHost, limits: Limits | None) -> Entering:

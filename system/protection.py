@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -62,16 +61,7 @@ class Protection:
             homes.note(key, None)
             homes.node.emit(AdaptationUndone(key.removeprefix(UNDER_WAY), step.decode()))
 
-    @property
-    def is_needed(self) -> bool:
-        """Whether any spec of this root has to be completed."""
-        return bool(self._loaded)
-
-    def completing(self, complete: Callable[[Any, str], Any]) -> Callable[[Any, str], Any]:
-        """Have each spec completed by this too."""
-        return lambda spec, address: self._completed(complete(spec, address), address)
-
-    def _completed(self, spec: ChildSpec, address: str) -> ChildSpec:
+    def completed(self, spec: ChildSpec, address: str) -> ChildSpec:
         """A spec with the mechanism that the address had when the last root ended.
 
         Raises:
@@ -106,7 +96,7 @@ class Protection:
             names = path.removeprefix(above).split("/")
             child = spec_below(spec.start, names)
             if child is not None:
-                other = self._completed(child, path)
+                other = self.completed(child, path)
                 spec = dataclasses.replace(spec, start=rebuilt(spec.start, names, functools.partial(_instead, other)))
         return spec
 

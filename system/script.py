@@ -219,5 +219,5 @@ def load_script(path: str | os.PathLike[str], node: Node | None = None) -> Scrip
 def tell_loaded(node: Node, path: str, sha256: str) -> None:
     """Say that this code is loaded."""
     root = node.root
-    if node.watched and root is not None:
+    if node.events.has_listeners and root is not None:
         node.emit(ScriptLoaded(root.path, path, sha256))

@@ -20,7 +20,7 @@ from ..actors.kernel.cell import Cell, Host
 from ..actors.kernel.lifecycle import LOCAL, NEAR
 from ..actors.kernel.mailbox import Bounded
 from ..actors.kernel.message import Message
-from ..actors.kernel.node import Node, cell_kind
+from ..actors.kernel.node import Node, Ports, cell_kind
 from ..actors.kernel.ref import ActorRef, current
 from ..actors.kernel.topics import publish
 from ..actors.loop_watchdog import LoopWatch, check_limits
@@ -163,22 +163,25 @@ class ActorSystem(Recorded, Controls):
         self._recovery = RecoveryTree(node, self._homes)
         self._workers = self._make_pool(node)
         if file is not None:
-            self._homes.file, node.complete = file, file.complete
+            self._homes.file = file
             self._patience = node.loop.call_later(PATIENCE, self._tell_unused)
-        node.host_for = self._host_for
         self._moves = Moves(node)
-        node.respec = respec
         self._watch = LoopWatch(node, *self._watch_limits)
         self._watch.open()
-        node.outside = self._homes.addresses.find
-        node.keeper = self._homes
         if self._log:
             self._sink = LogSink(self.name, node.loop, log_payloads=self._log_payloads)
             node.events.add_sink(self._sink)
         self.specifications = Specifications(self._homes, is_kept=self._store is not None)
         self.mechanism_notes = Protection(self._homes)
-        if self.mechanism_notes.is_needed:
-            node.complete = self.mechanism_notes.completing(node.complete)
+        node.connect(
+            Ports(
+                host_for=self._host_for,
+                complete=self._complete,
+                respec=respec,
+                outside=self._homes.addresses.find,
+                keeper=self._homes,
+            )
+        )
         self._body = asyncio.current_task()
         root = self._root = node.root = node.cell_below(None, f"/{self.name}")
         up = lifecycle.begin(root, Start(Supervisor, (self._flags, ())))
@@ -245,6 +248,11 @@ class ActorSystem(Recorded, Controls):
     def _make_pool(self, node: Node) -> Workers:
         """The processes of this system."""
         return Workers(node, ENTRY, (*BASE, *self._preload), on_frame)
+
+    def _complete(self, spec: ChildSpec, path: str) -> ChildSpec:
+        """A child spec with what the recovery file and earlier roots say of its address."""
+        file = self._homes.file
+        return self.mechanism_notes.completed(spec if file is None else file.complete(spec, path), path)
 
     def _host_for(self, spec: ChildSpec) -> AddressHost:
         """Where a child's lives are lived."""
@@ -492,7 +500,7 @@ class ActorSystem(Recorded, Controls):
     @property
     def dead_letters(self) -> int:
         """Messages that nobody handled, so far."""
-        return self.node.dead_letters
+        return self.node.numbers.dead_letters
 
     def pid_of(self, ref: ActorRef[Any]) -> int:
         """The OS process an actor lives in now: its own, or this one.
@@ -514,7 +522,7 @@ class ActorSystem(Recorded, Controls):
     @property
     def late_replies(self) -> int:
         """Replies that came when nobody waited any more, so far."""
-        return self.node.late_replies
+        return self.node.numbers.late_replies
 
     def tree(self) -> list[str]:
         """The addresses that live now, parents before children."""

@@ -180,8 +180,8 @@ async def _ping(worker: Worker) -> bool:
     counter = FrameCounter(worker)
     try:
         key, answered = worker.acceptance()
-        name = worker.connection.name_out(worker.cell.path if worker.cell is not None else "/")
-        worker.connection.send(frames.Ask(key, name, worker.connection.name_out(PING), NIL, TIMEOUT))
+        name = worker.connection.names.to_wire(worker.cell.path if worker.cell is not None else "/")
+        worker.connection.send(frames.Ask(key, name, worker.connection.names.to_wire(PING), NIL, TIMEOUT))
         try:
             await answered
         except HoldfastError:

@@ -328,12 +328,12 @@ class FrameFaults:
         if kind == "delay" and self._handle is None:
             self._handle = self._cell.node.loop.call_later(self._strikes.delay(), self.let_go)
         if self._handle is not None:
-            if getattr(frame, "body", None) is not None and self._strikes.at == "frame in":
+            if self._strikes.at == "frame in" and frames.payload_of(frame) is not None:
                 frame.body = msgspec.Raw(bytes(frame.body))  # It lies in a buffer that is used again.
             self._held.append(go)
         elif kind == "drop" and isinstance(frame, LOSABLE):
             if self._strikes.at == "frame out":
-                worker.connection._forget_names(frame)
+                worker.connection.names.withdraw(frame)
         elif kind == "corrupt":
             self._struck_down = worker
             self._corrupt(worker)

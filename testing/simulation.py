@@ -156,7 +156,7 @@ class Simulation:
             inside.reset(mark)
         root.node, root.is_up = root.system.node, True
         root.system._body = self._test
-        self._swaps.put(root.node, "wall", lambda: EPOCH + root.node.loop.time())
+        self._swaps.put(root.node.clock, "wall", lambda: EPOCH + root.node.loop.time())
         pool = root.system._workers
         if isinstance(pool, SimulatedWorkers):
             pool.draw_from(self.choices, self.latency)

@@ -161,8 +161,8 @@ def has_become(cell: Cell, old: type[Actor], start: Start[Any]) -> bytes | None:
             cell.node.topics.unsubscribe(topic, cell)
     for topic in new._topics:
         cell.node.topics.subscribe(topic, cell)
-    cell.node.respec(cell, start)
-    return None if cell.node.uplink is None else pack_recipe(start, cell.path)
+    cell.node.ports.respec(cell, start)
+    return None if cell.node.ports.uplink is None else pack_recipe(start, cell.path)
 
 
 def next_start(cell: Cell, new: Start[Any], *, keeps_arguments: bool) -> Start[Any]:
@@ -222,7 +222,7 @@ class Prepare(Order):
         changes = [one.change if isinstance(one, ReplaceState) else one.becoming(actor) for one in self.wanted]
         state, saved = tried_state(actor, changes, self.wanted[0].verb)
         hold.prepared = Prepared(state, start)
-        if cell.node.uplink is None:
+        if cell.node.ports.uplink is None:
             return None, []
         return None if start is None else pack_recipe(start, cell.path), saved
 
@@ -376,8 +376,8 @@ def status_of(cell: Cell) -> Status:
         cell.host.backlog(cell),
         None if turn is None else type_name(type(message_in(item))),
         0.0 if turn is None else cell.node.loop.time() - turn.since,
-        0 if more is None else len(more.links),
-        0 if more is None else len(more.monitors),
+        0 if more is None else len(more.ties.links),
+        0 if more is None else len(more.ties.monitors),
         os.getpid(),
         {} if more is None else {port: target.path for port, target in more.bindings.items()},
     )

@@ -10,7 +10,7 @@ from ..kernel.cell import GONE, Cell
 from ..kernel.envelope import Ask, Item
 from ..kernel.message import Message
 from ..process.wire import frames
-from ..process.wire.connection import BadFrame
+from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Peer, RelayedAsk
 from ..values import decode_value, encode_value
 from .orders import ORDERS, Mark, Order, status_of
@@ -140,7 +140,7 @@ def _send(peer: Peer, path: str, ask: Ask, verb: str, data: bytes) -> None:
     key = peer.expect(ask)
     connection = peer.connection
     fields = {"id": key, "order": verb, "data": data, "left": left}
-    connection.send(frames.Command(connection.name_out(path), "control", fields), path)
+    connection.send(frames.Command(connection.names.to_wire(path), "control", fields), path)
     ask.started = True  # From here on we cannot know.
 
 

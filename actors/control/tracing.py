@@ -60,7 +60,7 @@ class Tap:
         self._zero()
 
     def _zero(self) -> None:
-        self._since, self._life = self.cell.node.wall(), self.cell.life
+        self._since, self._life = self.cell.node.clock.wall(), self.cell.life
         self._in = self._out = self._turns = 0
         self._seconds = self._longest = 0.0
 
@@ -124,7 +124,7 @@ class Tap:
             if not issubclass(kind, TappedContext):
                 _set_class(cell.ctx, _tapped(kind))
         node = cell.node
-        if node.uplink is not None and cell is node.root:
+        if node.ports.uplink is not None and cell is node.root:
             return  # Its home is in another process: the messages are let in there.
         if cell.admit is not self._admit:
             if cell.admit is mailbox.admit_first:
@@ -150,7 +150,7 @@ class Tap:
         """To those who follow: here, or through the root."""
         if not self._tracing:
             return
-        if self.cell.node.uplink is not None:
+        if self.cell.node.ports.uplink is not None:
             self.cell.node.emit(event)
         else:
             self.hub.emit(event)

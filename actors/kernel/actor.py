@@ -119,6 +119,10 @@ class Actor:
     _declared: ClassVar[dict[type, Handles]] = {}
     _topics: ClassVar[tuple[str, ...]] = ()
     _bindings: ClassVar[frozenset[str]] = frozenset()
+    _supervises: ClassVar[bool] = False
+    """Whether it starts children of its own by a spec, and restarts them."""
+    _is_dynamic: ClassVar[bool] = False
+    """Whether those children stop at the same time."""
     _is_part: ClassVar[bool] = False
     """Whether it is a part of the runtime: from another process only who was granted its address speaks to it."""
 

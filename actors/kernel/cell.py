@@ -13,6 +13,7 @@ from ..exit_reasons import SHUTDOWN, ExitReason
 from ..ordered import Ordered
 from . import mailbox
 from .envelope import AnyTable, Ask, Item, Table
+from .links import Ties
 from .message import Message, Order, require_message
 from .ref import ActorRef
 
@@ -118,23 +119,33 @@ class Host(Protocol):
         ...
 
 
+class Belongings:
+    """What a life has taken, and gives back at its end: background tasks, timers, subscriptions, names."""
+
+    __slots__ = ("names", "tasks", "timers", "topics")
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+        self.tasks = Ordered[asyncio.Task[Any]]()
+        self.timers = Ordered[Any]()
+        self.topics = Ordered[str]()
+
+
 class More:
     """What only some cells have; made when first needed, so that an idle actor stays small.
 
-    So are the collections in it: most supervised actors never have any of them.
+    So is what is in `_MADE_LATER`: most supervised actors never have any of it.
     """
 
     __slots__ = (
+        "belongings",
         "bindings",
         "bound",
         "calls",
         "claimed",
         "enders",
-        "has_ties",
+        "has_more",
         "last",
-        "links",
-        "monitors",
-        "names",
         "outlet",
         "reason",
         "start",
@@ -143,30 +154,22 @@ class More:
         "stash",
         "suspended",
         "tap",
-        "tasks",
-        "timers",
-        "topics",
+        "ties",
         "trap_exits",
         "turn",
         "urgent",
-        "watching",
     )
 
+    belongings: Belongings
     bindings: dict[str, Cell]
     calls: list[Call]  # control that waits for the actor's process to be up
-    links: dict[Cell, None]
-    monitors: list[Any]  # who watches us (links.Monitor)
-    names: list[str]
-    tasks: Ordered[asyncio.Task[Any]]
-    timers: Ordered[Any]
-    topics: Ordered[str]
-    watching: dict[Any, None]  # whom we watch (links.Monitor)
+    ties: Ties
 
     def __init__(self) -> None:
         self.bound: Bound | None = None
         self.claimed: frozenset[str] = frozenset()  # ports of which only another process says where they lead
         self.enders: list[asyncio.Future[ExitReason]] | None = None
-        self.has_ties = False  # whether any of the collections was made
+        self.has_more = False  # whether anything was made later
         self.last: Actor | None = None  # the actor of the ended life, if it wants what stays undelivered
         self.outlet: Any = None  # what messages go through: the way into another process, or the actor's home
         self.reason: ExitReason = SHUTDOWN
@@ -181,27 +184,17 @@ class More:
         self.urgent: deque[Item] | None = None
 
     def __getattr__(self, name: str) -> Any:
-        """A collection is asked for the first time. (Python calls this for an empty slot only.)"""
-        make = _COLLECTIONS.get(name)
+        """Something is asked for the first time. (Python calls this for an empty slot only.)"""
+        make = _MADE_LATER.get(name)
         if make is None:
             raise AttributeError(name)
         made = make()
-        self.has_ties = True
+        self.has_more = True
         setattr(self, name, made)
         return made
 
 
-_COLLECTIONS: dict[str, Callable[[], Any]] = {
-    "bindings": dict,
-    "calls": list,
-    "links": dict,
-    "monitors": list,
-    "names": list,
-    "tasks": Ordered,
-    "timers": Ordered,
-    "topics": Ordered,
-    "watching": dict,
-}
+_MADE_LATER: dict[str, Callable[[], Any]] = {"belongings": Belongings, "bindings": dict, "calls": list, "ties": Ties}
 
 
 class _Hot:
@@ -274,8 +267,8 @@ class Cell(_Hot):
             UnknownMessage: the class is known and handles nothing of this type. BadMessage: this is no message.
             NotGranted: it is an order, and this process may give none there.
         """
-        if isinstance(message, Order) and self.node.uplink is not None:
-            self.node.uplink.require_granted(self.path, type_name(type(message)))
+        if isinstance(message, Order) and (uplink := self.node.ports.uplink) is not None:
+            uplink.require_granted(self.path, type_name(type(message)))
         if not self.table.knows(type(message)):
             require_message(self.path, message)
             raise UnknownMessage(self.path, type_name(type(message)))

@@ -89,13 +89,13 @@ class ActorContext:
 
     def now(self) -> float:
         """Unix time in seconds; in a journaled actor, that of the input in hand."""
-        return self.cell.node.wall()
+        return self.cell.node.clock.wall()
 
     @property
     def random(self) -> random.Random:
         """A random generator; in a journaled actor the same numbers come again under replay."""
         if self._random is None:
-            self._random = random.Random(self.cell.node.seed())
+            self._random = random.Random(self.cell.node.numbers.next_seed())
         return self._random
 
     def uuid(self) -> uuid.UUID:
@@ -149,7 +149,7 @@ class ActorContext:
             return ()
         if self._asking is not self.item:
             self._asking = self.item
-            self._turn = self.cell.node.next_turn()
+            self._turn = self.cell.node.numbers.next_turn()
         return ((self.path, self._turn), *chain_of(self.item))
 
     def turn_in(self, chain: Chain) -> bool:
@@ -225,7 +225,7 @@ class ActorContext:
         Not at itself, for it would wait for its own turn: without recovery what finds its own mailbox full is a dead
         letter there.
         """
-        uplink = self.cell.node.uplink
+        uplink = self.cell.node.ports.uplink
         if uplink is not None:  # The subscribers are known to the root only.
             self._alive()
             require_message(topic, message)
@@ -453,7 +453,7 @@ class ActorContext:
 
     def _beside(self, work: Coroutine[Any, Any, T], what: str) -> asyncio.Task[T]:
         """A task of this life, which knows in what turn it was begun."""
-        tasks, context = self.cell.extra().tasks, copy_context()
+        tasks, context = self.cell.extra().belongings.tasks, copy_context()
         context.run(begun_in.set, self.item)
         task = self.cell.node.loop.create_task(contained(work), name=f"{what} of {self.path}", context=context)
         tasks.add(task)

@@ -222,7 +222,7 @@ class Ask(Item, msgspec.Struct, eq=False):
         if not self.future.done():
             self.future.set_result(reply)
         elif self.to is not None:
-            self.to.node.late_replies += 1
+            self.to.node.numbers.late_replies += 1
 
     def fail(self, error: BaseException) -> None:
         """End the wait with a typed failure."""

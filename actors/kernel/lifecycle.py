@@ -161,7 +161,7 @@ def begin(
     build(cell, start, context_type)
     cell.state = RUNNING
     node = cell.node
-    if node.watched:
+    if node.events.has_listeners:
         node.emit(ActorStarted(cell.path, cell.life))
     for topic in start.kind._topics:
         node.topics.subscribe(topic, cell)
@@ -169,7 +169,7 @@ def begin(
         up(cell)
         return None
     started: asyncio.Future[None] = node.loop.create_future()
-    if cell.more is not None or getattr(start.kind, "_supervises", False):
+    if cell.more is not None or start.kind._supervises:
         cell.extra().starting = started  # Somebody waits, also if the life ends before its first turn has.
     mailbox.queue_of(cell).appendleft(FirstTurn(restored, started))
     up(cell)
@@ -333,7 +333,7 @@ def crash(cell: Cell, item: Any, error: BaseException) -> None:
         item.fail(remote_crash(error))
     if isinstance(item, FirstTurn):
         start_fails(cell, item, StartFailed(cell.path, str(reason)))
-        if isinstance(error, StartFailed) and getattr(type(cell.actor), "_supervises", False):
+        if isinstance(error, StartFailed) and cell.actor is not None and cell.actor._supervises:
             finish(cell, SHUTDOWN)  # A child did not start, which is no crash of ours (OTP).
             return
     tell_crash(cell, reason, item)
@@ -343,7 +343,7 @@ def crash(cell: Cell, item: Any, error: BaseException) -> None:
 def tell_crash(cell: Cell, reason: ExitReason, item: object) -> None:
     """The life ends by a crash, be it that its code raised or that it says so."""
     node = cell.node
-    if node.watched:
+    if node.events.has_listeners:
         node.emit(ActorCrashed(cell.path, cell.life, reason, item))
 
 
@@ -472,7 +472,7 @@ def ended(cell: Cell, reason: ExitReason) -> None:
     if more is not None:
         more.reason = reason
     if ctx is not None:
-        if not getattr(type(cell.actor), "_keeps_promises", False):
+        if cell.actor is None or not cell.actor._keeps_promises:
             for ask in ctx.promised():  # Nobody else can answer these.
                 ask.fail(AskFailed(cell.path, str(reason)))
         ctx.close()
@@ -513,18 +513,19 @@ def _undo(cell: Cell) -> None:
     The stash goes back to the queue.
     """
     more = cell.extra()
-    if more.has_ties:
-        for timer in list(more.timers):
+    if more.has_more:
+        own = more.belongings
+        for timer in list(own.timers):
             timer.cancel()
-        for task in more.tasks:
+        for task in own.tasks:
             task.cancel()
-        more.tasks.clear()
-        for topic in list(more.topics):
+        own.tasks.clear()
+        for topic in list(own.topics):
             cell.node.topics.unsubscribe(topic, cell)
-        for name in more.names:
+        for name in own.names:
             cell.node.names.pop(name, None)
-        more.names.clear()
-        more.watching.clear()
+        own.names.clear()
+        more.ties.watching.clear()
     more.suspended, more.trap_exits = 0, False
     queue = cell.queue
     if queue:
@@ -565,8 +566,8 @@ def retire(cell: Cell, why: object) -> None:
             more.bound.release()
         links.announce(cell, more.reason, recovering=False)  # Links of a recorded actor wait for this.
         links.gone(cell, more.reason)
-        commands: list[Item] = [*(more.calls if more.has_ties else ()), *(more.urgent or ())]
-        if more.has_ties:
+        commands: list[Item] = [*(more.calls if more.has_more else ()), *(more.urgent or ())]
+        if more.has_more:
             more.calls = []
         more.urgent = None
         for command in commands:

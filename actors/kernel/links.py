@@ -30,14 +30,25 @@ class Monitor:
         self.active = False
         target = self.target
         self.forget()
-        if target.more is not None and self in target.more.monitors:
-            target.more.monitors.remove(self)
+        if target.more is not None and self in target.more.ties.monitors:
+            target.more.ties.monitors.remove(self)
             target.host.told(target, "demonitor", {"watcher": self.watcher.path, "for_good": self.for_good})
 
     def forget(self) -> None:
         """It is over: its DOWN has been told, or is not wanted."""
         if self.watcher.more is not None:
-            self.watcher.more.watching.pop(self, None)
+            self.watcher.more.ties.watching.pop(self, None)
+
+
+class Ties:
+    """What binds the actors of an address to others: links, who watches them, and whom they watch."""
+
+    __slots__ = ("links", "monitors", "watching")
+
+    def __init__(self) -> None:
+        self.links: dict[Cell, None] = {}
+        self.monitors: list[Monitor] = []
+        self.watching: dict[Monitor, None] = {}
 
 
 def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
@@ -46,15 +57,15 @@ def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
     if target.is_dead:
         watcher.push(Down(watch, NOPROC, recovering=False))
     else:
-        target.extra().monitors.append(watch)
-        watcher.extra().watching[watch] = None
+        target.extra().ties.monitors.append(watch)
+        watcher.extra().ties.watching[watch] = None
         target.host.told(target, "monitor", {"watcher": watcher.path, "for_good": for_good})
     return watch
 
 
 def demonitor(watcher: Cell, target: Cell, *, for_good: bool) -> None:
     """Cancel one such watch, whichever: they are alike."""
-    for watch in target.more.monitors if target.more is not None else ():
+    for watch in target.more.ties.monitors if target.more is not None else ():
         if watch.watcher is watcher and watch.for_good is for_good:
             watch.cancel()
             return
@@ -67,8 +78,8 @@ def link(one: Cell, other: Cell) -> None:
     if other.is_dead:
         one.push(Exit(other, NOPROC))
         return
-    one.extra().links[other] = None
-    other.extra().links[one] = None
+    one.extra().ties.links[other] = None
+    other.extra().ties.links[one] = None
     other.host.told(other, "link", {"peer": one.path})
 
 
@@ -85,8 +96,8 @@ def sever(one: Cell, other: Cell) -> bool:
     """Forget the link on both sides. Returns whether there was one."""
     found = False
     for cell, peer in ((one, other), (other, one)):
-        if cell.more is not None and peer in cell.more.links:
-            del cell.more.links[peer]
+        if cell.more is not None and peer in cell.more.ties.links:
+            del cell.more.ties.links[peer]
             found = True
     return found
 
@@ -94,16 +105,17 @@ def sever(one: Cell, other: Cell) -> bool:
 def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
     """A life has ended: EXIT over its links, DOWN to its monitors."""
     more = cell.more
-    if more is None or not more.has_ties:
+    if more is None or not more.has_more:
         return
-    if more.links and not recovering:
-        peers, more.links = more.links, {}
+    ties = more.ties
+    if ties.links and not recovering:
+        peers, ties.links = ties.links, {}
         for peer in peers:
-            if peer.more is not None and peer.more.links.pop(cell, 0) is None:
+            if peer.more is not None and peer.more.ties.links.pop(cell, 0) is None:
                 peer.push(Exit(cell, reason))
-    if more.monitors:
+    if ties.monitors:
         stay: list[Monitor] = []
-        for watch in more.monitors:
+        for watch in ties.monitors:
             if watch.for_good:
                 stay.append(watch)
             else:
@@ -112,16 +124,17 @@ def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
                     stay.append(watch)
                 else:
                     watch.forget()
-        more.monitors = stay
+        ties.monitors = stay
 
 
 def gone(cell: Cell, reason: ExitReason) -> None:
     """The address is gone for good: tell who watches it."""
     more = cell.more
-    if more is None or not more.has_ties or not more.monitors:
+    if more is None or not more.has_more:
         return
-    watchers = [watch for watch in more.monitors if watch.for_good]
-    more.monitors = [watch for watch in more.monitors if not watch.for_good]
+    ties = more.ties
+    watchers = [watch for watch in ties.monitors if watch.for_good]
+    ties.monitors = [watch for watch in ties.monitors if not watch.for_good]
     for watch in watchers:
         watch.forget()
         watch.watcher.push(Down(watch, reason, recovering=False))
@@ -129,7 +142,7 @@ def gone(cell: Cell, reason: ExitReason) -> None:
 
 def down_arrived(watcher: Cell, target: Cell, reason: ExitReason, *, recovering: bool, for_good: bool) -> None:
     """A DOWN came from another process: it belongs to the oldest such watch that is still wanted."""
-    monitors: list[Monitor] = target.more.monitors if target.more is not None else []
+    monitors: list[Monitor] = target.more.ties.monitors if target.more is not None else []
     for watch in monitors:
         if watch.watcher is watcher and watch.for_good is for_good:
             monitors.remove(watch)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextvars
+import dataclasses
 import itertools
 import random
 import time
@@ -47,10 +48,86 @@ class Kept(Protocol):
         ...
 
 
+def begin_with(cell: Cell, start: Start[Any]) -> None:
+    """The next lives at `cell` begin with `start`; what its supervisor knows of it is the composition root's."""
+    cell.extra().start = start
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Ports:
+    """What a node asks of those around it; the composition root connects it once. By itself it answers like this."""
+
+    here: AddressHost = LOCAL
+    """How lives in this very process are lived."""
+    host_for: Callable[[Any], AddressHost] = lambda spec: LOCAL
+    """Chooses how a child's lives are lived."""
+    complete: Callable[[Any, str], Any] = lambda spec, path: spec
+    """Adds what else is known of a child spec."""
+    respec: Callable[[Cell, Start[Any]], None] = begin_with
+    """Has an actor's next lives begin with this."""
+    outside: Callable[[str], Cell | None] = lambda path: None
+    """Finds cells of other processes."""
+    keeper: Keeper = dataclasses.field(default_factory=NothingKept)
+    uplink: Any = None
+    """In an actor process: the guest, through which the root is reached."""
+    overdue: Overdue | None = None
+    """In an actor process: who ends it when it is blocked."""
+
+
+class Clock:
+    """The times that a node goes by."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self.wall: Callable[[], float] = time.time
+        self.is_monotonic = abs(monotonic() - loop.time()) < SAME_CLOCK  # whether the loop has the machine's clock
+
+    def is_past(self, deadline: float) -> bool:
+        """Whether a deadline is over that was set in this process or another one of the system.
+
+        A loop's own time may be some milliseconds late, so the root's may have told of the end already.
+        """
+        return deadline <= (monotonic() if self.is_monotonic else self._loop.time())
+
+    def on_machine(self, deadline: float) -> float:
+        """A deadline of the loop's, on the clock that all processes of the machine read."""
+        return deadline if self.is_monotonic else monotonic() + deadline - self._loop.time()
+
+
+class Numbers:
+    """What a node counts, and the numbers that it gives out."""
+
+    def __init__(self, seed: int | None) -> None:
+        self._seeds = random.Random(seed)
+        self._names = itertools.count(1)
+        self._turns = itertools.count(1)
+        self.dead_letters = 0
+        self.late_replies = 0
+
+    def next_seed(self) -> int:
+        """A seed for an actor's random generator."""
+        return self._seeds.getrandbits(64)
+
+    def next_name(self) -> str:
+        """A name for an actor that was given none."""
+        return f"${next(self._names)}"
+
+    def next_turn(self) -> int:
+        """A number for a turn that asks."""
+        return next(self._turns)
+
+
 class Node(RunLoop):
     """One process's actors. All of a node runs on one event loop, in one thread."""
 
-    def __init__(self, name: str, loop: asyncio.AbstractEventLoop, *, seed: int | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        loop: asyncio.AbstractEventLoop,
+        *,
+        seed: int | None = None,
+        topics: Topics | None = None,
+    ) -> None:
         super().__init__(loop)
         if not name or "/" in name:
             raise SpecError("ActorSystem", f"the name must be text without '/', not {name!r}")
@@ -58,10 +135,11 @@ class Node(RunLoop):
         self.base_context = contextvars.copy_context()
         self.deadlines = Deadlines(loop)
         self.codec = Codec(self.cell_at)
-        self.watched = False  # whether anybody looks at events: else they are not even made
-        self.events = EventHub(self._watch)
-        self.topics = Topics()
-        self.is_monotonic = abs(monotonic() - loop.time()) < SAME_CLOCK  # whether the loop has the machine's clock
+        self.clock = Clock(loop)
+        self.events = EventHub()
+        self.numbers = Numbers(seed)
+        self.ports = Ports()
+        self.topics = topics or Topics()
         self.threads = Threads()
         self.names: dict[str, Cell] = {}
         self.kept: weakref.WeakKeyDictionary[Cell, Kept] = weakref.WeakKeyDictionary()  # outlives an actor's lives
@@ -69,30 +147,21 @@ class Node(RunLoop):
         self.safe: dict[str, asyncio.TimerHandle] = {}  # who is in safe state here: when that should be over
         self.led: dict[str, dict[str, set[str]]] = {}  # of who is replayed: where bindings led, by where they lead
         self.gave_up: SupervisorGaveUp | None = None  # the last supervisor here that did
-        self.dead_letters = 0
-        self.late_replies = 0
-        self.wall: Callable[[], float] = time.time
-        self.outside: Callable[[str], Cell | None] | None = None  # finds cells of other processes
         self.root: Cell | None = None
         self.arbiter: Any = None  # who may act on which address, once somebody has asked for it
-        self.uplink: Any = None  # in an actor process: the guest, through which the root is reached
-        self.overdue: Overdue | None = None  # in an actor process: who ends it when it is blocked
-        self.here: AddressHost = LOCAL  # lives in this very process
         self.awaited: dict[str, list[Callable[[], object]]] = {}  # what is done when somebody else has a path
-        self.host_for: Callable[[Any], AddressHost] = lambda spec: self.here  # chooses how a child's lives go
-        self.keeper: Keeper = NothingKept()
-        self.complete: Callable[[Any, str], Any] = lambda spec, path: spec  # what else is known of a child spec
-        self.respec: Callable[[Cell, Start[Any]], None] = begin_with  # has an actor's next lives begin with this
-        self._seeds = random.Random(seed)
-        self._numbers = itertools.count(1)
-        self._turns = itertools.count(1)
+
+    def connect(self, ports: Ports) -> None:
+        """Give the node what it asks of those around it, before its first actor."""
+        self.ports = ports
 
     def begin_limit(self, what: str, seconds: float) -> Callable[[], None]:
         """Somebody keeps a time limit by a timer here; what is returned is called when it is void.
 
         In an actor process that has a thread of its own blocked beyond it ends; see `deadline_thread.py`.
         """
-        return self.overdue.begin(what, seconds) if self.overdue is not None else _void
+        overdue = self.ports.overdue
+        return overdue.begin(what, seconds) if overdue is not None else _void
 
     async def close(self) -> None:
         """End every runner, and what still waits for its time."""
@@ -104,17 +173,14 @@ class Node(RunLoop):
 
     # -- events -----------------------------------------------------------------------------------------------------
 
-    def _watch(self, watched: bool) -> None:
-        self.watched = watched
-
     def emit(self, event: Event) -> None:
         """Put an event on the stream."""
         self.events.emit(event)
 
     def dead_letter(self, cell: Cell, message: object, why: str) -> None:
         """A message that nobody handles: counted, and told to who looks, opened if it came packed."""
-        self.dead_letters += 1
-        if self.watched:
+        self.numbers.dead_letters += 1
+        if self.events.has_listeners:
             self.events.emit(DeadLetter(cell.path, self.codec.opened(cell, message), why))
 
     def not_taken(self, cell: Cell, message: object, error: HoldfastError) -> None:
@@ -124,27 +190,10 @@ class Node(RunLoop):
 
     def refused(self, cell: Cell, item: Any, no: Refusal) -> None:
         """A tell was answered with a Refusal: there is nobody to hand it to."""
-        if self.watched:
+        if self.events.has_listeners:
             self.events.emit(DeadLetter(cell.path, item, f"refused: {no}"))
 
-    # -- numbers ----------------------------------------------------------------------------------------------------
-
-    def seed(self) -> int:
-        """A seed for an actor's random generator."""
-        return self._seeds.getrandbits(64)
-
-    def next_turn(self) -> int:
-        """A number for a turn that asks."""
-        return next(self._turns)
-
     # -- the tree ---------------------------------------------------------------------------------------------------
-
-    def is_past(self, deadline: float) -> bool:
-        """Whether a deadline is over that was set in this process or another one of the system.
-
-        A loop's own time may be some milliseconds late, so the root's may have told of the end already.
-        """
-        return deadline <= (monotonic() if self.is_monotonic else self.loop.time())
 
     def cell_below(self, parent: Cell | None, name: str | None, host: Host | None = None) -> Cell:
         """A new cell in the tree.
@@ -153,10 +202,10 @@ class Node(RunLoop):
             NameTaken: there is one of that name.
         """
         if name is None:
-            name = f"${next(self._numbers)}"
+            name = self.numbers.next_name()
         elif parent is not None and (not name or "/" in name):
             raise SpecError("name", f"an actor's name must be text without '/', not {name!r}")
-        cell = Cell(self, parent, name, self.here if host is None else host)
+        cell = Cell(self, parent, name, self.ports.here if host is None else host)
         if parent is not None:
             if parent.children is None:
                 parent.children = {}
@@ -208,7 +257,7 @@ class Node(RunLoop):
                     break
             if cell is not None:
                 return cell
-        return self.outside(path) if self.outside is not None else None
+        return self.ports.outside(path)
 
     def cell_at(self, path: str) -> Cell:
         """The cell at an address; if there is none, a stand-in whose messages are dead letters."""
@@ -255,13 +304,13 @@ class Node(RunLoop):
         if cell.state is not RUNNING:
             raise ActorStopped(cell.path)
         self.names[name] = cell
-        cell.extra().names.append(name)
+        cell.extra().belongings.names.append(name)
 
     def unregister(self, name: str) -> None:
         """Free a name; unknown ones are fine."""
         cell = self.names.pop(name, None)
         if cell is not None:
-            cell.extra().names.remove(name)
+            cell.extra().belongings.names.remove(name)
 
     def bind(self, cell: Cell, port: str, target: Cell, *, is_claimed: bool = False) -> None:
         """Point a binding elsewhere; the owner sees it from its next turn on.
@@ -296,11 +345,6 @@ class Node(RunLoop):
 
 def _void() -> None:
     """Nobody watches."""
-
-
-def begin_with(cell: Cell, start: Start[Any]) -> None:
-    """The next lives at `cell` begin with `start`; what its supervisor knows of it is the composition root's."""
-    cell.extra().start = start
 
 
 def cell_kind(cell: Cell) -> type[Actor] | None:

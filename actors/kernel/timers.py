@@ -28,7 +28,7 @@ class Timer:
         self._queued = False
         self._due = cell.node.loop.time() + delay
         self._handle: asyncio.TimerHandle | None = None
-        cell.extra().timers.add(self)
+        cell.extra().belongings.timers.add(self)
         self._arm()
 
     @property
@@ -43,7 +43,7 @@ class Timer:
         self._handle = None
         self._queued = False
         if self._cell.more is not None:
-            self._cell.more.timers.discard(self)
+            self._cell.more.belongings.timers.discard(self)
 
     def pause(self) -> None:
         """Its actor is being moved: nothing comes until `resume`."""
@@ -102,7 +102,7 @@ class Timer:
         """Its turn has come: whether it still counts."""
         counts, self._queued = self._queued, False
         if self._interval is None and self._cell.more is not None:
-            self._cell.more.timers.discard(self)
+            self._cell.more.belongings.timers.discard(self)
         return counts
 
 

@@ -29,7 +29,7 @@ class Topics:
         if not topic.startswith("/"):
             raise ValueError(f"topic {topic!r} must start with '/'")
         self._cells.setdefault(topic, {})[cell] = None
-        cell.extra().topics.add(topic)
+        cell.extra().belongings.topics.add(topic)
 
     def unsubscribe(self, topic: str, cell: Cell) -> None:
         """No more of it; unknown ones are fine."""
@@ -39,7 +39,7 @@ class Topics:
             if not cells:
                 del self._cells[topic]
         if cell.more is not None:
-            cell.more.topics.discard(topic)
+            cell.more.belongings.topics.discard(topic)
 
     def subscribers(self, topic: str) -> tuple[Cell, ...]:
         """In the order of subscription."""

@@ -61,7 +61,8 @@ class FromHere(Leaving):
             list(more.stash or ()),
         )
         # What belongs to the address: a new life that fails may have added to it.
-        self._topics, self._links, self._watches = set(more.topics), set(more.links), set(more.watching)
+        self._topics = set(more.belongings.topics)
+        self._links, self._watches = set(more.ties.links), set(more.ties.watching)
         self.pack(actor, state)
         move.at_rest()
         self._rested.set_result(None)
@@ -95,12 +96,12 @@ class FromHere(Leaving):
         if transit is None:
             return
         more = cell.extra()
-        for topic in [topic for topic in more.topics if topic not in self._topics]:
+        for topic in [topic for topic in more.belongings.topics if topic not in self._topics]:
             cell.node.topics.unsubscribe(topic, cell)
-        for peer in [peer for peer in more.links if peer not in self._links]:
-            peer.extra().links.pop(cell, None)
-            del more.links[peer]
-        for watch in [watch for watch in more.watching if watch not in self._watches]:
+        for peer in [peer for peer in more.ties.links if peer not in self._links]:
+            peer.extra().ties.links.pop(cell, None)
+            del more.ties.links[peer]
+        for watch in [watch for watch in more.ties.watching if watch not in self._watches]:
             watch.cancel()
         self.take_back(transit)
         transit.over(cell, transit.old)

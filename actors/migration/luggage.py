@@ -69,7 +69,7 @@ class StatePacker:
 
     def __init__(self, actor: Actor, owe: Owe) -> None:
         self._actor, self._owe = actor, owe
-        self._timers = list(actor.ctx.cell.extra().timers)
+        self._timers = list(actor.ctx.cell.extra().belongings.timers)
         self._owed: set[int] = set()
 
     def pack(self) -> bytes:
@@ -124,17 +124,17 @@ def pack_rest(actor: Actor) -> dict[str, Any]:
     cell = actor.ctx.cell
     more, codec = cell.extra(), cell.node.codec
     timers: list[Any] = []
-    for timer in more.timers:
+    for timer in more.belongings.timers:
         message, left, interval, queued = timer.packed()
         timers.append([message_name(type(message)), codec.encode(message, cell.path), left, interval, queued])
-    watches = [[watch.target.path, watch.for_good] for watch in more.watching if watch.life == cell.life]
+    watches = [[watch.target.path, watch.for_good] for watch in more.ties.watching if watch.life == cell.life]
     downs = [item.watch for item in cell.queue or () if type(item) is Down and item.watch.active]
-    watches += [[watch.target.path, watch.for_good] for watch in downs if watch not in more.watching]
+    watches += [[watch.target.path, watch.for_good] for watch in downs if watch not in more.ties.watching]
     return {
         "timers": timers,
         "trap_exits": more.trap_exits,
         "suspended": bool(more.suspended & mailbox.BY_USER),
-        "links": [peer.path for peer in more.links],
+        "links": [peer.path for peer in more.ties.links],
         "watches": watches,
     }
 
@@ -169,7 +169,7 @@ def unpack(
             case _:
                 return watched(*value.key)
 
-    holds, values = cast("list[Any]", decode_value(state, imports=cell.node.uplink is not None))
+    holds, values = cast("list[Any]", decode_value(state, imports=cell.node.ports.uplink is not None))
     put_state(actor, lift(values, found) if holds else values)
 
 

@@ -80,7 +80,7 @@ class Take(Item):
             take._refused(str(error) if isinstance(error, HoldfastError) else error_text(error))
             return None
         take.is_done = True
-        for timer in cell.extra().timers:
+        for timer in cell.extra().belongings.timers:
             timer.pause()
         return LEAVE  # And stays `scheduled`, so that nobody puts it on the run queue.
 
@@ -97,9 +97,10 @@ def _ends(command: Item) -> bool:
 def _busy(cell: Cell) -> str:
     """Why an actor cannot be brought to rest yet; "" if it can."""
     more = cell.extra()
-    if more.tasks:
+    if more.belongings.tasks:
         return "background work (pipe_to_self, create_task) is out"
-    own = cell.node.uplink if cell is cell.node.root else None  # Else what it has passed on is answered from here on.
+    # Of another actor, what it has passed on is answered from here on.
+    own = cell.node.ports.uplink if cell is cell.node.root else None
     for item in cell.queue or ():
         if isinstance(item, Piped):
             return "the result of background work waits for its turn"
@@ -112,7 +113,7 @@ def _busy(cell: Cell) -> str:
 
 def resume(cell: Cell) -> None:
     """The life that had been brought to rest goes on where it was."""
-    for timer in cell.extra().timers:
+    for timer in cell.extra().belongings.timers:
         timer.resume()
     lifecycle.up(cell)
 
@@ -209,24 +210,25 @@ def settle(twin: Cell, cell: Cell) -> None:
     ctx.cell = cell
     ctx.keep_promises()
     mine, its = cell.extra(), twin.extra()
-    mine.timers, mine.tasks, mine.stash = its.timers, its.tasks, its.stash
+    has, had, ties, tied = mine.belongings, its.belongings, mine.ties, its.ties
+    has.timers, has.tasks, mine.stash = had.timers, had.tasks, its.stash
     mine.trap_exits = its.trap_exits
-    for timer in mine.timers:
+    for timer in has.timers:
         timer.belongs_to(cell)
-    for topic in list(its.topics):
+    for topic in list(had.topics):
         node.topics.unsubscribe(topic, twin)
         node.topics.subscribe(topic, cell)
-    for name in its.names:
+    for name in had.names:
         node.names[name] = cell
-        mine.names.append(name)
-    for peer in its.links:
-        peer.extra().links.pop(twin, None)
-        peer.extra().links[cell] = mine.links[peer] = None
-    for watch in its.watching:
+        has.names.append(name)
+    for peer in tied.links:
+        peer.extra().ties.links.pop(twin, None)
+        peer.extra().ties.links[cell] = ties.links[peer] = None
+    for watch in tied.watching:
         watch.watcher, watch.life = cell, cell.life
-        mine.watching[watch] = None
-    mine.monitors += its.monitors
-    for watch in its.monitors:
+        ties.watching[watch] = None
+    ties.monitors += tied.monitors
+    for watch in tied.monitors:
         watch.target = cell
     for child in (twin.children or {}).values():
         child.parent = cell
@@ -260,10 +262,11 @@ def part(cell: Cell) -> Cell:
     old.actor, old.ctx, old.context = cell.actor, ctx, cell.context
     ctx.cell = old
     its = old.extra()
-    its.timers, more.timers = more.timers, Ordered()
-    its.tasks, more.tasks = more.tasks, Ordered()
+    gone, kept = its.belongings, more.belongings
+    gone.timers, kept.timers = kept.timers, Ordered()
+    gone.tasks, kept.tasks = kept.tasks, Ordered()
     its.bindings = more.bindings
-    for timer in list(its.timers):
+    for timer in list(gone.timers):
         timer.belongs_to(old)
         timer.cancel()
     cell.actor = cell.ctx = cell.context = None

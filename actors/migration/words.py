@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 from ..errors import error_text
 from ..process.wire import frames
-from ..process.wire.connection import BadFrame, Connection
+from ..process.wire.connection import Connection
+from ..process.wire.frames import BadFrame
 from ..values import decode_value, encode_value
 
 if TYPE_CHECKING:
@@ -37,7 +38,7 @@ def say(connection: Connection, path: str, attempt: int, step: str, **told: Any)
     data = encode_value(told, where=path)
     for at in range(0, len(data), PIECE):
         part, is_last = data[at : at + PIECE], at + PIECE >= len(data)
-        connection.send(frames.Migrate(connection.name_out(path), attempt, step, part, is_last), path)
+        connection.send(frames.Migrate(connection.names.to_wire(path), attempt, step, part, is_last), path)
 
 
 class Incoming:

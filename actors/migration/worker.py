@@ -220,7 +220,7 @@ class FromWorker(FromOwnWorker):
         unpack(actor, luggage.state, luggage.rest, self._asks.__getitem__, self._watched)
 
     def _watched(self, path: str, for_good: bool) -> Monitor:
-        watching: dict[Monitor, None] = self.cell.extra().watching
+        watching: dict[Monitor, None] = self.cell.extra().ties.watching
         return next(watch for watch in watching if watch.target.path == path and watch.for_good is for_good)
 
     def died(self, cell: Cell, reason: ExitReason) -> None:

@@ -15,7 +15,7 @@ from ..kernel.cell import RUNNING, Cell
 from ..kernel.context import ActorContext
 from ..kernel.envelope import Ask, Item
 from ..kernel.links import Monitor
-from ..process.wire.connection import BadFrame
+from ..process.wire.frames import BadFrame
 from ..process.wire.peer import Arrived, RelayedAsk
 from ..process.wire.start_codec import unpack_recipe
 from .luggage import pack_items, pack_rest, unpack
@@ -39,10 +39,9 @@ class Attempt(Protocol):
 class GuestMoves:
     """The moves of the actors of a process: its own, or those below its supervisor; one attempt at a time for each."""
 
-    def __init__(self, guest: Guest) -> None:
-        self._guest = guest
+    def __init__(self, guest: Guest, child_attempt: Callable[[str, int], Attempt]) -> None:
+        self._guest, self._child_attempt = guest, child_attempt
         self._attempts: dict[str, tuple[int, Incoming, Attempt]] = {}  # by address: who arrives has no cell yet
-        self.of_child: Callable[[str, int], Attempt] | None = None  # makes one of a child of the process's supervisor
 
     def hear(self, path: str, frame: Migrate) -> None:
         """Do the next step of a move. The words of the root come in order: a new number ends an earlier attempt.
@@ -58,10 +57,10 @@ class GuestMoves:
             attempt.obey(frame.step, told)
 
     def _made(self, path: str, number: int) -> tuple[int, Incoming, Attempt]:
-        root, attempt = self._guest.node.root, None
-        if self.of_child is not None and root is not None and path != root.path:
-            attempt = self.of_child(path, number)
-        made = self._attempts[path] = number, Incoming(imports=True), attempt or GuestMove(self._guest, path, number)
+        root = self._guest.node.root
+        is_own = root is None or path == root.path  # Else it is of a child of the process's supervisor.
+        attempt = GuestMove(self._guest, path, number) if is_own else self._child_attempt(path, number)
+        self._attempts[path] = made = number, Incoming(imports=True), attempt
         return made
 
     def readdressed(self, old: str, new: str) -> None:
@@ -156,15 +155,15 @@ class GuestMove:
         watches = [self._watch(cell, path, for_good) for path, for_good in rest["watches"]]
         for path in rest["links"]:
             peer = self._guest.node.cell_at(path)
-            cell.extra().links[peer] = peer.extra().links[cell] = None
+            cell.extra().ties.links[peer] = peer.extra().ties.links[cell] = None
         unpack(actor, luggage["state"], rest, self._owed, lambda path, for_good: _found(watches, path, for_good))
         return await_up(cell, start)
 
     def _watch(self, cell: Cell, path: str, for_good: bool) -> Monitor:
         """A watch that the root keeps already."""
         watch = Monitor(cell, self._guest.node.cell_at(path), for_good)
-        watch.target.extra().monitors.append(watch)
-        cell.extra().watching[watch] = None
+        watch.target.extra().ties.monitors.append(watch)
+        cell.extra().ties.watching[watch] = None
         return watch
 
     def _owed(self, key: int) -> Ask:
@@ -231,7 +230,7 @@ class GuestMove:
 def _leave(cell: Cell, reason: ExitReason) -> None:
     """The actor lives elsewhere: what is left here ends, and tells nobody."""
     more = cell.extra()
-    for kept in (more.links, more.topics, more.monitors):
+    for kept in (more.ties.links, more.belongings.topics, more.ties.monitors):
         kept.clear()
     if cell.queue is not None:
         cell.queue.clear()

@@ -25,7 +25,7 @@ from ..overflow import DROPS
 from ..persistence import child_key
 from .resource_limits import Limits, limits_data
 from .wire import frames
-from .wire.connection import BadFrame
+from .wire.frames import BadFrame
 from .wire.peer import obey, send_signal
 from .wire.start_codec import pack_recipe
 from .worker_pool import Worker, Workers
@@ -66,7 +66,7 @@ class Outlet:
             worker.send_item(cell, self.path, item, number)
         else:  # A plain message of a type that was sent before: all names are numbers.
             connection = worker.connection
-            connection.tell(connection.name_out(self.path), name, item, number, self.path)  # type: ignore[arg-type]
+            connection.tell(connection.names.to_wire(self.path), name, item, number, self.path)  # type: ignore[arg-type]
         self.sent = number
         flight = self.flight
         flight.append((number, item))
@@ -283,7 +283,7 @@ class FlightHome(WorkerHome):
         if cell.host.place.process(cell) is not worker:
             raise StartFailed(cell.path, str(cell.extra().reason))  # It was up, and has died before we came to it.
         node = cell.node
-        if node.watched:
+        if node.events.has_listeners:
             node.emit(ActorStarted(cell.path, cell.life))
         outlet: Outlet = cell.extra().outlet
         outlet.worker = worker
@@ -450,7 +450,7 @@ class WorkerPlace(Place):
         """Ask the actor to end in good order; while it starts, when it is up. A supervisor can end while it starts."""
         worker = self.workers.of(cell)
         start = cell.extra().start
-        supervises = start is not None and getattr(start.kind, "_supervises", False)
+        supervises = start is not None and start.kind._supervises
         if worker is not None and (supervises or self.home.takes_stop(cell)):
             self.send_stop(worker, cell, reason)
         else:
@@ -460,7 +460,7 @@ class WorkerPlace(Place):
         """Tell the process that its actor shall end."""
         self.stop_sent = reason
         connection = worker.connection
-        connection.send(frames.Command(connection.name_out(cell.path), "stop", {"reason": pack_exit(reason)}))
+        connection.send(frames.Command(connection.names.to_wire(cell.path), "stop", {"reason": pack_exit(reason)}))
 
     def kill(self, cell: Cell) -> None:
         """SIGKILL the process."""
@@ -507,7 +507,7 @@ class WorkerPlace(Place):
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self.workers.of(cell)
         if worker is not None and verb in ("bind", "link", "unlink"):  # What its process has to know of itself.
-            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
+            worker.connection.send(frames.Command(worker.connection.names.to_wire(cell.path), verb, data))
 
 
 def in_process(workers: Workers, limits: Limits | None) -> AddressHost:
@@ -554,7 +554,7 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
 
 def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
     """What an actor process wants done to an address, or tells of its own."""
-    cell = node.cell_at(worker.connection.name_in(frame.to))
+    cell = node.cell_at(worker.connection.names.from_wire(frame.to))
     match frame.verb:
         case "subscribe":
             node.topics.subscribe(frame.data["topic"], cell)
@@ -583,7 +583,7 @@ def keep(worker: Worker, frame: frames.Command) -> None:
         BadFrame: there is nothing like it to be done.
     """
     node, path, answer = worker.node, frame.data["path"], frame.data.get("answer")
-    keeper, problem = node.keeper, None
+    keeper, problem = node.ports.keeper, None
     try:
         match frame.data["what"]:
             case "erase":

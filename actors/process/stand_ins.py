@@ -12,7 +12,7 @@ from ..kernel.bindings import claim
 from ..kernel.cell import RUNNING, Cell, Host
 from ..kernel.codec import Parcel
 from ..kernel.node import cell_kind
-from .wire.connection import BadFrame
+from .wire.frames import BadFrame
 from .wire.peer import OutsideHost, Peer
 from .wire.start_codec import loaded
 
@@ -95,7 +95,7 @@ class Inner:
         cell.host.parent.leaves(is_restarting=with_parent)
         more = cell.extra()
         more.reason = reason
-        for topic in list(more.topics):
+        for topic in list(more.belongings.topics):
             self._node.topics.unsubscribe(topic, cell)
         lifecycle.retire(cell, reason)
         links.announce(cell, reason, recovering=False)

@@ -9,7 +9,7 @@ import socket
 import sys
 import weakref
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 
@@ -21,17 +21,20 @@ from ..events import ActorStarted, Event, event_data
 from ..exit_reasons import ExitReason, pack_exit
 from ..fast_loop import new_event_loop
 from ..kernel import lifecycle
+from ..kernel.actor import Start
 from ..kernel.address_host import AddressHost
 from ..kernel.cell import RUNNING, Cell
 from ..kernel.envelope import AnyTable
 from ..kernel.lifecycle import HERE, MAILBOX
 from ..kernel.message import Message, Order, message_name
-from ..kernel.node import Node
+from ..kernel.node import Node, Ports
 from ..kernel.ref import current
 from ..kernel.topics import Topics
-from ..migration.worker_moves import GuestMoves
+from ..migration.worker_moves import Attempt, GuestMoves
+from ..persistence import Keeper
 from .wire import frames
-from .wire.connection import BadFrame, Connection
+from .wire.connection import Connection
+from .wire.frames import BadFrame
 from .wire.peer import Arrived, OutsideHost, Peer, RelayedAsk, named, obey
 from .wire.start_codec import unpack_recipe
 from .wire.worker_gate import is_at_or_below, is_granted
@@ -41,21 +44,53 @@ ENDED_WITHIN = 1.0
 
 _BODIES = msgspec.msgpack.Decoder(list[frames.Raw])
 
-Launcher = Callable[["Guest", Cell, frames.Launch], "asyncio.Future[None] | None"]
-"""Begins the life a launch frame asks for; the composition root gives one that knows recovery and supervision."""
+
+class Composition(Protocol):
+    """What the composition root alone knows, for one actor process."""
+
+    recovery: Any
+    """The recovery method's side in this process."""
+
+    @property
+    def keeper(self) -> Keeper:
+        """The root's keeper, as the supervisors of this process speak to it."""
+        ...
+
+    def launch(self, cell: Cell, frame: frames.Launch) -> asyncio.Future[None] | None:
+        """Begin the life that the root asks for."""
+        ...
+
+    def host_for(self, spec: Any) -> AddressHost:
+        """How a child below this process's supervisor is lived."""
+        ...
+
+    def complete(self, spec: Any, path: str) -> Any:
+        """A child spec with what else is known of it."""
+        ...
+
+    def respec(self, cell: Cell, start: Start[Any]) -> None:
+        """Have an actor's next lives begin with this."""
+        ...
+
+    def child_attempt(self, path: str, number: int) -> Attempt:
+        """An attempt to move a live child of this process's supervisor."""
+        ...
 
 
-def main(sock: socket.socket, page_fd: int, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
+Compose = Callable[["Guest"], Composition]
+
+
+def main(sock: socket.socket, page_fd: int, compose: Compose) -> int:
     """Serve the root until its socket ends. Returns the exit code."""
     page = memoryview(mmap.mmap(page_fd, 0)).cast("Q")
     os.close(page_fd)
     with asyncio.Runner(loop_factory=new_event_loop) as runner:
-        return runner.run(_serve(sock, page, launcher, prepare))
+        return runner.run(_serve(sock, page, compose))
 
 
-async def _serve(sock: socket.socket, page: memoryview, launcher: Launcher, prepare: Callable[[Guest], None]) -> int:
-    guest = Guest(asyncio.get_running_loop(), page, launcher)
-    prepare(guest)
+async def _serve(sock: socket.socket, page: memoryview, compose: Compose) -> int:
+    loop = asyncio.get_running_loop()
+    guest = Guest(loop, page, compose, Overdue(loop))
     guest.join(Connection(guest.on_frame, guest.on_lost, guest.on_batch))
     guest.connection.takers = guest.takers
     await guest.connection.open(sock)
@@ -128,23 +163,32 @@ class NudgingPage:
 class Guest(Peer):
     """The child's end of the connection, and its node."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, page: memoryview, launcher: Launcher) -> None:
-        super().__init__(Node("guest", loop))
+    def __init__(
+        self, loop: asyncio.AbstractEventLoop, page: memoryview, compose: Compose, overdue: Overdue | None
+    ) -> None:
+        super().__init__(Node("guest", loop, topics=GuestTopics(self)))
         self.page: Any = page
         self.ended: asyncio.Future[int] = loop.create_future()
-        self.moves = GuestMoves(self)
-        self.recovery: Any = None  # the recovery method's side in this process, if it has one
-        self._launcher = launcher
+        self._composition = composition = compose(self)
+        self.recovery = composition.recovery
+        self.moves = GuestMoves(self, composition.child_attempt)
         self._starting: tuple[int, asyncio.Future[None]] | None = None  # the launch whose `on_start` is awaited
         self._targets: dict[int, Cell] = {}
         self._outside: dict[str, Cell] = {}
         self._host = OutsideHost(self)
-        self.node.outside = self.outside
-        self.node.uplink = self
         self.parent = GuestParent(self)
-        self.node.here = AddressHost(MAILBOX, HERE, self.parent)
-        self.node.topics = GuestTopics(self)
-        self.node.overdue = Overdue(loop)
+        self.node.connect(
+            Ports(
+                here=AddressHost(MAILBOX, HERE, self.parent),
+                host_for=composition.host_for,
+                complete=composition.complete,
+                respec=composition.respec,
+                outside=self.outside,
+                keeper=composition.keeper,
+                uplink=self,
+                overdue=overdue,
+            )
+        )
         self.node.events.add_sink(self._on_event)
         self.takers: dict[type[frames.Frame], Callable[[Any], None]] = {
             frames.Tell: self._tell,
@@ -156,7 +200,7 @@ class Guest(Peer):
             frames.Launch: self._launch,
             frames.Command: self._command,
             frames.Record: self.on_record,
-            frames.Migrate: lambda frame: self.moves.hear(self.connection.name_in(frame.to), frame),
+            frames.Migrate: lambda frame: self.moves.hear(self.connection.names.from_wire(frame.to), frame),
             frames.Forget: self.on_forget,
         }
 
@@ -191,14 +235,14 @@ class Guest(Peer):
         """Publish through the root; the future ends when every subscriber has accepted."""
         connection = self.connection
         name, body = self._payload(message)
-        source = None if sender is None else connection.name_out(sender.path)
+        source = None if sender is None else connection.names.to_wire(sender.path)
         key, accepted = self.acceptance()
         connection.send(frames.Publish(key, topic, name, body, source), topic)
         return accepted
 
     def command(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """Tell the root something about an address."""
-        self.connection.send(frames.Command(self.connection.name_out(cell.path), verb, data))
+        self.connection.send(frames.Command(self.connection.names.to_wire(cell.path), verb, data))
 
     def address_retired(self, cell: Cell) -> None:
         """An address of this process is free. The process's own is kept at the root, and the process ends with it."""
@@ -310,14 +354,14 @@ class Guest(Peer):
         """The cell at an address of this process."""
         if type(to) is int and (cell := self._targets.get(to)) is not None:
             return cell
-        path = self.connection.name_in(to)
+        path = self.connection.names.from_wire(to)
         cell = self.node.cell_at(path)
         if cell is self.node.root:  # Cells of a subtree come and go; ours stays.
-            self._targets[self.connection.number_in(to)] = cell
+            self._targets[self.connection.names.number_of(to)] = cell
         return cell
 
     def _launch(self, frame: frames.Launch) -> None:
-        path = self.connection.name_in(frame.to)
+        path = self.connection.names.from_wire(frame.to)
         if frame.options.get("prepare"):
             self._prepare(frame)
             return
@@ -325,7 +369,7 @@ class Guest(Peer):
         if frame.options.get("bounded"):
             self.page = NudgingPage(self, self.page)
         node = self.node
-        cell = node.root = Cell(node, None, path, node.here)
+        cell = node.root = Cell(node, None, path, node.ports.here)
         cell.life = frame.life - 1
         try:
             _apply(limits)
@@ -337,7 +381,7 @@ class Guest(Peer):
             if frame.options.get("moved"):
                 up: asyncio.Future[None] | None = self.moves.begin(cell, unpack_recipe(frame.recipe))
             else:
-                up = self._launcher(self, cell, frame)
+                up = self._composition.launch(cell, frame)
         except (
             BaseException
         ) as error:  # Limits that cannot be set, modules that cannot be imported, arguments, `__init__`.
@@ -372,7 +416,7 @@ class Guest(Peer):
 
     def _command(self, frame: frames.Command) -> None:
         if frame.verb == "readdress":
-            self._readdress(self.connection.name_in(frame.to))
+            self._readdress(self.connection.names.from_wire(frame.to))
             return
         cell = self._target(frame.to)
         if frame.verb == "bind":
@@ -403,7 +447,7 @@ class Guest(Peer):
         told = pack_exit(reason if reason is not None else exit_reasons.SHUTDOWN)
         sys.stdout.flush()
         sys.stderr.flush()
-        self.connection.send(frames.Ended(self.connection.name_out(cell.path), cell.life, told))
+        self.connection.send(frames.Ended(self.connection.names.to_wire(cell.path), cell.life, told))
         self.connection.flush()
         # The root ends us when it has read this. If we closed, and it wrote to us just then, it would read no more.
         self.node.loop.call_later(ENDED_WITHIN, self.connection.close)

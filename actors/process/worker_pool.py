@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import os
 import signal
 import time
 from collections.abc import Callable, Sequence
@@ -15,20 +14,21 @@ from ..control.orders import Look
 from ..control.orders_lane import order, send_call
 from ..errors import AskFailed, ProcessUnavailable, StartFailed, StartIgnored
 from ..events import TRACED, LogLine, ProcessDied, ProcessStarted, TrustBreached
-from ..exit_reasons import KILLED, Exited, ExitReason, Hung, OutOfMemory, Signal, pack_exit, unpack_exit
+from ..exit_reasons import KILLED, Exited, ExitReason, Hung, pack_exit, unpack_exit
 from ..kernel.cell import Cell
-from ..kernel.envelope import Ask
 from ..migration.words import NO_ATTEMPT, say
 from ..streams import check_can_watch
 from .fork.fork_server import ForkServer
 from .fork.forked_process import Forked, has_ended
 from .fork.launch import keep_large_memory, why_not_importable
+from .process_end import ProcessEnd
 from .process_watchdog import LOOKS, Watch, oom_kills
 from .program.stdout import OutputReader
 from .resource_limits import Limits
 from .stand_ins import Inner
 from .wire import frames
-from .wire.connection import BadFrame, Connection
+from .wire.connection import Connection
+from .wire.frames import BadFrame
 from .wire.peer import Peer
 from .wire.worker_gate import Gate
 
@@ -58,16 +58,9 @@ class Worker(Peer):
         self._workers = workers
         self._died: Callable[[Cell, ExitReason], None] | None = None
         self._launches: dict[int, asyncio.Future[None]] = {}
-        self._told: ExitReason | None = None  # the reason the actor itself gave
-        self._killed_for: ExitReason | None = None
-        self._status: int | None = None
-        self._lost = False
-        self._is_orphaned = False
-        self._buried = False
+        self.end = ProcessEnd(oom_kills())
         self._is_reserved = False  # for an actor that is being moved here, and lives elsewhere so far
         self._grave: asyncio.Future[None] = self.node.loop.create_future()
-        self.noticed_at = 0.0  # when the first sign of its end came, on the monotonic clock
-        self._oom_before = oom_kills()
         self._watch: Watch | None = None
         self._outputs: list[OutputReader] = []
         self.movers: dict[int, Callable[[frames.Migrate], None]] = {}  # who hears of which attempt to move an actor
@@ -89,9 +82,10 @@ class Worker(Peer):
         }
         check_can_watch(forked.sock.fileno(), forked.stdout_fd, forked.stderr_fd)
         await self.connection.open(forked.sock)
-        for stream, name in (("stdout", "stdout_fd"), ("stderr", "stderr_fd")):
-            self._outputs.append(OutputReader(loop, getattr(forked, name), functools.partial(self._on_line, stream)))
-            setattr(forked, name, -1)
+        self._outputs.append(OutputReader(loop, forked.stdout_fd, functools.partial(self._on_line, "stdout")))
+        forked.stdout_fd = -1  # Its reader closes it from here on.
+        self._outputs.append(OutputReader(loop, forked.stderr_fd, functools.partial(self._on_line, "stderr")))
+        forked.stderr_fd = -1
 
     def is_alive(self) -> bool:
         """Whether it can be given an actor: a process ends with its fork server, but not in the same instant."""
@@ -102,7 +96,7 @@ class Worker(Peer):
         self.reserve(cell, limits, died)
         self._is_reserved = False
         self._workers.by_cell[cell] = self
-        if self.node.watched:
+        if self.node.events.has_listeners:
             self.node.emit(ProcessStarted(cell.path, self.pid))
 
     async def launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
@@ -131,12 +125,12 @@ class Worker(Peer):
 
     async def _ask_launch(self, cell: Cell, recipe: bytes, options: dict[str, Any]) -> None:
         self._check_program(cell, recipe)
-        self._last_id = key = self._last_id + 1
-        if self._buried:
+        key = self.next_id()
+        if self.end.is_buried:
             raise StartFailed(cell.path, "its process has ended")
         up = self._launches[key] = self.node.loop.create_future()
         connection = self.connection
-        connection.send(frames.Launch(key, connection.name_out(cell.path), cell.life, recipe, options), cell.path)
+        connection.send(frames.Launch(key, connection.names.to_wire(cell.path), cell.life, recipe, options), cell.path)
         if "prepare" not in options:
             self._order_again(cell)
         try:
@@ -171,7 +165,7 @@ class Worker(Peer):
         old, self.home = self.home, path
         self.gate.readdressed(old, path)
         self.inner.readdressed(old, path)
-        self.connection.send(frames.Command(self.connection.name_out(path), "readdress", {}))
+        self.connection.send(frames.Command(self.connection.names.to_wire(path), "readdress", {}))
 
     def give_back(self) -> None:
         """The actor is not moved into this process: it ends, and nobody is told."""
@@ -182,7 +176,7 @@ class Worker(Peer):
     @property
     def is_killed(self) -> bool:
         """Whether we have killed it; it may not have died yet."""
-        return self._killed_for is not None
+        return self.end.killed_for is not None
 
     def on_death(self, died: Callable[[Cell, ExitReason], None]) -> None:
         """Who hears of its end from now on."""
@@ -205,8 +199,8 @@ class Worker(Peer):
             self._watch.close()
             self._watch = None
         self.movers.clear()
-        self.record_taker, self._record_takers = _no_record, {}
-        if self._buried:
+        self.ignore_records()
+        if self.end.is_buried:
             return
         connection = self.connection
         say(connection, cell.path, NO_ATTEMPT, "leave", reason=pack_exit(reason))
@@ -216,8 +210,8 @@ class Worker(Peer):
 
     def kill(self, why: ExitReason) -> None:
         """SIGKILL, by pidfd; its end is then called `why`."""
-        if self._killed_for is None:
-            self._killed_for = why
+        if self.end.killed_for is None:
+            self.end.killed_for = why
         if not self.forked.kill(signal.SIGKILL):
             self.connection.close()  # It ends when it sees that, unless it hangs.
 
@@ -273,7 +267,7 @@ class Worker(Peer):
     def on_ended(self, frame: frames.Ended) -> None:
         """The actor's life has ended by itself; its process has nothing more to do."""
         self._noticed()
-        self._told = unpack_exit(frame.reason)
+        self.end.told = unpack_exit(frame.reason)
         self.forked.kill(signal.SIGKILL)
 
     def on_moved(self) -> None:
@@ -294,63 +288,62 @@ class Worker(Peer):
         self._workers.on_note(self, frame)
 
     def _on_line(self, stream: str, text: str) -> None:
-        if self.node.watched:
+        if self.node.events.has_listeners:
             path = self.cell.path if self.cell is not None else f"process {self.pid}"
             self.node.emit(LogLine(path, stream, text))
 
     # -- its end ----------------------------------------------------------------------------------------------------
 
     def _noticed(self) -> None:
-        if not self.noticed_at:
-            self.noticed_at = time.monotonic()
+        if not self.end.noticed_at:
+            self.end.noticed_at = time.monotonic()
 
     def _on_lost(self, error: Exception | None) -> None:
-        self._lost = True
+        self.end.is_lost = True
         self._noticed()
         if isinstance(error, BadFrame):
             self._breached(error)
-        if self._status is not None or self._is_orphaned:
-            self.forked.kill(signal.SIGKILL)
-            self._bury()
-        else:
-            self.forked.kill(signal.SIGKILL)  # Whoever closes its socket has to end.
-            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+        self.forked.kill(signal.SIGKILL)  # Whoever closes its socket has to end.
+        self._bury_soon()
 
     def _breached(self, error: BadFrame) -> None:
         """It spoke nonsense, or of what is not its own."""
-        if self._killed_for is None and self._status is None:
+        if self.end.killed_for is None and self.end.status is None:
             path = self.cell.path if self.cell is not None else f"process {self.pid}"
             self.node.emit(TrustBreached(path, self.pid, error.problem))
         self.kill(Exited(70))  # EX_SOFTWARE
 
     def on_exit(self, status: int) -> None:
         """The fork server has reaped it."""
-        self._status = status
+        self.end.status = status
         self._noticed()
-        if self._lost:
-            self._bury()
-        else:
-            # What it wrote before its end may still be in the socket: the end of the socket comes behind it.
-            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+        self._bury_soon()
 
     def on_orphaned(self) -> None:
         """The fork server has died, and it with it: nobody will tell its exit status."""
-        self._is_orphaned = True
-        if self._lost:
+        self.end.is_orphaned = True
+        if self.end.is_complete:
             self._bury()
 
+    def _bury_soon(self) -> None:
+        """At once if all is known. What it wrote before its end may still be in the socket, whose end comes behind."""
+        if self.end.is_complete:
+            self._bury()
+        else:
+            self.node.loop.call_later(REAPED_WITHIN, self._bury)
+
     def _bury(self) -> None:
-        if self._buried:
+        if self.end.is_buried:
             return
-        self._buried = True
-        reason = self._reason()
+        self.end.is_buried = True
+        reason = self.end.reason(oom_kills())
         self.connection.close()
         for output in self._outputs:
             output.close()
         if self._watch is not None:
             self._watch.close()
         cell = self.cell
-        if cell is not None and self.node.watched:
+        if cell is not None and self.node.events.has_listeners:
             self.node.emit(ProcessDied(cell.path, self.pid, reason))
         for up in self._launches.values():
             if not up.done():
@@ -369,32 +362,6 @@ class Worker(Peer):
         self._workers.buried(self)
         if not self._grave.done():
             self._grave.set_result(None)
-
-    def take_pending(self) -> list[Ask]:
-        """The asks that waited for this process, now the caller's."""
-        pending, self.pending = self.pending, {}
-        return list(pending.values())
-
-    def _reason(self) -> ExitReason:
-        """Why it ended: what it said itself, what we killed it for, or what the system reports."""
-        if self._told is not None:
-            return self._told
-        if self._killed_for is not None:
-            return self._killed_for
-        status = self._status
-        if status is None:
-            return Signal(signal.SIGKILL)  # Ended with its fork server.
-        if os.WIFSIGNALED(status):
-            number = os.WTERMSIG(status)
-            if number == signal.SIGKILL and oom_kills() > self._oom_before:
-                return OutOfMemory("killed by the kernel")
-            return Signal(number)
-        return Exited(os.waitstatus_to_exitcode(status))
-
-
-def _no_record(path: str) -> frames.TakeRecord:
-    """What a life says that has been moved away is not kept."""
-    return lambda frame: None
 
 
 def _seen(done: asyncio.Future[Any]) -> None:
@@ -560,7 +527,7 @@ class Workers:
             cell = self.node.find(event.address)
             if cell is not None and cell.more is not None and cell.more.tap is not None:
                 cell.more.tap.hub.emit(event)
-        elif event is not None and self.node.watched:
+        elif event is not None and self.node.events.has_listeners:
             self.node.emit(event)
 
     def processes(self) -> dict[str, int]:

@@ -171,7 +171,7 @@ class JournalHome(RecordedHome):
         if recovers:
             hold(switch, running)
             self.homes.recoveries.crashed(cell.path, self.method, noticed)
-        cell.extra().topics.clear()  # These would be unsubscribed with the life.
+        cell.extra().belongings.topics.clear()  # These would be unsubscribed with the life.
         switch.life.fail(StartFailed(cell.path, why))
         self.life_ended(switch, end)
 
@@ -245,7 +245,7 @@ class JournalHome(RecordedHome):
         """Keep everything, and count deaths in the same turn."""
         if worker is None or cell.state is not RUNNING:
             return None
-        running, noticed, ordered = self.in_hand(worker), worker.noticed_at, reason == KILLED
+        running, noticed, ordered = self.in_hand(worker), worker.end.noticed_at, reason == KILLED
 
         def over(recovers: bool | None) -> None:
             self.over(
@@ -308,11 +308,11 @@ class JournalHome(RecordedHome):
             raise error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error)) from error
         except asyncio.CancelledError:
             raise StartFailed(cell.path, "it was stopped while it started") from None
-        if node.watched:
+        if node.events.has_listeners:
             node.emit(ActorStarted(cell.path, cell.life))
         if entered.recovering:
             clock.mark("release")
-            if node.watched:
+            if node.events.has_listeners:
                 node.emit(Recovered(cell.path, cell.life, switch.life.replayed, clock.phases(restore_seconds)))
         self.homes.recoveries.over(cell.path)
 

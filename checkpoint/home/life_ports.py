@@ -9,7 +9,7 @@ import msgspec
 
 from ...actors.process.fork.child_processes import parent_of
 from ...actors.process.wire import frames
-from ...actors.process.wire.connection import BadFrame
+from ...actors.process.wire.frames import BadFrame
 from ..protocol import Released, Snapshot, ToHome, ToLife, TurnEnd, Wanted
 
 if TYPE_CHECKING:
@@ -62,4 +62,4 @@ class RemoteLife:
 
     def to_life(self, record: ToLife) -> None:
         path = self._worker.home + self._below
-        self._connection.send(frames.Record(self._connection.name_out(path), record), path)  # type: ignore[arg-type]  # encoded in place
+        self._connection.send(frames.Record(self._connection.names.to_wire(path), record), path)  # type: ignore[arg-type]  # encoded in place

@@ -124,7 +124,8 @@ class Outputs:
         self.kept.append(out)
         if out.verb == "timer" and not self._home.shapes.knows(out.name):
             self._home.note_shape(out.name, batch)
-        entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, self._home.node.wall())
+        now = self._home.node.clock.wall()
+        entry = ("op", turn, out.verb, out.to, out.name, out.body, out.seconds, out.interval, now)
         self._home.note(turn, entry, batch)
 
     def _deliver(self, target: Cell, out: Out, batch: Batch, sender: str | None = None) -> None:

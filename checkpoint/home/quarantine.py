@@ -104,7 +104,7 @@ class Quarantine:
         """Put an input aside; its turn ends in the same append."""
         one = QuarantineEntry(
             home.path, source.id, source.kind, source.name, source.body, source.sender, source.origin,
-            source.deliveries, self._node.wall(),
+            source.deliveries, self._node.clock.wall(),
         )  # fmt: skip
         self._held[one.address, one.id] = one
         if home.journal.durable:

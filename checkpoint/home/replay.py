@@ -75,7 +75,7 @@ class PacedReplay:
         if not waiting:
             then()
             return
-        if home.node.watched and now - self._told_at >= TELL_EVERY:
+        if home.node.events.has_listeners and now - self._told_at >= TELL_EVERY:
             self._told_at = now
             home.node.emit(ReplayPaced(home.path, len(waiting), waiting[-1][0] - now, home.ledger.backlog(-1)))
         self._handle = home.node.loop.call_at(waiting[0][0], self._go_on, port, then)

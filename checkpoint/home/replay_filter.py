@@ -35,7 +35,7 @@ class Skipped(NamedTuple):
 def turns_to_replay(home: Switch) -> list[tuple[int, Turn]]:
     """The turns to replay, in order; an event tells of those that are not."""
     chosen = turns_to_skip(home)
-    if home.node.watched and any(chosen):
+    if home.node.events.has_listeners and any(chosen):
         counts = len(chosen.readonly), len(chosen.superseded)
         home.node.emit(TurnsSkipped(home.path, *counts, chosen.problem))
     return home.ledger.replayed(chosen.readonly | chosen.superseded)

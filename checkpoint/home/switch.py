@@ -188,7 +188,7 @@ class Switch:
         self, kind: str, name: str, body: bytes, sender: str | None, batch: Batch | None = None, origin: str = ""
     ) -> Input:
         """Number and journal an input."""
-        source = self.ledger.admit(kind, name, body, self.node.wall(), sender, origin)
+        source = self.ledger.admit(kind, name, body, self.node.clock.wall(), sender, origin)
         if self.intake.bound is not None:
             self.intake.bound.added(source)
         if self.journal.durable:

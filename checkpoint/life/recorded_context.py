@@ -107,7 +107,7 @@ class RecordedContext(ActorContext):
 
     def now(self) -> float:
         feed = self.recorded.feed
-        return self.cell.node.wall() if feed is None else feed.time
+        return self.cell.node.clock.wall() if feed is None else feed.time
 
     @property
     def random(self) -> random.Random:

@@ -43,6 +43,7 @@ class RecordedGuest:
     def __init__(self, guest: Guest) -> None:
         self._guest = guest
         self._ports: dict[str, Port] = {}
+        self.keeper = GuestKeeper(guest)
         guest.record_taker = self._taker
 
     def _taker(self, path: str) -> frames.TakeRecord:
@@ -57,9 +58,7 @@ class RecordedGuest:
 
     def begins(self, path: str) -> None:
         """A life is about to begin at an address."""
-        keeper = self._guest.node.keeper
-        if isinstance(keeper, GuestKeeper):
-            keeper.begins(path)
+        self.keeper.begins(path)
 
     def vacated(self, path: str) -> None:
         """Nobody lives at an address any more: whoever does so again is given a new way."""
@@ -91,15 +90,22 @@ class RecordedGuest:
         if spec.recovery is not None and spec.recovery.records:
             place = child_here(self._guest, spec.recovery)
             return AddressHost(place.home, place, NEAR)
-        here: AddressHost = self._guest.node.here
+        here: AddressHost = self._guest.node.ports.here
         return here
 
 
 class GuestKeeper:
     """The root's keeper, as the supervisors of this process speak to it: in order with everything else they say."""
 
-    def __init__(self, guest: Guest, notes: dict[str, bytes], known: list[str]) -> None:
-        self._guest, self._notes, self._known = guest, dict(notes), set(known)
+    def __init__(self, guest: Guest) -> None:
+        self._guest = guest
+        self._notes: dict[str, bytes] = {}
+        self._known: set[str] = set()
+
+    def learn(self, notes: dict[str, bytes], known: list[str]) -> None:
+        """Take in what the root has kept of the addresses of this process so far."""
+        self._notes.update(notes)
+        self._known.update(known)
 
     def _say(self, what: str, path: str, **data: Any) -> None:
         root = self._guest.node.root
@@ -197,7 +203,7 @@ class Port:
 
     def to_home(self, record: ToHome) -> None:
         connection = self._guest.connection
-        connection.send(frames.Record(connection.name_out(self.path), cast("Any", record)), self.path)
+        connection.send(frames.Record(connection.names.to_wire(self.path), cast("Any", record)), self.path)
 
     def when_told(self, then: Callable[[], None]) -> None:
         self._guest.node.loop.call_soon(then)  # Behind the flush, which was called for before.

@@ -195,7 +195,7 @@ class FarParent(Parent):
         else:
             running = self.below.place.running(self.cell)
             is_blameless = reason == KILLED or blamed(worker.page[self.slot], one_works=one_works) < 0
-            self._over_below(reason, running, ordered=is_blameless, noticed=worker.noticed_at)
+            self._over_below(reason, running, ordered=is_blameless, noticed=worker.end.noticed_at)
 
     # -- the end of a life ------------------------------------------------------------------------------------------
 
@@ -389,7 +389,7 @@ class SlotPlace(Place):
     def _tell(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self._parent.worker
         if worker is not None and cell.state is RUNNING:
-            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
+            worker.connection.send(frames.Command(worker.connection.names.to_wire(cell.path), verb, data))
 
     def control(self, cell: Cell, call: Call) -> None:
         worker = self._parent.worker
@@ -401,7 +401,7 @@ class SlotPlace(Place):
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         worker = self._parent.worker
         if verb == "bind" and worker is not None:  # Also between two lives: the address has its bindings there.
-            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), verb, data))
+            worker.connection.send(frames.Command(worker.connection.names.to_wire(cell.path), verb, data))
 
     def process(self, cell: Cell) -> Worker | None:
         return self._parent.worker if cell.state is RUNNING else None

@@ -165,7 +165,7 @@ class FromRecordedWorker(FromOwnWorker):
 
         def over(recovers: bool | None) -> None:
             self._home.over(
-                cell, -1, str(dead), ordered=False, noticed=worker.noticed_at, reason=dead, recovers=recovers
+                cell, -1, str(dead), ordered=False, noticed=worker.end.noticed_at, reason=dead, recovers=recovers
             )  # fmt: skip
 
         old.parent.life_over(cell, dead, over)

@@ -135,7 +135,7 @@ class Recoveries:
     def phase(self, recovery: Recovery, phase: str, when: float) -> None:
         """A phase is over, the next one begins: the controller tells of it."""
         since, recovery.since = recovery.since, max(recovery.since, when)
-        if self._node.watched:
+        if self._node.events.has_listeners:
             spent, total = recovery.since - since, max(0.0, recovery.since - recovery.noticed)
             self._untold.append(RecoveryPhase(recovery.path, recovery.number, recovery.attempt, phase, total, spent))
             if len(self._untold) == 1 and self._controller is not None:

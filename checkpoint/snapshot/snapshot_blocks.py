@@ -117,7 +117,7 @@ class SnapshotImages:
             home.life.port.to_life(Kept(shared.number, True, is_full))
         home.limit.cut()
         home.due.kept(meta.turn)
-        if home.node.watched:
+        if home.node.events.has_listeners:
             written = sum(length for number, _, length in meta.blocks if number == shared.number)
             home.node.emit(SnapshotTaken(home.path, record.turn, size, record.pause, written))
 

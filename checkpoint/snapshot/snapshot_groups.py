@@ -66,7 +66,7 @@ class Groups:
             HoldfastError: one of them is not recorded, or the store refused.
         """
         homes = [self._recorded(path) for path in paths]
-        group = GroupSnapshot(FORMAT, self._homes.node.wall(), [_image(home) for home in homes])
+        group = GroupSnapshot(FORMAT, self._homes.node.clock.wall(), [_image(home) for home in homes])
         self._homes.journal.note(_key(name), msgspec.msgpack.encode(group))
 
     def _recorded(self, path: str) -> Switch:
@@ -114,7 +114,7 @@ class Groups:
             self._homes.vacate(image.path, "its group goes back to an earlier snapshot")
         for image in group.images:
             meta = msgspec.msgpack.decode(image.meta, type=Meta)
-            meta = msgspec.structs.replace(meta, time=self._homes.node.wall())  # Its timers have stood still.
+            meta = msgspec.structs.replace(meta, time=self._homes.node.clock.wall())  # Its timers have stood still.
             entries: list[Entry] = [tuple(_tuple(part) for part in entry) for entry in image.entries]
             if journal.durable:
                 old = [position for position, _ in journal.load(image.path).entries]

@@ -48,10 +48,11 @@ class SnapshotReceiver:
         becomes = self.becomes
         kind = "" if becomes is None or not record.is_replaced else message_name(becomes.kind)
         if becomes is not None and home.cell is not None and record.kind == kind:
-            home.node.respec(home.cell, becomes)  # Now: the answer to whoever has replaced the code may never come.
+            # Now: the answer to whoever has replaced the code may never come.
+            home.node.ports.respec(home.cell, becomes)
         home.limit.cut()
         home.due.kept(record.turn)
-        if home.node.watched:
+        if home.node.events.has_listeners:
             home.node.emit(SnapshotTaken(home.path, record.turn, len(state), record.pause, len(state)))
 
     def _refused(self, record: Snapshot, error: HoldfastError) -> None:

@@ -99,7 +99,7 @@ def encode_meta(meta: Meta, compress: bool | int) -> bytes:
 def meta_now(home: Switch, turn: int, stash: list[int], state: bytes = b"") -> Meta:
     """A snapshot of the state after `turn`, with what the home knows at this moment."""
     timers, topics = outlasting(home)
-    epoch, now = home.journal.epoch, home.node.wall()
+    epoch, now = home.journal.epoch, home.node.clock.wall()
     return Meta(
         FORMAT,
         turn,
@@ -219,7 +219,7 @@ def load(home: Switch, planted: Journaled | None = None) -> None:
 
 def elapsed(home: Switch, since: float) -> float:
     """Seconds since a moment that a store of before may not have (0), by a clock that may have been set back."""
-    return max(0.0, home.node.wall() - since) if since else 0.0
+    return max(0.0, home.node.clock.wall() - since) if since else 0.0
 
 
 def load_newest(home: Switch) -> tuple[Journaled, Meta | None]:

@@ -43,5 +43,5 @@ def forget_turns(home: Switch) -> None:
     meta = ledger.newest or Meta(FORMAT, ledger.turn, 0, [], {}, [], 0, b"")
     ledger.newest = msgspec.structs.replace(meta, turn=ledger.turn)
     go_back(home, meta)
-    if count and home.node.watched:
+    if count and home.node.events.has_listeners:
         home.node.emit(TurnsLost(home.path, count, meta.base))

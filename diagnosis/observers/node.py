@@ -114,5 +114,5 @@ class NodeObserver(Observer):
 
 def at_root(observer: Observer) -> None:
     """Refuse an observer that sees only its own process. Raises SpecError."""
-    if observer.ctx.cell.node.uplink is not None:
+    if observer.ctx.cell.node.ports.uplink is not None:
         raise SpecError(observer.ctx.path, f"{type(observer).__name__} must be in the system's own process: a task")

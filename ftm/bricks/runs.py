@@ -232,7 +232,7 @@ class Shadow(Server):
         assert main is not None
         assert main.parent is not None
         name = f"shadow-{next(_NUMBERS)}"
-        cell = node.cell_below(main.parent, name, AddressHost(FED, self, node.here.parent))
+        cell = node.cell_below(main.parent, name, AddressHost(FED, self, node.ports.here.parent))
         self.standing.shadows.add(self)
         cell.spec = child(name, self._recipe)
         cell.extra().start = self._recipe

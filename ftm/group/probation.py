@@ -138,7 +138,7 @@ class Probation:
             self._group.path, was, now, is_kept, self.why, node.loop.time() - self._begun
         )  # fmt: skip
         self.settled.set_result(event)
-        if node.watched:
+        if node.events.has_listeners:
             node.emit(event)
         self._group.untrusted.discard(self)
         self._on_over(is_kept)

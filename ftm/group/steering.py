@@ -51,7 +51,7 @@ def bind(group: Group, name: str, data: dict[str, Any]) -> None:
     """Tell a replica of a binding."""
     worker = group.worker_of(name)
     if worker is not None and group.life_of(name):
-        to = worker.connection.name_out(group.place(f"{name}/server"))
+        to = worker.connection.names.to_wire(group.place(f"{name}/server"))
         worker.connection.send(frames.Command(to, "bind", data))
 
 

@@ -134,7 +134,7 @@ class ToGroup(Entering):
     def _move_in(self) -> None:
         """What waits for an actor that had no home waits there."""
         cell, more, luggage, switch = self.cell, self.cell.extra(), self.move.luggage, self._switch
-        bound, topics, waiting = luggage.bound, list(more.topics), luggage.waiting
+        bound, topics, waiting = luggage.bound, list(more.belongings.topics), luggage.waiting
         switch.calls.later.update(luggage.owed)
         if bound is not None:
             waiting, bound.waiting = list(bound.waiting), deque()

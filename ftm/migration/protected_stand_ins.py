@@ -22,7 +22,7 @@ from ...actors.migration.here import dispose
 from ...actors.migration.quiesce import farewell, obey_commands, part, settle_with_queue, sorted_out, twin
 from ...actors.migration.worker_moves import GuestMove
 from ...actors.process.resource_limits import Limits, limits_data
-from ...actors.process.wire.connection import BadFrame
+from ...actors.process.wire.frames import BadFrame
 from ...actors.process.wire.start_codec import pack_recipe
 from ...checkpoint.life.child_stub import ChildPlace, RootHome
 from ...checkpoint.life.recorded_inbox import StopRecorded

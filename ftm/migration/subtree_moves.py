@@ -411,12 +411,12 @@ class ToSubtree(IntoSubtree):
             "owed": pack_owed(worker, luggage.owed),
             "timers": luggage.timers,
             "is_suspended": luggage.suspended,
-            "links": [peer.path for peer in more.links],
-            "monitors": [[watch.watcher.path, watch.for_good] for watch in more.monitors],
-            "watches": [[watch.target.path, watch.for_good] for watch in more.watching],
+            "links": [peer.path for peer in more.ties.links],
+            "monitors": [[watch.watcher.path, watch.for_good] for watch in more.ties.monitors],
+            "watches": [[watch.target.path, watch.for_good] for watch in more.ties.watching],
             "topics": list(topics),
         }
-        for watch in list(more.watching):
+        for watch in list(more.ties.watching):
             watch.cancel()  # It begins to watch again, there.
         move.say_now(worker, "settle", **told)
         self.parent.goes_for_good()
@@ -428,7 +428,7 @@ class ToSubtree(IntoSubtree):
         cell, worker = self.cell, self.worker
         for port, target in unclaimed(cell).items():
             data = {"port": port, "target": target.path}
-            worker.connection.send(frames.Command(worker.connection.name_out(cell.path), "bind", data))
+            worker.connection.send(frames.Command(worker.connection.names.to_wire(cell.path), "bind", data))
         self.move.gone_on_at = now()
 
     def settled(self) -> None:

@@ -23,7 +23,7 @@ from ...actors.migration.here import Arrival
 from ...actors.migration.luggage import check_sendable, pack_rest
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
-from ...actors.process.wire.connection import BadFrame
+from ...actors.process.wire.frames import BadFrame
 from ...checkpoint.protocol import Respec
 from .protected_stand_ins import ChildAtRoot, child_at_root, respec
 from .unrecorded_luggage import EarlyAsk, pack, pack_owed, refuse, restore_owing, save_owing, unpack
@@ -68,7 +68,7 @@ class PlainChild:
 
     def _come_to_rest(self) -> None:
         cell = self._guest.node.find(self._path)
-        if cell is None or cell.state is not RUNNING or cell.host is not self._guest.node.here:
+        if cell is None or cell.state is not RUNNING or cell.host is not self._guest.node.ports.here:
             self._say("refused", why="it is being restarted; try again")
             return
         take = Take(_owe, self._at_rest, lambda why: self._say("refused", why=why))
@@ -125,13 +125,13 @@ class PlainChild:
     def _hand_ties_over(self, cell: Cell) -> None:
         """Links, and monitors that reach out of this process, are the root's from now on; so are subscriptions."""
         more, guest = cell.extra(), self._guest
-        for peer in more.links:
+        for peer in more.ties.links:
             guest.command(cell, "link", {"peer": peer.path})
-        for watch in [one for one in more.watching if one.life == cell.life]:
+        for watch in [one for one in more.ties.watching if one.life == cell.life]:
             watch.cancel()
             guest.command(watch.target, "monitor", {"watcher": cell.path, "for_good": watch.for_good})
-        more.monitors = [one for one in more.monitors if one.watcher.host is guest.node.here]
-        for topic in list(more.topics):
+        more.ties.monitors = [one for one in more.ties.monitors if one.watcher.host is guest.node.ports.here]
+        for topic in list(more.belongings.topics):
             Topics.unsubscribe(guest.node.topics, topic, cell)
 
     # -- coming back ------------------------------------------------------------------------------------------------
@@ -205,7 +205,7 @@ class PlainChild:
         chosen = place.home.bound
         has_ended = arrival.other.state is not RUNNING  # by its background work
         guest.recovery.port_of(self._path).place = None
-        cell.host = guest.node.here
+        cell.host = guest.node.ports.here
         bound = None if chosen is None else Bound(chosen.capacity, chosen.overflow)
         queue, stash = unpack(guest, cell, told["queue"]), unpack(guest, cell, told["stash"])
         commands = arrival.take_over(queue, stash, bound, suspended=bool(told["is_suspended"]))

@@ -209,7 +209,7 @@ class Replica(Supervisor):
             return super()._launch(one)
         if one.cell is None:
             one.cell = new_cell(self.ctx.cell, one)
-        here = one.cell.node.here
+        here = one.cell.node.ports.here
         one.cell.host = AddressHost(FED, self._server, here.parent)
         self._server.start(one.cell)
         return None

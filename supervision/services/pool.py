@@ -87,13 +87,13 @@ class PoolSupervisor(Supervisor):
     def _added(self) -> list[str]:
         """The recorded workers that an earlier life of ours has added, the lowest number first."""
         above = child_key(self.ctx.path, "")
-        names = (key.removeprefix(above) for key in self.ctx.cell.node.keeper.notes(above))
+        names = (key.removeprefix(above) for key in self.ctx.cell.node.ports.keeper.notes(above))
         return sorted((name for name in names if name.isdecimal()), key=int)
 
     def _note(self, name: str, value: bytes | None) -> None:
         """Keep in mind that there is a recorded worker more than at the start. Raises HoldfastError."""
         if self._template.has_home:
-            self.ctx.cell.node.keeper.note(child_key(self.ctx.path, name), value)
+            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, name), value)
 
     def _check(self, plan: Plan) -> None:
         *workers, router = (spec.id for spec in plan.children) if plan.children else ("",)

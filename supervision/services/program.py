@@ -180,7 +180,7 @@ class Program(Actor):
         self._lines.append(text)
         self._parts.pop(stream, None)
         node = self.ctx.cell.node
-        if node.watched:
+        if node.events.has_listeners:
             node.emit(LogLine(self.ctx.path, stream, text))
         if self._sign is not None:
             self._sign.line(text)
@@ -298,12 +298,12 @@ class _Leash:
 
     def __init__(self, cell: Cell, kept: Kept) -> None:
         self._cell, self._kept = cell, kept
-        cell.extra().timers.add(self)
+        cell.extra().belongings.timers.add(self)
 
     def cancel(self) -> None:
         """The life is over."""
         cell, kept = self._cell, self._kept
-        cell.extra().timers.discard(self)
+        cell.extra().belongings.timers.discard(self)
         if kept.ended.done():
             return
         kept.kill()

@@ -256,7 +256,7 @@ class Transaction:
         return root.path if root is not None else ""
 
     def _emit(self, event: Any) -> None:
-        if self._system.node.watched:
+        if self._system.node.events.has_listeners:
             self._system.node.emit(event)
 
 

@@ -25,7 +25,7 @@ from ...actors.process.resource_limits import Limits
 from ...actors.process.wire import frames
 from ...actors.process.wire.connection import HIGH_BYTES, Connection
 from ...actors.process.worker_pool import Worker, Workers
-from ...system.worker_main import launch, prepare
+from ...system.worker_main import WorkerComposition
 from ..swaps import Swaps
 from .choices import Choices
 from .control import Place, inside
@@ -197,10 +197,8 @@ class SimulatedProcess(Place):
 
     def _boot(self, ours: Connection) -> None:
         loop = asyncio.get_running_loop()
-        guest = self.guest = worker_node.Guest(loop, memoryview(self.page).cast("Q"), launch)
+        guest = self.guest = worker_node.Guest(loop, memoryview(self.page).cast("Q"), WorkerComposition, None)
         self.node = guest.node
-        guest.node.overdue = None  # Nothing blocks it but what blocks the run.
-        prepare(guest)
         theirs = Connection(guest.on_frame, guest.on_lost, guest.on_batch)
         guest.join(theirs)
         theirs.takers = guest.takers

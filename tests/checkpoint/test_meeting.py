@@ -133,7 +133,7 @@ async def test_who_is_deleted_is_erased_unless_that_is_not_wanted(
         await add(system, "else", name="other")
         await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
         await top(system).ask(hf.DeleteChild("doer", erase=erase), timeout=20.0)
-        known = set(system.node.keeper.known("/app"))  # type: ignore[attr-defined]
+        known = set(system.node.ports.keeper.known("/app"))  # type: ignore[attr-defined]
         assert ("/app/top/doer" in known) is not erase
         await top(system).ask(hf.StartChild(spec), timeout=20.0)
         assert await seen(system) == ([] if erase else ["one"])

@@ -261,7 +261,7 @@ async def test_a_replay_waits_as_long_as_there_was_between_its_messages(pacing: 
     """R39, R76: nine seconds of messages; what comes meanwhile is held, and handled behind them."""
     loop = asyncio.get_running_loop()
     async with hf.ActorSystem("app", log=False) as system:
-        system.node.wall = lambda: 1000.0 + loop.time()
+        system.node.clock.wall = lambda: 1000.0 + loop.time()
         ref = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid(NEVER, pacing=pacing)))
         for n in range(4):
             ref.tell(Do(["world", f"add {n}"]))
@@ -287,7 +287,7 @@ async def test_handlers_that_take_their_time_do_not_make_a_paced_replay_longer()
     """R70 measured the sum of both; here a replay takes no longer than what was recorded, if handlers keep up."""
     loop = asyncio.get_running_loop()
     async with hf.ActorSystem("app", log=False) as system:
-        system.node.wall = lambda: 1000.0 + loop.time()
+        system.node.clock.wall = lambda: 1000.0 + loop.time()
         ref = await system.start(hf.child("slow", hf.start(Slow), recovery=hf.hybrid(NEVER, pacing="original")))
         for _ in range(5):
             ref.tell(Note("x"))
@@ -314,7 +314,7 @@ async def test_a_crash_or_a_stop_in_a_paced_replay(store: str | None) -> None:
     """The next one begins again from the beginning (T17); a stop does not wait for it."""
     loop = asyncio.get_running_loop()
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
-        system.node.wall = lambda: 1000.0 + loop.time()
+        system.node.clock.wall = lambda: 1000.0 + loop.time()
         ref = await system.start(hf.child("doer", hf.start(Doer), recovery=hf.hybrid(NEVER, pacing="original")))
         for n in range(5):
             ref.tell(Note(str(n)))

@@ -36,7 +36,7 @@ async def test_what_kills_again_and_again_is_listed_with_how_often_and_since_whe
     isolation: str, store: str | None, tmp_path: Path
 ) -> None:
     async with running(store) as system:
-        system.node.wall = lambda: 1234.5
+        system.node.clock.wall = lambda: 1234.5
         doer = await poisoned(system, isolation, tmp_path / "deaths")
         (one,) = system.quarantined()
         assert one == system.quarantined(doer)[0] == system.quarantined(doer.path)[0]

@@ -65,7 +65,7 @@ async def left_behind(folder: Path, setting: Set, *, saved: bool) -> str:
 async def test_a_timer_has_run_on_while_the_root_was_away(tmp_path: Path, saved: bool, later: float) -> None:
     store = await left_behind(tmp_path, Set(3600.0), saved=saved)
     async with hf.ActorSystem("app", store=store, log=False) as system:
-        system.node.wall = lambda: time.time() + later
+        system.node.clock.wall = lambda: time.time() + later
         alarm = await system.start(ALARM)
         home = system.homes.at(alarm.path)
         assert home is not None
@@ -80,7 +80,7 @@ async def test_what_was_due_while_the_root_was_away_comes_once_at_once(
 ) -> None:
     store = await left_behind(tmp_path, Set(100.0, every), saved=saved)
     async with hf.ActorSystem("app", store=store, log=False) as system:
-        system.node.wall = lambda: time.time() + 1_000.0
+        system.node.clock.wall = lambda: time.time() + 1_000.0
         alarm = await system.start(ALARM)
         while not await alarm.ask(Ticks()):
             pass

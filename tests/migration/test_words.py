@@ -8,8 +8,7 @@ import pytest
 
 from holdfast.actors.migration import words
 from holdfast.actors.migration.words import Incoming, say
-from holdfast.actors.process.wire.connection import BadFrame
-from holdfast.actors.process.wire.frames import Migrate
+from holdfast.actors.process.wire.frames import BadFrame, Migrate
 from holdfast.actors.process.worker_pool import Worker
 from holdfast.actors.values import encode_value
 
@@ -19,8 +18,9 @@ class Wire:
 
     def __init__(self) -> None:
         self.sent: list[Migrate] = []
+        self.names = self
 
-    def name_out(self, path: str) -> str:
+    def to_wire(self, path: str) -> str:
         return path
 
     def send(self, frame: Migrate, where: str) -> None:

@@ -203,7 +203,7 @@ async def test_a_start_that_fails_or_is_refused_leaves_nothing_in_the_journal(
         blocked.unlink()
         await restarted(system)
         assert await ids(system) == ["good"]
-        assert list(system.node.keeper.notes("child ")) == ["child /app/school/good"]
+        assert list(system.node.ports.keeper.notes("child ")) == ["child /app/school/good"]
 
 
 async def test_one_that_fails_to_come_back_is_tried_again_and_does_not_keep_the_others_away(

@@ -383,9 +383,9 @@ async def test_what_a_process_says_before_it_has_heard_of_its_address_is_meant_s
             assert await held
             await moving
             assert await other.ask(Add(0)) == 1
-            (watch,) = other._cell.extra().monitors
+            (watch,) = other._cell.extra().ties.monitors
             assert watch.watcher is one._cell
-            assert list(other._cell.extra().links) == [one._cell]
+            assert list(other._cell.extra().ties.links) == [one._cell]
             assert not [event for event in events.take() if isinstance(event, hf.TrustBreached)]
         assert system.pid_of(one) == process
         assert await one.ask(Add(1)) == 1

@@ -22,7 +22,7 @@ from ...errors import ProcessUnavailable
 from ...streams import check_can_watch
 from .boot import HEADER, Kind, receive
 from .child_processes import signal_by
-from .forked_process import SOCKET_BYTES, Forked, ForkRequest, has_ended
+from .forked_process import SOCKET_BYTES, Forked, ForkLedger, ForkRequest, fail, has_ended
 from .launch import check_can_start, exec_server, server_config
 
 FORK_SECONDS = 10.0  # a server that does not answer by then is stopped or stuck
@@ -74,10 +74,7 @@ class ForkServer:
         self._slots = asyncio.Semaphore(FORKS_IN_FLIGHT)
         self._outbox: deque[ForkRequest | bytes] = deque()
         self._loading = 0  # PRELOADs without an answer
-        self._last_number = 0
-        self._requests: dict[int, ForkRequest] = {}  # by number, unanswered
-        self._unclaimed: dict[int, ForkRequest] = {}  # by pid, answered, `fork` has not resumed yet
-        self._children: dict[int, Forked] = {}  # by pid, what `fork` has returned
+        self._forks = ForkLedger()
 
     @property
     def pid(self) -> int:
@@ -167,12 +164,12 @@ class ForkServer:
         self._close_control()
         self._ended.set()
         # The kernel kills the children, except one that was stopped before it could ask for that.
-        for child in self._children.values():
+        for child in self._forks.children.values():
             child.kill()
             # Each leads a process group: what it had started is in it, and nobody is left to find it there.
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(child.pid, signal.SIGKILL)
-        self._children.clear()
+        self._forks.children.clear()
         was_ready = self._ready.done() and not self._ready.cancelled() and self._ready.exception() is None
         self._fail_all(f"the fork server (pid {self._process.pid}) has died ({_cause(self._process.returncode)})")
         if was_ready and not self._stopping:
@@ -190,13 +187,9 @@ class ForkServer:
         """Nothing will be answered any more. Requests close their descriptors when `fork` resumes."""
         self._outbox.clear()
         self._loading = 0
-        waiting = [request.outcome for request in self._requests.values()]
+        self._forks.fail(problem)
         if self._process is not None:
-            waiting.append(self._ready)  # type: ignore[arg-type]
-        for future in waiting:
-            if not future.done():
-                future.set_exception(ProcessUnavailable(problem))
-                future.exception()  # whoever waited may have been cancelled: then nobody else asks for it
+            fail(self._ready, problem)
 
     # --- forking
 
@@ -219,30 +212,19 @@ class ForkServer:
     async def _fork(self) -> Forked:
         if self._control is None or not self._ready.done():
             raise ProcessUnavailable("the fork server does not run")
-        self._last_number += 1
-        request = ForkRequest(self._last_number, self._loop.create_future())
-        self._requests[request.number] = request
+        request = self._forks.begin(self._loop.create_future())
         try:
             self._post(request)
-            pid = await request.outcome
-            child = self._children[pid] = request.hand_over()
+            await request.outcome
+            child = self._forks.hand_over(request)
             if self._ended.is_set():
                 child.kill()
             return child
         finally:
-            self._requests.pop(request.number, None)
-            self._claim(request)
-
-    def _claim(self, request: ForkRequest) -> None:
-        """`fork` resumes: its caller has the process now, or nobody has."""
-        outcome = request.outcome
-        pid = outcome.result() if outcome.done() and not outcome.cancelled() and outcome.exception() is None else -1
-        self._unclaimed.pop(pid, None)
-        if not request.handed_over:
-            request.abandon()
-        elif request.status is not None:
-            # Soon, not now: the caller must first learn of the process before it learns of its death.
-            self._loop.call_soon(self._report, pid, request.status)
+            self._forks.close(request)
+            if request.handed_over and request.status is not None:
+                # Soon, not now: the caller must first learn of the process before it learns of its death.
+                self._loop.call_soon(self._report, request.outcome.result(), request.status)
 
     def preload(self, module_or_path: str) -> None:
         """Import one more module in the server; processes forked from now on have it. Problems go to `preload_errors`.
@@ -287,8 +269,8 @@ class ForkServer:
             raise
         except OSError as error:  # a dead server is told by its pidfd
             self.is_deaf |= isinstance(error, ConnectionError)
-            if isinstance(packet, ForkRequest) and not packet.outcome.done():
-                packet.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be reached: {error}"))
+            if isinstance(packet, ForkRequest):
+                fail(packet.outcome, f"the fork server cannot be reached: {error}")
 
     def _on_readable(self) -> None:
         self._read_packets(PACKETS_PER_TICK)
@@ -318,9 +300,7 @@ class ForkServer:
         control = self._control
         assert control is not None
         self._loop.remove_reader(control.fileno())
-        for request in list(self._requests.values()):
-            if not request.outcome.done():
-                request.outcome.set_exception(ProcessUnavailable(f"the fork server cannot be heard: {error!r}"))
+        self._forks.fail(f"the fork server cannot be heard: {error!r}")
         self._loop.call_later(AGAIN_AFTER, self._read_again, control)
 
     def _read_again(self, control: socket.socket) -> None:
@@ -335,11 +315,12 @@ class ForkServer:
     def _on_packet(self, kind: Kind, number: int, value: int, text: str, fds: list[int]) -> None:
         match kind:
             case Kind.FORKED:
-                self._on_forked(number, value, fds)
+                self._forks.forked(number, value, fds)
             case Kind.EXITED:
-                self._on_exited(number, value)
+                if not self._forks.exited(number, value):
+                    self._report(number, value)
             case Kind.REFUSED:
-                self._refuse(number, text)
+                self._forks.refused(number, text)
             case Kind.READY if not self._ready.done():
                 self.threads = value
                 self._ready.set_result(None)
@@ -353,33 +334,8 @@ class ForkServer:
             case _:
                 pass
 
-    def _on_forked(self, number: int, pid: int, fds: list[int]) -> None:
-        request = self._requests.pop(number, None)
-        if request is None or request.outcome.done():  # given up meanwhile
-            for fd in fds:
-                signal_by(fd, signal.SIGKILL)
-                os.close(fd)
-        elif not fds:  # no descriptor was free here; the child ends with its socket
-            request.outcome.set_exception(ProcessUnavailable("no process can be started: out of file descriptors"))
-        else:
-            request.pidfd = fds[0]
-            self._unclaimed[pid] = request
-            request.outcome.set_result(pid)
-
-    def _refuse(self, number: int, why: str) -> None:
-        request = self._requests.pop(number, None)
-        if request is not None and not request.outcome.done():
-            request.outcome.set_exception(ProcessUnavailable(f"no process can be started: {why}"))
-
-    def _on_exited(self, pid: int, status: int) -> None:
-        if pid in self._unclaimed:
-            self._unclaimed.pop(pid).status = status
-        else:
-            self._report(pid, status)
-
     def _report(self, pid: int, status: int) -> None:
-        if pid in self._children:
-            del self._children[pid]
+        if self._forks.children.pop(pid, None) is not None:
             self._on_exit(pid, status)
 
 

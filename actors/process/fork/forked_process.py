@@ -10,7 +10,9 @@ import select
 import signal
 import socket
 from dataclasses import dataclass
+from typing import Any
 
+from ...errors import ProcessUnavailable
 from ...shared_memory import keep_size, unnamed
 from .boot import HEADER, PAGE_BYTES, Kind
 from .child_processes import signal_by
@@ -123,3 +125,72 @@ class ForkRequest:
         done.kill()
         done.close()
         self.pidfd = -1
+
+
+class ForkLedger:
+    """The forks that were asked for, and the processes that came of them."""
+
+    def __init__(self) -> None:
+        self._last_number = 0
+        self._requests: dict[int, ForkRequest] = {}  # by number, unanswered
+        self._unclaimed: dict[int, ForkRequest] = {}  # by pid, answered, whoever asked has not resumed yet
+        self.children: dict[int, Forked] = {}  # by pid, what was handed over
+
+    def begin(self, outcome: asyncio.Future[int]) -> ForkRequest:
+        """One more is asked for."""
+        self._last_number += 1
+        request = self._requests[self._last_number] = ForkRequest(self._last_number, outcome)
+        return request
+
+    def forked(self, number: int, pid: int, fds: list[int]) -> None:
+        """The server has made a process; `fds` is its pidfd, if there was a descriptor free for it."""
+        request = self._requests.pop(number, None)
+        if request is None or request.outcome.done():  # given up meanwhile
+            for fd in fds:
+                signal_by(fd, signal.SIGKILL)
+                os.close(fd)
+        elif not fds:  # no descriptor was free here; the child ends with its socket
+            fail(request.outcome, "no process can be started: out of file descriptors")
+        else:
+            request.pidfd = fds[0]
+            self._unclaimed[pid] = request
+            request.outcome.set_result(pid)
+
+    def refused(self, number: int, why: str) -> None:
+        """The server could make no process."""
+        request = self._requests.pop(number, None)
+        if request is not None:
+            fail(request.outcome, f"no process can be started: {why}")
+
+    def exited(self, pid: int, status: int) -> bool:
+        """A process is dead. Returns whether whoever asked for it has not had it yet: then the request remembers it."""
+        request = self._unclaimed.pop(pid, None)
+        if request is not None:
+            request.status = status
+        return request is not None
+
+    def hand_over(self, request: ForkRequest) -> Forked:
+        """The process that came of a request, now the caller's."""
+        child = self.children[request.outcome.result()] = request.hand_over()
+        return child
+
+    def close(self, request: ForkRequest) -> None:
+        """Whoever asked has resumed: it has the process now, or nobody has."""
+        self._requests.pop(request.number, None)
+        outcome = request.outcome
+        if outcome.done() and not outcome.cancelled() and outcome.exception() is None:
+            self._unclaimed.pop(outcome.result(), None)
+        if not request.handed_over:
+            request.abandon()
+
+    def fail(self, problem: str) -> None:
+        """Nothing that is asked for comes. Each request closes its descriptors when whoever asked resumes."""
+        for request in self._requests.values():
+            fail(request.outcome, problem)
+
+
+def fail(future: asyncio.Future[Any], problem: str) -> None:
+    """End a wait, unless it is over. Whoever waited may have been cancelled: asyncio need not complain of it."""
+    if not future.done():
+        future.set_exception(ProcessUnavailable(problem))
+        future.exception()

@@ -3,42 +3,41 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
-import os
 import socket
-import struct
 import sys
 from collections.abc import Callable
 from typing import Any, cast
 
 import msgspec
 
-from ...errors import BadMessage, HoldfastError, type_name
-from ...kernel.codec import ARRAY, MAX_BYTES, array_head, encode_special, too_large, unencodable
+from ...errors import BadMessage, type_name
+from ...kernel.codec import MAX_BYTES, too_large, unencodable
 from ...values.budget import MOST_CONTAINERS, check_containers
+from .frame_buffer import LENGTH, FrameBuffer
+from .frame_encoder import FrameEncoder, OpenRun
 from .frames import (
     AnyFrame,
     Ask,
+    BadFrame,
     Command,
     Failure,
     Forget,
     Frame,
     Launch,
     Migrate,
-    Name,
     Offer,
     Publish,
     Record,
     Reply,
     Run,
     Tell,
+    payload_of,
     tagged,
 )
+from .name_table import NameTable
 
-LENGTH = struct.Struct("<I")
 MAX_FRAME = MAX_BYTES + 64 * 1024
 """A frame's head is small; anything larger than this is not ours."""
-READ_BYTES = 256 * 1024
 PIECE_BYTES = 64 * 1024
 """Frames from this size on are written by themselves instead of being copied together."""
 HIGH_BYTES = 4 * 1024 * 1024
@@ -46,11 +45,7 @@ HIGH_BYTES = 4 * 1024 * 1024
 
 RUN_BYTES = 32 * 1024
 """Payload after which a run of messages is closed; a single one larger than an eighth of this is no part of a run."""
-LARGE_ARRAY = 64 * 1024
-"""Arrays from this size on are written from where they are instead of being copied into the frame."""
 _RUN, _FORGET = tagged(Run), tagged(Forget)
-MOST_NAMES = 4096
-"""Names after which a sender forgets all that it has given: whoever was written to once is not remembered for ever."""
 SMALL_BYTES = 1024 * 1024
 """The largest frame of a kind that carries no payload: what is in it may be anything, and takes many times the room."""
 _CARRIERS: frozenset[type[Frame]] = frozenset((Tell, Ask, Reply, Failure, Offer, Publish, Record, Migrate))
@@ -60,12 +55,6 @@ FRAMES_PER_TICK = 128
 """Frames of one guarded peer, each 4 KiB counting as one more, after which others come first."""
 
 _DECODER: msgspec.msgpack.Decoder[AnyFrame] = msgspec.msgpack.Decoder(AnyFrame)
-
-
-class BadFrame(HoldfastError, text="malformed frame: {problem}"):
-    """The peer sent something that is no frame of ours: the connection is closed."""
-
-    problem: str
 
 
 class Connection(asyncio.BufferedProtocol):
@@ -88,73 +77,17 @@ class Connection(asyncio.BufferedProtocol):
         self.takers: dict[type[Frame], Callable[[Any], None]] = {}  # frames of these types do not go to `on_frame`
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
-        self._encoder = msgspec.msgpack.Encoder(enc_hook=self._encode_special)
-        self._large: list[tuple[bytes, bytes, memoryview]] = []  # arrays of the frame in hand: mark, head, elements
-        self._marks = itertools.count(int.from_bytes(os.urandom(15), "big"))
-        self._run: list[bytes] = []  # messages that go out as one frame
-        self._run_bytes = 0
-        self._run_head = (0, 0, 0)  # address, type name, first number
+        self.names = NameTable()
+        self._encoder = FrameEncoder()
+        self._run = OpenRun()
         self._out: list[bytes] = []
         self._out_bytes = 0
         self._flushing = False
         self._paused = False
         self._waiters: list[asyncio.Future[None]] = []
-        self._names_out: dict[str, int] = {}
-        self._is_full = False  # so many names that they are forgotten behind the next frame
-        self.kinds_out: dict[type, int] = {}  # the numbers of message types' names
-        self._names_in: list[str] = []
         self._guarded, self._is_resting = guarded, False
-        self._large_in = _CARRIER_TAGS if guarded else _FROM_ROOT_TAGS
-        self._large_out = _FROM_ROOT if guarded else _CARRIERS
-        self._buffer = bytearray(READ_BYTES)
-        self._view = memoryview(self._buffer)
-        self._begin = self._end = 0
+        self._buffer = FrameBuffer()
         self.is_open = True
-
-    # -- names ------------------------------------------------------------------------------------------------------
-
-    def name_out(self, text: str) -> Name:
-        """A name as the peer will understand it; text the first time."""
-        number = self._names_out.get(text)
-        if number is None:
-            number = self._names_out[text] = len(self._names_out)
-            self._is_full = number >= MOST_NAMES
-            return text
-        return number
-
-    def _forget(self) -> None:
-        """Give all names anew from the next frame on."""
-        self._names_out.clear()
-        self.kinds_out.clear()
-        self._is_full = False
-        self._out += (len(_FORGET).to_bytes(4, "little"), _FORGET)
-        self._out_bytes += len(_FORGET)
-
-    def forget_in(self) -> None:
-        """The peer gives all its names anew."""
-        self._names_in.clear()
-
-    def name_in(self, name: Name) -> str:
-        """A name the peer sent.
-
-        Raises:
-            BadFrame: a number it never gave.
-        """
-        if type(name) is str:
-            self._names_in.append(name)
-            return name
-        number = cast("int", name)
-        if not 0 <= number < len(self._names_in):
-            raise BadFrame(f"name {number} was never introduced")
-        return self._names_in[number]
-
-    def rename_in(self, now: Callable[[str], str]) -> None:
-        """Names that the peer gave mean other ones from now on."""
-        self._names_in = list(map(now, self._names_in))
-
-    def number_in(self, name: Name) -> int:
-        """The number of the name that `name_in` was given last: the peer uses it from now on."""
-        return len(self._names_in) - 1 if type(name) is str else cast("int", name)
 
     # -- writing ----------------------------------------------------------------------------------------------------
 
@@ -166,32 +99,38 @@ class Connection(asyncio.BufferedProtocol):
         """
         if not self.is_open:
             return
-        if self._run:
+        if self._run.bodies:
             self._close_run()
+        encoder = self._encoder
         try:
-            data = self._encoder.encode(frame)
+            data = encoder.encode(frame)
         except Exception as error:  # Whatever a payload raises while it is encoded means that it cannot be.
-            self._large.clear()
-            payload = getattr(frame, "body", None)
-            self._forget_names(frame)
+            encoder.large.clear()
+            payload = payload_of(frame)
+            self.names.withdraw(frame)
             raise BadMessage(actor, type_name(type(payload)), unencodable(payload, error)) from error
         size = len(data)
         parts: list[Any] = [data]
-        if self._large:
-            parts = self._spliced(data)
+        if encoder.large:
+            parts = encoder.spliced(data)
             size = sum(map(len, parts))
-        if size > SMALL_BYTES and (size > MAX_FRAME or type(frame) not in self._large_out):
-            payload = getattr(frame, "body", None)
-            self._forget_names(frame)
+        if size > SMALL_BYTES and (size > MAX_FRAME or not self._may_send_large(type(frame))):
+            payload = payload_of(frame)
+            self.names.withdraw(frame)
             raise BadMessage(actor, type_name(type(payload)), too_large(payload, size))
         self._out.append(size.to_bytes(4, "little"))
         self._out += parts
         self._out_bytes += size
-        if self._is_full:
-            self._forget()
+        if self.names.is_full:
+            self.names.forget_given()
+            self._out += (len(_FORGET).to_bytes(4, "little"), _FORGET)
+            self._out_bytes += len(_FORGET)
         if not self._flushing:
             self._flushing = True
             self._loop.call_soon(self.flush)
+
+    def _may_send_large(self, kind: type[Frame]) -> bool:
+        return kind in (_FROM_ROOT if self._guarded else _CARRIERS)
 
     def tell(self, to: int, name: int, message: Any, number: int, actor: str) -> None:
         """Queue a plain message; those of one type to one address go out as one frame.
@@ -201,77 +140,41 @@ class Connection(asyncio.BufferedProtocol):
         """
         if not self.is_open:
             return
-        run = self._run
-        if run and (self._run_bytes >= RUN_BYTES or self._run_head[:2] != (to, name)):
+        run, encoder = self._run, self._encoder
+        if run.bodies and (run.size >= RUN_BYTES or run.head[:2] != (to, name)):
             self._close_run()
-            run = self._run
         try:
-            data = self._encoder.encode(message)
+            data = encoder.encode(message)
         except Exception as error:
-            self._large.clear()
+            encoder.large.clear()
             raise BadMessage(actor, type_name(type(message)), unencodable(message, error)) from error
         size = len(data)
-        if size * 8 > RUN_BYTES or self._large:
-            self._large.clear()
+        if size * 8 > RUN_BYTES or encoder.large:
+            encoder.large.clear()
             self.send(Tell(to, name, message, number), actor)
             return
-        if not run:
-            self._run_head = (to, name, number)
+        if not run.bodies:
+            run.head = (to, name, number)
             if not self._flushing:
                 self._flushing = True
                 self._loop.call_soon(self.flush)
-        run.append(data)
-        self._run_bytes += size
+        run.bodies.append(data)
+        run.size += size
 
     def _close_run(self) -> None:
         """Queue the run as a frame."""
-        run, self._run = self._run, []
-        count = len(run)
-        array = (0xDC0000 | count).to_bytes(3, "big")
-        data = b"".join((_RUN, *map(self._encoder.encode, self._run_head), array, *run))
-        self._run_bytes = 0
+        run = self._run
+        array = (0xDC0000 | len(run.bodies)).to_bytes(3, "big")
+        data = b"".join((_RUN, *map(self._encoder.encode, run.head), array, *run.bodies))
+        run.bodies, run.size = [], 0
         self._out.append(len(data).to_bytes(4, "little"))
         self._out.append(data)
         self._out_bytes += len(data)
 
-    # -- large arrays -----------------------------------------------------------------------------------------------
-
-    def _encode_special(self, value: Any) -> Any:
-        """As the codec does it, but a large array is left out; a mark stands where it belongs."""
-        numpy = sys.modules.get("numpy")
-        if numpy is None or not isinstance(value, numpy.ndarray) or value.nbytes < LARGE_ARRAY:
-            return encode_special(value)
-        if not value.flags.c_contiguous or value.dtype.hasobject:
-            return encode_special(value)
-        mark = next(self._marks).to_bytes(16, "big")
-        head = array_head(value)
-        self._large.append((mark, head, memoryview(value.reshape(-1).view("u1"))))
-        return msgspec.msgpack.Ext(ARRAY, mark)
-
-    def _spliced(self, data: bytes) -> list[Any]:
-        """A frame in parts, with the arrays where their marks were. (MessagePack counts items, not their bytes.)"""
-        parts: list[Any] = []
-        large, self._large = self._large, []
-        begin = 0
-        for mark, head, elements in large:
-            at = data.index(mark, begin)
-            size = len(head) + len(elements)
-            parts += (data[begin : at - 2], b"\xc9" + size.to_bytes(4, "big") + bytes((ARRAY,)) + head, elements)
-            begin = at + len(mark)
-        parts.append(data[begin:])
-        return parts
-
-    def _forget_names(self, frame: Frame) -> None:
-        """Names that this frame would have introduced are still unknown to the peer."""
-        for field in frame.__struct_fields__:
-            value = getattr(frame, field)
-            if field in ("to", "name", "sender") and type(value) is str:
-                self._names_out.pop(value, None)
-
     def flush(self) -> None:
         """Write what is queued, now; otherwise that happens at the end of the loop tick."""
         self._flushing = False
-        if self._run:
+        if self._run.bodies:
             self._close_run()
         transport, out = self._transport, self._out
         if transport is None or not self.is_open or self._paused or not out:
@@ -287,7 +190,7 @@ class Connection(asyncio.BufferedProtocol):
     @property
     def has_room(self) -> bool:
         """Whether the peer keeps up."""
-        return not self._paused and self._out_bytes + self._run_bytes < HIGH_BYTES
+        return not self._paused and self._out_bytes + self._run.size < HIGH_BYTES
 
     def room(self) -> asyncio.Future[None] | None:
         """None while the peer keeps up; else a future that ends when it does again."""
@@ -322,27 +225,10 @@ class Connection(asyncio.BufferedProtocol):
             self._loop.call_soon(self._go_on)
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        if self._end == len(self._buffer):
-            self._make_room()
-        return self._view[self._end :]
-
-    def _make_room(self) -> None:
-        """Move what is left of a frame to the front, in a larger buffer if the frame needs it."""
-        left = self._end - self._begin
-        need = left + 1
-        if left >= LENGTH.size:
-            need = LENGTH.unpack_from(self._buffer, self._begin)[0] + LENGTH.size
-        size = len(self._buffer)
-        while size < need:
-            size *= 2
-        old = self._view
-        self._buffer = bytearray(size)
-        self._view = memoryview(self._buffer)
-        self._view[:left] = old[self._begin : self._end]
-        self._begin, self._end = 0, left
+        return self._buffer.space()
 
     def buffer_updated(self, nbytes: int) -> None:
-        self._end += nbytes
+        self._buffer.end += nbytes
         self._take_in(FRAMES_PER_TICK if self._guarded else sys.maxsize)
 
     def _take_in(self, most: int) -> None:
@@ -360,16 +246,17 @@ class Connection(asyncio.BufferedProtocol):
                 self._on_batch()
 
     def _take_frames(self, left: int) -> None:
-        begin, end, view, buffer = self._begin, self._end, self._view, self._buffer
+        buffer = self._buffer
+        begin, end, view, data = buffer.begin, buffer.end, buffer.view, buffer.data
         unpack, decode, on_frame, taker = LENGTH.unpack_from, _DECODER.decode, self._on_frame, self.takers.get
         while end - begin >= 4:
-            (size,) = unpack(buffer, begin)
+            (size,) = unpack(data, begin)
             if size > SMALL_BYTES:
                 self._check_large(begin + 4, end, size)
             if end - begin - 4 < size:
                 break
             if left < 0:
-                self._begin = begin
+                buffer.begin = begin
                 self._rest()
                 return
             start = begin + 4
@@ -381,12 +268,7 @@ class Connection(asyncio.BufferedProtocol):
             taker(type(frame), on_frame)(frame)
             if not self.is_open:
                 return
-        if begin == end:
-            begin = end = 0
-            if len(buffer) > READ_BYTES * 8:  # One huge frame shall not hold its memory for ever.
-                self._buffer = bytearray(READ_BYTES)
-                self._view = memoryview(self._buffer)
-        self._begin, self._end = begin, end
+        buffer.taken(begin)
         if self._guarded and self._paused:
             self._rest()
 
@@ -396,8 +278,8 @@ class Connection(asyncio.BufferedProtocol):
             raise BadFrame(f"{size} bytes are announced, the limit is {MAX_FRAME}")
         if end - start < 2:
             return  # Its kind has not come yet.
-        head, tag = self._buffer[start], self._buffer[start + 1]
-        if head & 0xF0 != 0x90 or tag not in self._large_in:
+        head, tag = self._buffer.data[start : start + 2]
+        if head & 0xF0 != 0x90 or tag not in (_CARRIER_TAGS if self._guarded else _FROM_ROOT_TAGS):
             raise BadFrame(f"{size} bytes are announced for a frame without a payload, the limit is {SMALL_BYTES}")
 
     def _rest(self) -> None:

@@ -12,6 +12,8 @@ from typing import Annotated, Any
 
 import msgspec
 
+from ...errors import HoldfastError
+
 Raw = msgspec.Raw
 Name = int | str
 """An address or type name: text the first time, its number in order of first use from then on."""
@@ -20,6 +22,12 @@ Name = int | str
 LONGEST_CHAIN = 4096
 """Turns that wait for each other, in the chain of an ask."""
 Chain = Annotated[tuple[tuple[str, int], ...], msgspec.Meta(max_length=LONGEST_CHAIN)]
+
+
+class BadFrame(HoldfastError, text="malformed frame: {problem}"):
+    """The peer sent something that is no frame of ours: the connection is closed."""
+
+    problem: str
 
 
 class Frame(msgspec.Struct, array_like=True, forbid_unknown_fields=True):
@@ -169,6 +177,11 @@ class Migrate(Frame, tag=17):
     step: str
     part: bytes
     is_last: bool
+
+
+def payload_of(frame: Frame) -> Any:
+    """What a frame carries for others; None if it carries nothing."""
+    return frame.body if isinstance(frame, (Tell, Ask, Reply, Failure, Publish, Record, Offer)) else None
 
 
 def tagged(kind: type[Frame]) -> bytes:

@@ -21,7 +21,8 @@ from ...kernel.envelope import Ask, Envelope, Item
 from ...kernel.lifecycle import NEAR
 from ...kernel.message import Message, message_name
 from . import frames
-from .connection import BadFrame, Connection
+from .connection import Connection
+from .frames import BadFrame
 from .pending_sends import Offered
 
 if TYPE_CHECKING:
@@ -72,18 +73,18 @@ class Peer:
                 return
             source, message = item.sender, item.message
         # Names are numbered by first use: here in the order in which the other side reads them.
-        to = connection.name_out(path)
+        to = connection.names.to_wire(path)
         name, body = self._payload(message)
-        sender = None if source is None else connection.name_out(source.path)
+        sender = None if source is None else connection.names.to_wire(source.path)
         connection.send(frames.Tell(to, name, body, number, sender), path)
 
     def _send_ask(self, cell: Cell, path: str, ask: Ask, number: int) -> None:
         connection = self.connection
-        self._last_id = key = self._last_id + 1
-        until = ask.deadline if self.node.is_monotonic else monotonic() + ask.deadline - self.node.loop.time()
-        to = connection.name_out(path)
+        key = self.next_id()
+        until = self.node.clock.on_machine(ask.deadline)
+        to = connection.names.to_wire(path)
         name, body = self._payload(ask.message)
-        sender = None if ask.sender is None else connection.name_out(ask.sender.path)
+        sender = None if ask.sender is None else connection.names.to_wire(ask.sender.path)
         frame = frames.Ask(key, to, name, body, until, number, sender, ask.chain)
         connection.send(frame, path)
         self.pending[key] = ask
@@ -98,9 +99,9 @@ class Peer:
             BadMessage: it cannot be coded.
         """
         connection = self.connection
-        to = connection.name_out(path)
+        to = connection.names.to_wire(path)
         name, body = self._payload(message)
-        source = None if sender is None else connection.name_out(sender.path)
+        source = None if sender is None else connection.names.to_wire(sender.path)
         key, accepted = self.acceptance()
         connection.send(frames.Offer(key, to, name, body, source), path)
         return accepted
@@ -120,9 +121,14 @@ class Peer:
 
     def expect(self, ask: Ask) -> int:
         """A number under which the other side shall answer this."""
-        self._last_id = key = self._last_id + 1
+        key = self.next_id()
         self.pending[key] = ask
         return key
+
+    def next_id(self) -> int:
+        """A number for a frame that is answered."""
+        self._last_id += 1
+        return self._last_id
 
     def _payload(self, message: Any) -> tuple[frames.Name, Any]:
         """Type name and body; a parcel is passed on as it is."""
@@ -131,8 +137,8 @@ class Peer:
         if known is not None:
             return known, message
         if kind is Parcel:
-            return self.connection.name_out(message.name), Raw(message.body)
-        name = self.connection.name_out(message_name(kind))
+            return self.connection.names.to_wire(message.name), Raw(message.body)
+        name = self.connection.names.to_wire(message_name(kind))
         if type(name) is int:  # Text introduces the name with this frame: known from the next one on.
             self.kinds_out[kind] = name
         return name, message
@@ -143,19 +149,27 @@ class Peer:
 
     def join(self, connection: Connection) -> None:
         """Speak over this connection."""
-        self.connection, self.kinds_out = connection, connection.kinds_out
+        self.connection, self.kinds_out = connection, connection.names.kinds
 
     def on_forget(self, frame: frames.Forget) -> None:
         """The other side gives all its names anew."""
-        self.connection.forget_in()
+        self.connection.names.forget_got()
         self.routes.clear()
         self._record_takers.clear()
 
     def fail_pending(self, error: HoldfastError) -> None:
         """The other side is gone."""
-        pending, self.pending = self.pending, {}
-        for ask in pending.values():
+        for ask in self.take_pending():
             ask.fail(error)
+
+    def take_pending(self) -> list[Ask]:
+        """The asks that waited for the other side, now the caller's."""
+        pending, self.pending = self.pending, {}
+        return list(pending.values())
+
+    def ignore_records(self) -> None:
+        """What is said there from now on for a recovery method is not kept: the life has been moved away."""
+        self.record_taker, self._record_takers = ignored, {}
 
     # -- in ---------------------------------------------------------------------------------------------------------
 
@@ -178,8 +192,8 @@ class Peer:
         """Something for the recovery method at an address."""
         take = self._record_takers.get(frame.to)
         if take is None:
-            take = self.record_taker(self.connection.name_in(frame.to))
-            self._record_takers[self.connection.number_in(frame.to)] = take
+            take = self.record_taker(self.connection.names.from_wire(frame.to))
+            self._record_takers[self.connection.names.number_of(frame.to)] = take
         take(frame)
 
     def on_failure(self, frame: frames.Failure) -> None:
@@ -192,7 +206,7 @@ class Peer:
 
     def _message_in(self, cell: Cell, frame: frames.Tell | frames.Ask) -> Any:
         """The message in a frame. Raises UnknownMessage or BadMessage."""
-        message = self.codec.message_in(cell, self.connection.name_in(frame.name), frame.body)
+        message = self.codec.message_in(cell, self.connection.names.from_wire(frame.name), frame.body)
         if type(frame.name) is int and cell is self.node.root and not cell.host.takes_parcels:
             # Our own actor's class stays: so does the way in for this type.
             kind: Any = type(message)
@@ -200,14 +214,14 @@ class Peer:
         return message
 
     def _sender(self, name: frames.Name | None) -> Cell | None:
-        return None if name is None else self.node.cell_at(self.connection.name_in(name))
+        return None if name is None else self.node.cell_at(self.connection.names.from_wire(name))
 
     def on_tell(self, cell: Cell, frame: frames.Tell, page: memoryview | None) -> None:
         """Take in a message."""
         try:
             message = self._message_in(cell, frame)
         except HoldfastError as error:
-            name = self.connection.name_in(frame.name) if type(frame.name) is int else str(frame.name)
+            name = self.connection.names.from_wire(frame.name) if type(frame.name) is int else str(frame.name)
             self._sender(frame.sender)
             self.node.dead_letter(cell, Parcel(name, bytes(frame.body)), str(error))
             if page is not None:
@@ -225,8 +239,8 @@ class Peer:
     def on_offer(self, cells: Iterable[Cell], frame: frames.Offer | frames.Publish, topic: str | None = None) -> None:
         """Take in a message whose sender waits until every one of `cells` has accepted it, or left the topic."""
         connection = self.connection
-        name = connection.name_in(frame.name)
-        sender = None if frame.sender is None else self.node.cell_at(connection.name_in(frame.sender))
+        name = connection.names.from_wire(frame.name)
+        sender = None if frame.sender is None else self.node.cell_at(connection.names.from_wire(frame.sender))
         parcel = Parcel(name, bytes(frame.body))
         Offered(self, frame.id, parcel, sender, topic).begin(cells)
 
@@ -251,6 +265,11 @@ class Peer:
 def no_records(path: str) -> frames.TakeRecord:
     """Nobody is recovered over this connection."""
     raise BadFrame(f"a record for {path}, which is not recovered")
+
+
+def ignored(path: str) -> frames.TakeRecord:
+    """The records of a life that has been moved away."""
+    return lambda frame: None
 
 
 NIL = Raw(msgspec.msgpack.encode(None))
@@ -426,7 +445,7 @@ class OutsidePlace(Place):
 
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         connection = self.peer.connection
-        connection.send(frames.Command(connection.name_out(cell.path), verb, data))
+        connection.send(frames.Command(connection.names.to_wire(cell.path), verb, data))
 
 
 class OutsideHost(AddressHost):
@@ -444,7 +463,7 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
     connection = peer.connection
     if isinstance(item, links.Exit):
         data: dict[str, Any] = {"source": item.source.path, "reason": pack_exit(item.reason)}
-        connection.send(frames.Command(connection.name_out(path), "exit", data))
+        connection.send(frames.Command(connection.names.to_wire(path), "exit", data))
     elif isinstance(item, links.Down):
         data = {
             "source": item.watch.target.path,
@@ -452,7 +471,7 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
             "recovering": item.recovering,
             "for_good": item.watch.for_good,
         }
-        connection.send(frames.Command(connection.name_out(path), "down", data))
+        connection.send(frames.Command(connection.names.to_wire(path), "down", data))
     else:
         raise HoldfastError(f"{type(item).__name__} cannot be sent to {path}")
 

@@ -23,7 +23,8 @@ from ...kernel.cell import GONE, Cell
 from ...kernel.message import Order
 from ...kernel.node import cell_kind
 from . import frames
-from .connection import MOST_NAMES, BadFrame
+from .frames import BadFrame
+from .name_table import MOST_NAMES
 from .start_codec import loaded
 
 if TYPE_CHECKING:
@@ -55,7 +56,7 @@ class Gate:
     def readdressed(self, old: str, new: str) -> None:
         """Its actor has another address: what it says until it knows that is meant so."""
         self._left.append((old, new))
-        self._worker.connection.rename_in(self._now)
+        self._worker.connection.names.rename_got(self._now)
 
     def _now(self, path: str) -> str:
         for old, new in self._left:
@@ -142,8 +143,8 @@ class Gate:
         connection = self._worker.connection
         if self._left:
             text = self._now(text)
-        connection.name_in(text)
-        number = connection.number_in(text)
+        connection.names.from_wire(text)
+        number = connection.names.number_of(text)
         self._chars += len(text)
         if number >= MOST_NAMES_IN or self._chars > MOST_NAME_CHARS:
             raise BadFrame("it gives names without end")
@@ -153,7 +154,7 @@ class Gate:
         """The address that a frame is of; known by its number from now on."""
         if type(frame.to) is str:
             frame.to = self._introduce(frame.to)
-        return self._worker.connection.name_in(frame.to)
+        return self._worker.connection.names.from_wire(frame.to)
 
     def _message(self, frame: Any) -> None:
         """What the names of a message say."""
@@ -166,7 +167,7 @@ class Gate:
         if sender is not None and sender not in self._own:
             if type(sender) is str:
                 sender = frame.sender = self._introduce(sender)
-            self.require_own(self._worker.connection.name_in(sender), "a message")
+            self.require_own(self._worker.connection.names.from_wire(sender), "a message")
             self._own.add(sender)
 
     def target(self, to: frames.Name) -> Cell:
@@ -179,10 +180,10 @@ class Gate:
         if cell is not None and cell.state is not GONE:
             return cell
         connection = self._worker.connection
-        path = connection.name_in(to)
+        path = connection.names.from_wire(to)
         cell = self._node.cell_at(path)
         self._check_part(cell)
-        self._targets[connection.number_in(to)] = cell
+        self._targets[connection.names.number_of(to)] = cell
         return cell
 
     def _check_part(self, cell: Cell) -> None:
@@ -201,7 +202,7 @@ class Gate:
             self._message(frame)
         if frame.name in self._orders:
             connection = self._worker.connection
-            self.require_granted(connection.name_in(frame.to), connection.name_in(frame.name))
+            self.require_granted(connection.names.from_wire(frame.to), connection.names.from_wire(frame.name))
 
     def ask(self, frame: frames.Ask) -> None:
         """As for a message; its deadline is a time."""
@@ -213,7 +214,7 @@ class Gate:
         """It publishes as itself, and no orders."""
         self._message(frame)
         if frame.name in self._orders:
-            raise BadFrame(f"an order is published: {self._worker.connection.name_in(frame.name)}")
+            raise BadFrame(f"an order is published: {self._worker.connection.names.from_wire(frame.name)}")
 
     def outcome(self, frame: Any) -> None:
         """It answers what was asked of it: a number that waits for nobody there is late, or nothing."""

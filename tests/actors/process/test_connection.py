@@ -18,7 +18,9 @@ from hypothesis import strategies as st
 import holdfast as hf
 from holdfast.actors.kernel.codec import MAX_BYTES
 from holdfast.actors.process.wire import frames
-from holdfast.actors.process.wire.connection import HIGH_BYTES, MAX_FRAME, READ_BYTES, BadFrame, Connection
+from holdfast.actors.process.wire.connection import HIGH_BYTES, MAX_FRAME, Connection
+from holdfast.actors.process.wire.frame_buffer import READ_BYTES
+from holdfast.actors.process.wire.frames import BadFrame
 
 LENGTH = struct.Struct("<I")
 SECONDS = 20.0
@@ -41,7 +43,7 @@ class End:
 
     def _on_frame(self, frame: frames.AnyFrame) -> None:
         if isinstance(frame, frames.Tell | frames.Command):  # as both sides do
-            self.connection.name_in(frame.to)
+            self.connection.names.from_wire(frame.to)
         if isinstance(frame, frames.Tell):
             frame.body = msgspec.Raw(bytes(frame.body))  # it lies in the buffer, which is used again
         self.frames.append(frame)
@@ -185,7 +187,7 @@ async def test_the_buffer_of_a_large_frame_is_given_back() -> None:
         await other.get(1)
         one.connection.send(frames.Beat())
         await other.get(2)
-        assert len(other.connection._buffer) == READ_BYTES
+        assert len(other.connection._buffer.data) == READ_BYTES
 
 
 async def test_what_is_queued_leaves_before_an_orderly_close() -> None:
@@ -201,13 +203,13 @@ async def test_what_is_queued_leaves_before_an_orderly_close() -> None:
 
 async def test_a_frame_above_the_limit_is_refused_and_the_next_one_goes_through() -> None:
     async with pair() as (one, other):
-        number = one.connection.name_out("/app/new")
+        number = one.connection.names.to_wire("/app/new")
         with pytest.raises(hf.BadMessage) as refused:
             one.connection.send(tell("huge", bytes(MAX_FRAME), to=number), "/app/new")
         assert "Blob" in str(refused.value)
         assert "field 'data'" in str(refused.value)
         assert str(MAX_BYTES) in str(refused.value)
-        one.connection.send(tell("small", to=one.connection.name_out("/app/new")))
+        one.connection.send(tell("small", to=one.connection.names.to_wire("/app/new")))
         assert labels(await other.get(1)) == ["small"], "a name that was not sent is introduced again"
 
 
@@ -252,7 +254,7 @@ async def test_what_is_no_frame_closes_the_connection(data: bytes) -> None:
         assert isinstance(await end.lost(), BadFrame)
         assert isinstance(end.frames[0], frames.Beat), "what came before it counts"
         assert sum(isinstance(frame, frames.Beat) for frame in end.frames) == 1, "what comes behind it does not"
-        assert len(end.connection._buffer) == READ_BYTES, "no memory for what was announced"
+        assert len(end.connection._buffer.data) == READ_BYTES, "no memory for what was announced"
         end.connection.send(frames.Beat())  # to a closed connection: nothing happens
 
 

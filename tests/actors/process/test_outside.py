@@ -78,7 +78,7 @@ async def test_a_cancelled_monitor_leaves_nothing_behind(make: Make) -> None:
         watcher.tell(Watch("monitor", target))
     watcher.tell(Cancel())
     await watcher.ask(Heard())
-    await until(lambda: not target._cell.extra().monitors)
+    await until(lambda: not target._cell.extra().ties.monitors)
 
 
 async def test_watch_tells_once_when_the_address_is_gone(make: Make, system: hf.ActorSystem) -> None:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import holdfast as hf
-from holdfast.actors.process.wire.connection import LARGE_ARRAY, RUN_BYTES
+from holdfast.actors.process.wire.connection import RUN_BYTES
+from holdfast.actors.process.wire.frame_encoder import LARGE_ARRAY
 
 pytestmark = pytest.mark.pairs
 

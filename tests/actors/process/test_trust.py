@@ -13,7 +13,7 @@ import pytest
 
 import holdfast as hf
 from holdfast.actors.kernel.cell import Cell
-from holdfast.actors.process.wire.connection import MOST_NAMES
+from holdfast.actors.process.wire.name_table import MOST_NAMES
 from tests.actors.process.waiting import SECONDS, next_event
 
 pytestmark = pytest.mark.pairs
@@ -62,7 +62,7 @@ class Worker(hf.Actor):
     @hf.on(Names)
     def names(self, message: Names) -> int:
         gc.collect()
-        return len(self.ctx.cell.node.uplink._outside)
+        return len(self.ctx.cell.node.ports.uplink._outside)
 
 
 class Job(hf.Actor):
@@ -112,15 +112,15 @@ async def test_who_asked_once_is_not_remembered(system: hf.ActorSystem) -> None:
         job.kill()
     assert await worker.ask(Names(), timeout=SECONDS) < 1000
     connection = system._workers.by_cell[worker._cell].connection
-    assert len(connection._names_out) < 1500
+    assert len(connection.names._given) < 1500
 
 
 async def test_links_outlive_the_forgetting_of_names(system: hf.ActorSystem) -> None:
     """Names begin anew while asks are open and messages are on their way, in order."""
     worker = await system.start(hf.child("worker", hf.start(Worker), isolation="process"))
     for at in range(MOST_NAMES + 10):
-        cell = Cell(system.node, None, f"/app/nobody-{at}", system.node.here)
-        system._workers.by_cell[worker._cell].connection.name_out(cell.path)
+        cell = Cell(system.node, None, f"/app/nobody-{at}", system.node.ports.here)
+        system._workers.by_cell[worker._cell].connection.names.to_wire(cell.path)
     asks = [worker.ask(Ping(), timeout=SECONDS) for _ in range(100)]
     assert [await ask for ask in asks] == [1] * 100
 

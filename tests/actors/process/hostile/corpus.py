@@ -74,12 +74,13 @@ async def main() -> None:
     frames_in = Connection._take_frames
 
     def listening(self: Connection, left: int) -> None:
-        at, end = self._begin, self._end
+        buffer = self._buffer
+        at, end = buffer.begin, buffer.end
         while self._guarded and end - at >= 4:
-            size = int.from_bytes(self._buffer[at : at + 4], "little")
+            size = int.from_bytes(buffer.data[at : at + 4], "little")
             if end - at - 4 < size:
                 break
-            data = bytes(self._buffer[at + 4 : at + 4 + size])
+            data = bytes(buffer.data[at + 4 : at + 4 + size])
             if size <= LONGEST:
                 known.setdefault(shape(data), data)
             at += 4 + size

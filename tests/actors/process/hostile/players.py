@@ -70,14 +70,14 @@ class Evil(hf.Actor):
     port: hf.Binding[hf.Actor]
 
     def _socket(self) -> socket.socket:
-        connection = self.ctx.cell.node.uplink.connection
+        connection = self.ctx.cell.node.ports.uplink.connection
         connection.flush()
         return connection._transport.get_extra_info("socket")
 
     @hf.on(Write)
     def write(self, message: Write) -> int:
         self._socket()
-        self.ctx.cell.node.uplink.connection._transport.write(message.data)
+        self.ctx.cell.node.ports.uplink.connection._transport.write(message.data)
         return 1
 
     @hf.on(WriteLater)
@@ -100,16 +100,16 @@ class Evil(hf.Actor):
 
     @hf.on(SetPage)
     async def set_page(self, message: SetPage) -> int:
-        page = self.ctx.cell.node.uplink.page
+        page = self.ctx.cell.node.ports.uplink.page
         getattr(page, "_page", page)[message.place] = message.number
         self._socket()
-        self.ctx.cell.node.uplink.connection._transport.write(message.nudge)
+        self.ctx.cell.node.ports.uplink.connection._transport.write(message.nudge)
         await asyncio.sleep(3600)
         return 1
 
     @hf.on(BeDeaf)
     def be_deaf(self, message: BeDeaf) -> int:
-        uplink = self.ctx.cell.node.uplink
+        uplink = self.ctx.cell.node.ports.uplink
         uplink.node.loop.call_later(0.05, uplink.connection._transport.pause_reading)
         return 1
 
@@ -131,7 +131,7 @@ class Evil(hf.Actor):
         return 1
 
     def _unbridle(self) -> None:
-        self.ctx.cell.node.uplink.require_granted = lambda path, order: None
+        self.ctx.cell.node.ports.uplink.require_granted = lambda path, order: None
 
 
 class House(hf.Supervisor):
