@@ -188,7 +188,7 @@ class RequestProtocol(Transfer):
             self._keep(done)
         if done.is_last and done.number == self._current:
             self._current = None
-            if standing.leads and done.number >= 0 and not standing.server.is_over:
+            if standing.leads and done.number >= 0 and not standing.server.state.is_over:
                 dropped = [number for number, one in standing.inside.items() if not standing.server.has_taken(one)]
                 if dropped:
                     self._end_dropped(done, dropped)

@@ -104,7 +104,7 @@ class Helping(Remembering):
     def _base(self, order: Compute) -> State | None:
         """The state that is here, if it is the one that is meant."""
         standing = self._standing
-        point = standing.server.point
+        point = standing.server.points.point
         if standing.server.life is not None or point is None or point.turn != order.turn:
             return None
         if point is not self._kept:

@@ -114,11 +114,11 @@ class Transfer(Gate):
             await self._quiet()
             standing.check(epoch)
             await server.ensure()
-            state = None
-            if server.has_access:
-                state = server.capture() if server.point is not None or server.turn >= 0 else None
-            elif server.point is not None and server.turn == server.point.turn and not server.point.data.size:
-                state = server.point  # It has begun afresh, and so does the other one.
+            state, point = None, server.points.point
+            if server.state.has_access:
+                state = server.capture() if point is not None or server.turn >= 0 else None
+            elif point is not None and server.turn == point.turn and not point.data.size:
+                state = point  # It has begun afresh, and so does the other one.
             elif server.turn >= 0:
                 why = "the state of the protected actor cannot be read, and it has handled requests already"
                 raise CannotJoin(path=path, why=why)

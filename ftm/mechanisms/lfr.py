@@ -31,6 +31,7 @@ from ..bricks.runs import Missing, Shadow, digest_of_state
 from ..bricks.standing import PeerLost
 from ..bricks.state_transfer import GoneAstray
 from ..model.mechanism import Mechanism, Role
+from ..replica.rewind_points import before_turn
 
 RUNS_AGAIN = 3
 """How often what has differed is computed again."""
@@ -110,7 +111,7 @@ class Forwarding(Before, Sender):
         requests = [decided(one, now) for one in work.requests]
         work = Work(work.epoch, work.config, work.number, requests, work.go)
         if requests or work.go is not None:
-            looks = standing.server.has_access and standing.looking.is_due(requests, now, self._every)
+            looks = standing.server.state.has_access and standing.looking.is_due(requests, now, self._every)
             standing.forwarded.append(self.send_peer(Forward(work, looks)))
         return work
 
@@ -187,7 +188,7 @@ class Notifying(After, Sender):
             for task in list(standing.forwarded):
                 await task
         standing.forwarded = [task for task in standing.forwarded if not task.done()]
-        released = standing.server.released
+        released = standing.server.traces.released
         digests = [(end.id, end.turn, digest(end, released.get(end.turn, []))) for end in done.ends]
         self.send_peer(Notify(digests, standing.looking.take(standing.server, done)))
         return done
@@ -212,7 +213,7 @@ class Comparing(After):
         if done.number <= FORWARDED and done.number != self._standing.forwarded_as:
             return done  # It leads on from a state that is given up.
         self._begin_anew()
-        inside, released = self._standing.inside, self._standing.server.released
+        inside, released = self._standing.inside, self._standing.server.traces.released
         for end in done.ends:
             request = inside.get(end.id)
             name = "" if request is None else request.feed.name
@@ -271,11 +272,11 @@ class Comparing(After):
     def _stray(self, number: int, turn: int, name: str, known: set[int] | None) -> None:
         """From here on our state is not the leader's: we must not lead, and do not count until we have joined again."""
         standing = self._standing
-        if not standing.server.has_access:
+        if not standing.server.state.has_access:
             raise HoldfastError(f"{standing.path} has diverged from its leader at request {number}")
         self._has_diverged = True
         standing.unready()
-        begin = standing.server.since_before(number, turn)
+        begin = before_turn(standing.server.points, number, turn)
         if begin is not None:
             self.ctx.create_task(self._compute_again(*begin, number, name, known))
         self.ctx.cell.node.cell_at(standing.paths["protocol"]).ref.tell(GoneAstray())
@@ -288,7 +289,7 @@ class Comparing(After):
         `known`: digests of the outcomes that the request had; that it has one of these again is no proof of anything.
         """
         standing = self._standing
-        heard, shadow = list(standing.server.heard.values()), Shadow(standing, None)
+        heard, shadow = list(standing.server.traces.heard.values()), Shadow(standing, None)
         found: set[tuple[int, bytes]] = set()
         turn = before.turn
         try:

@@ -353,9 +353,9 @@ class Replica(Supervisor):
             standing.leads = leads
         roles = [one.role(leads=standing.leads) for one in woven.layers]
         standing.computes = standing.leads or all(role.computes for role in roles)
-        self._server.is_lazy = not any("state_access" in one.needs for one in woven.layers)
         server = self._server
-        if not server.is_lazy and server.tail and server.life is not None and server.life.feed is None:
+        server.state.is_lazy = not any("state_access" in one.needs for one in woven.layers)
+        if not server.state.is_lazy and server.points.tail and server.life is not None and server.life.feed is None:
             server.capture()  # From here on, the last part is what was handled since the last point.
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
         standing.forget_bricks()
@@ -391,7 +391,7 @@ class Replica(Supervisor):
     async def _keep_state(self) -> None:
         """The protected actor does not live here any more: its state stays, as bytes."""
         server = self._server
-        if server.life is not None and server.life.feed is None and server.has_access:
+        if server.life is not None and server.life.feed is None and server.state.has_access:
             server.capture()
         await server.drop_life()
 

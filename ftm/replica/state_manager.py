@@ -13,6 +13,7 @@ from ...actors.kernel.message import Message
 from ...checkpoint.protocol import TurnEnd
 from ..bricks.brick_messages import Change, State
 from ..bricks.state_images import Misfit
+from .rewind_points import change_since, led_to
 
 if TYPE_CHECKING:
     from ..bricks.standing import Standing
@@ -77,17 +78,19 @@ class StateManager(Actor):
 
     @on(Capture)
     def capture(self, message: Capture) -> Captured:
-        """Save the state."""
+        """Save the state, and work out what has changed in it."""
         server = self._standing.server
         state = server.capture()
-        return Captured(state, server.since(message.since))
+        change = change_since(server.points, message.since)
+        server.points.given = state  # Whoever asked has all of it from now on.
+        return Captured(state, change)
 
     @on(Apply)
     async def apply(self, message: Apply) -> int:
-        """Take a state."""
+        """Have the state that the other replica has said."""
         server = self._standing.server
         try:
-            state = server.led_to(message.state)
+            state = led_to(server.points.point, message.state)
         except (Misfit, DamagedValue):
             return MISFIT
         had_life = server.life is not None
@@ -100,16 +103,16 @@ class StateManager(Actor):
 
     @on(LastRun)
     def last_run(self, message: LastRun) -> Ran:
-        """The last part."""
+        """Tell what the last part has come to."""
         server = self._standing.server
-        return Ran(message.ends, sorted(server.released.items()), server.capture())
+        return Ran(message.ends, sorted(server.traces.released.items()), server.capture())
 
     @on(RunAgain)
     async def run_again(self, message: RunAgain) -> Ran:
         """The last part once more."""
         server = self._standing.server
         ends, state = await server.again()
-        return Ran(ends, sorted(server.released.items()), state)
+        return Ran(ends, sorted(server.traces.released.items()), state)
 
     @on(Undo)
     async def undo(self, message: Undo) -> State:

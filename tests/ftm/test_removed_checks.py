@@ -134,8 +134,8 @@ CHECKS = {
     ),
     "a delta is put upon the state that it belongs to": Check(
         "ftm/replica/rewind_points.py",
-        "        if point is None or point.turn != state.base:\n",
-        "        if point is None:\n",
+        "    if point is None or point.turn != state.base:\n",
+        "    if point is None:\n",
         CHECKS_ALONE,
         "test_what_has_changed_since",
     ),
@@ -191,9 +191,9 @@ CHECKS = {
         "test_a_batch_that_comes_to_proceed_twice",
     ),
     "what cannot be undone leaves at the front only": Check(
-        "ftm/replica/protected_actor.py",
-        "        return self.standing.leads and not self.ends and self.confirmed >= self.handed\n",
-        "        return self.standing.leads\n",
+        "ftm/replica/replica_state.py",
+        "    return leads and not part.ends and state.confirmed >= state.handed\n",
+        "    return leads\n",
         PBR,
         "test_a_turn_that_asks_is_undone",
     ),
@@ -276,7 +276,7 @@ CHECKS = {
     ),
     "TMR: what is stopped in the middle has no vote": Check(
         "ftm/bricks/runs.py",
-        "        if self._is_stopping:  # Stopped",
+        "        if self.state.is_stopping:  # Stopped",
         "        if False:  # Stopped",
         "tests/ftm/test_tmr.py",
         "test_a_replica_that_is_stopped_while",
