@@ -326,7 +326,7 @@ class Deciding(After):
     async def run_here(self, before: State, requests: list[Request]) -> Run:
         """Have the actor itself run requests, from a state."""
         server = self._standing.server
-        ends, _ = await server.again(before, requests)
+        ends = await server.run_again(before, requests)
         return self._last_run(before, ends)
 
     async def _take(

@@ -473,7 +473,7 @@ class Server(lifecycle.HerePlace):
         ends, part.ends = part.ends, []
         return ends
 
-    async def _run_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
+    async def _run_part_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
         """Nothing of the last part has happened: run it, and no more, again. `single`: one request at a time."""
         if single:
             self.attempts.singles = len(self.part.begun)
@@ -540,7 +540,7 @@ class Server(lifecycle.HerePlace):
                 if len(begun) == 1 and self.life is not None and self.life.cell.actor is not None:
                     self._fail(begun[0], ends[-1], error)
                 await self.drop_life()
-                ends = await self._run_again(pending, single=len(begun) > 1)
+                ends = await self._run_part_again(pending, single=len(begun) > 1)
             else:
                 return ends
 
@@ -688,22 +688,12 @@ class Server(lifecycle.HerePlace):
 
     # -- the last part once more -----------------------------------------------------------------------------------
 
-    async def again(
-        self, since: State | None = None, feeds: list[Request] | None = None
-    ) -> tuple[list[TurnEnd], State]:
-        """Rewind to the point before the last part, and run that part again; returns ends and state.
+    async def run_again(self, before: State, requests: list[Request]) -> list[TurnEnd]:
+        """Rewind to an earlier state, and run requests from there again; returns their ends.
 
         Nothing is handed over. Asks get the outcomes that they had.
-
-        Args:
-            since: rewind to this state instead.
-            feeds: run these requests instead.
         """
         previous = self.points.previous
-        before, requests = (None, None) if previous is None else previous
-        before, requests = since or before, requests if feeds is None else feeds
-        assert before is not None
-        assert requests is not None
         self.traces.objections.clear()
         await self._go_back_to(before)
         self.traces.go_back_to(before.turn)
@@ -715,15 +705,15 @@ class Server(lifecycle.HerePlace):
         await self.ensure()
         skips, self.attempts.skips = self.attempts.skips, {}
         try:
-            state = self.capture()
+            self.capture()
         except BaseException as error:  # What the user's own values and methods raise: as when a part is sealed.
             if len(requests) != 1 or len(ends) != 1 or skips:
                 raise
             self._fail(requests[0], ends[0], error)
             await self.drop_life()
-            return await self.again(before, requests)
+            return await self.run_again(before, requests)
         self.points.previous = previous
-        return ends, state
+        return ends
 
     async def _run_all(self, requests: list[Request], *, even_stopping: bool) -> list[TurnEnd]:
         """Run requests, part by part, until all have ended. `even_stopping`: also when the life is ended meanwhile."""
@@ -733,13 +723,6 @@ class Server(lifecycle.HerePlace):
             self.points.keep_tail(self.part.begun, new)
             ends += new
         return ends
-
-    async def back(self) -> State:
-        """Rewind to the point before the last part, for good: it leaves no trace but its numbers."""
-        assert self.points.previous is not None
-        before, _ = self.points.previous
-        await self._go_back_to(before)
-        return before
 
     # -- as the port home -------------------------------------------------------------------------------------------
 

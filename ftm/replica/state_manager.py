@@ -10,7 +10,6 @@ from ...actors.errors import DamagedValue
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.message import Message
-from ...checkpoint.protocol import TurnEnd
 from ..bricks.brick_messages import Change, State
 from ..bricks.state_images import Misfit
 from .rewind_points import change_since, led_to
@@ -42,28 +41,6 @@ class Apply(Message[int]):
     """
 
     state: State | Change
-
-
-class Ran(msgspec.Struct):
-    """What a run of the last part has come to: its ends, all that they sent, and the state it has left."""
-
-    ends: list[TurnEnd]
-    released: list[tuple[int, list[int]]]
-    state: State
-
-
-class LastRun(Message[Ran]):
-    """What the last part has come to, as it was handed over."""
-
-    ends: list[TurnEnd]
-
-
-class RunAgain(Message[Ran]):
-    """Rewind to where the last part began, and run it again."""
-
-
-class Undo(Message[State]):
-    """Rewind to where the last part began, for good; the reply is that state."""
 
 
 class StateManager(Actor):
@@ -100,21 +77,3 @@ class StateManager(Actor):
         if had_life:
             await server.ensure()
         return server.turn
-
-    @on(LastRun)
-    def last_run(self, message: LastRun) -> Ran:
-        """Tell what the last part has come to."""
-        server = self._standing.server
-        return Ran(message.ends, sorted(server.traces.released.items()), server.capture())
-
-    @on(RunAgain)
-    async def run_again(self, message: RunAgain) -> Ran:
-        """The last part once more."""
-        server = self._standing.server
-        ends, state = await server.again()
-        return Ran(ends, sorted(server.traces.released.items()), state)
-
-    @on(Undo)
-    async def undo(self, message: Undo) -> State:
-        """The last part leaves no trace."""
-        return await self._standing.server.back()
