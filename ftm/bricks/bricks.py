@@ -79,7 +79,7 @@ class Brick(Posting):
     @property
     def has_peer(self) -> bool:
         """Whether another replica has all that this one has acknowledged."""
-        return self._standing.peer_state == "live"
+        return self._standing.other.state == "live"
 
     # -- the other replica ------------------------------------------------------------------------------------------
 
@@ -227,7 +227,7 @@ class Proceed(Brick):
         To run it again is to do it twice.
         """
         if work.number <= FORWARDED:
-            return work.number != self._standing.forwarded_as
+            return work.number != self._standing.following.number
         if work.number < 0:  # A marker.
             return False
         is_known = work.number <= self._last and work.epoch == self._last_epoch

@@ -228,7 +228,7 @@ class Shadow(Server):
         assert main.parent is not None
         name = f"shadow-{next(_NUMBERS)}"
         cell = node.cell_below(main.parent, name, AddressHost(FED, self, node.here.parent))
-        self.standing.shadows.add(self)
+        self.standing.server.shadows.add(self)
         cell.spec = child(name, self._recipe)
         cell.extra().start = self._recipe
         claimed = main.extra().claimed
@@ -242,7 +242,7 @@ class Shadow(Server):
         if self.cell is not None:
             lifecycle.retire(self.cell, SHUTDOWN)
             self.cell = None
-            self.standing.shadows.discard(self)
+            self.standing.server.shadows.discard(self)
 
     # -- nothing leaves ---------------------------------------------------------------------------------------------
 
@@ -269,7 +269,7 @@ class Remembering(Before):
 
     async def before(self, work: Work) -> Work:
         """Remember the requests of a batch."""
-        inputs = self._standing.inputs
+        inputs = self._standing.server.traces.inputs
         inputs.update((one.feed.id, one) for one in work.requests)
         while len(inputs) > MOST_INPUTS:
             del inputs[next(iter(inputs))]
@@ -305,7 +305,7 @@ class Deciding(After):
         before, asked = server.points.previous
         before = msgspec.structs.replace(before, live=server.life.is_live)
         dropped = {end.id for end in done.ends if end.status == DROPPED}
-        inputs = self._standing.inputs
+        inputs = self._standing.server.traces.inputs
         asked = [inputs.get(one.feed.id, one) for one in asked]
         requests = [one if one.feed.id in dropped else without_deadline(one) for one in asked]
         first = self._last_run(before, done.ends)

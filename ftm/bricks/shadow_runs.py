@@ -124,5 +124,5 @@ class Helping(Remembering):
         if order.state is not None:  # What is here may not be what has led to that.
             standing.log.replace(order.log)
         standing.log.add(entries)
-        standing.kept = epoch, run.state.turn  # It may have been told meanwhile that another one leads.
+        standing.following.computed = epoch, run.state.turn  # It may have been told meanwhile that another one leads.
         return True

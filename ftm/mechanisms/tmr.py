@@ -134,7 +134,7 @@ class Voting(Deciding):
         if self._point is not state and self._point != state:
             begin = time.perf_counter()
             self._point, self._digest = state, self._digests.of(state)
-            self._standing.took(time.perf_counter() - begin, state.data.size)
+            self._standing.server.took(time.perf_counter() - begin, state.data.size)
         return self._digest
 
     def _others(self) -> list[str]:

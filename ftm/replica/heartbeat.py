@@ -72,7 +72,7 @@ class Heart(Actor):
         now = self.ctx.cell.node.loop.time()
         gap, self._seen = min(now - self._seen, 2 * self._interval), now  # While this process stood still, no turn ran.
         before, self._turns = self._turns, {}
-        for server in (standing.server, *standing.shadows):
+        for server in (standing.server, *standing.server.shadows):
             life = server.life
             feed = None if life is None else life.feed
             if life is None or feed is None or feed.kind == START:

@@ -45,7 +45,7 @@ from ...checkpoint.protocol import (
     Unsaved,
 )
 from ...checkpoint.snapshot.key_variables import variables
-from ..alarms import ProtectionLost
+from ..alarms import ProtectionCostly, ProtectionLost
 from ..bricks.brick_messages import Beside, Request, State, WorkLost
 from ..bricks.state_images import Images
 from ..model.mechanism import has_state_access
@@ -89,6 +89,8 @@ BEGUN_WITHIN: Final = 60.0
 """Seconds that `on_start` of a life that begins at a point may take; then the replica cannot have one."""
 MOST_CRASHES: Final = 8
 """Ends of the life outside any turn, one after another, after which the replica is given up."""
+COSTLY: Final = 0.01
+"""Seconds from which on it is told what going through the state takes."""
 MOST_COPIED: Final = 16_000_000
 """Bytes of a state that home gets a copy of."""
 
@@ -129,11 +131,13 @@ class Server(lifecycle.HerePlace):
         self.part, self.attempts = Part(deque()), Attempts()
         self.traces, self.reports = Traces(), Reports()
         self.hooks: list[TurnHook] = []  # see each end while the actor is as the turn has left it; the innermost first
+        self.shadows: set[Server] = set()  # more lives of it, which only compute
         self._driver: Driver | None = None  # None: nothing goes home
         self._rest = Rest(standing.node.loop)
         self._images = Images()
         self._beginning = asyncio.Lock()
         self._live: Live | None = None
+        self._is_costly = False  # that was told
         self._work_waited_for: list[asyncio.Future[None]] = []
 
     def report_to(self, driver: Driver) -> None:
@@ -408,8 +412,14 @@ class Server(lifecycle.HerePlace):
         assert life.feed is None
         begin = time.perf_counter()
         rewind_to(life, point, self.points.names, has_deltas=self.state.has_deltas)
-        self.standing.took(time.perf_counter() - begin, point.data.size)
+        self.standing.server.took(time.perf_counter() - begin, point.data.size)
         self.points.go_back_to(point)
+
+    def took(self, seconds: float, size: int) -> None:
+        """The state was gone through to compare runs: tell, once, if that takes long."""
+        if seconds > COSTLY and not self._is_costly:
+            self._is_costly, standing = True, self.standing
+            standing.node.emit(ProtectionCostly(standing.address, standing.path, seconds, size))
 
     async def _go_back_to(self, point: State) -> None:
         """Have the life stand at a point: the one that there is, or one that begins there."""

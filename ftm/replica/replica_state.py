@@ -98,6 +98,7 @@ class Traces:
     heard: dict[tuple[int, int], Outcome] = dataclasses.field(default_factory=dict)  # by turn and number of the ask
     released: dict[int, list[int]] = dataclasses.field(default_factory=dict)  # digests of what left in mid-turn
     withheld: list[Out] = dataclasses.field(default_factory=list)  # of the turn in hand, on a follower
+    inputs: dict[int, Request] = dataclasses.field(default_factory=dict)  # as they came in, for other runs of them
     objections: dict[int, str] = dataclasses.field(default_factory=dict)  # what hooks have against requests
 
     def begin_anew(self, heard: Iterable[Outcome]) -> None:

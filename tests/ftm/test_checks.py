@@ -138,7 +138,7 @@ async def test_what_a_follower_hears_before_it_has_the_state_does_not_keep_the_s
     await driver.add("r2")
     joining = asyncio.ensure_future(driver.join("r2"))
     async with asyncio.timeout(10):
-        while driver.standing("r1").peer_state != "joining":
+        while driver.standing("r1").other.state != "joining":
             await asyncio.sleep(0.001)
     for (turn, k), out in driver.released.items():
         driver.inward(Outcome(turn, k, answer(out)))

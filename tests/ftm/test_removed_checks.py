@@ -36,8 +36,8 @@ CHECKS = {
     ),
     "T1: who was replaced says nothing more": Check(
         "ftm/bricks/standing.py",
-        "        self.is_fenced = True\n        self.set_peer",
-        "        self.set_peer",
+        "        self.is_fenced = True\n        self.other.replace",
+        "        self.other.replace",
         PBR,
         "test_an_old_primary_that_wakes_up",
     ),
@@ -71,7 +71,7 @@ CHECKS = {
     ),
     "LFR: a reply leaves when the follower has the request": Check(
         "ftm/mechanisms/lfr.py",
-        '        if standing.peer_state == "live":\n            for task',
+        '        if standing.other.state == "live":\n            for task',
         "        if False:\n            for task",
         LFR,
         "test_a_reply_leaves_only_when",
@@ -178,8 +178,8 @@ CHECKS = {
     ),
     "a life at an address that is known is brought to the state": Check(
         "ftm/bricks/state_transfer.py",
-        "        if standing.peer == path:  # It follows anew",
-        "        if standing.peer == path:\n            return server.turn\n        if False:  # It follows anew",
+        "        if standing.other.path == path:  # It follows",
+        "        if standing.other.path == path:\n            return server.turn\n        if False:  # It follows",
         JOINING,
         "test_a_backup_that_lives_anew or test_a_backup_that_follows_anew",
     ),

@@ -147,7 +147,7 @@ class Slow(Total):
     """Takes longer than whoever asks waits."""
 
     @hf.on(Add)
-    async def add(self, message: Add) -> int:
+    async def add(self, message: Add) -> int:  # type: ignore[override]
         self.seen.append(message.n)
         await asyncio.sleep(1.0)
         return sum(self.seen)
