@@ -29,7 +29,7 @@ class Called:
         self._name = str(getattr(engine, "path", type(engine).__qualname__))
         self._failure: StoreFailed | None = None
         self.keys: dict[str, str] = {}
-        """The names under which the engine has addresses, where those are other ones (`home/addresses.py`)."""
+        """The names under which the engine has addresses, where those are other ones (`addresses.py`)."""
         self.durable = engine.durable
         self.epoch = self._call(lambda: engine.epoch)
         self.in_hand: InHand | None = getattr(engine, "in_hand", None)

@@ -9,6 +9,7 @@ from ...actors.errors import ControlFailed, HoldfastError, StartFailed
 from ...actors.events import RecoveryFailed
 from ...actors.kernel.cell import DOWN, GONE, Cell
 from ...actors.persistence import child_key
+from ..addresses import Addresses, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
 from ..journal import Journal, Saved
@@ -18,7 +19,6 @@ from ..recovery_file import RecoveryFile
 from ..snapshot.rollback import older_snapshot, roll_back
 from ..snapshot.snapshot_groups import Groups
 from ..snapshot.snapshot_schedule import nobody
-from .addresses import Addresses, renamed
 from .ask_recovery import Rejoin
 from .capacity import HomeBound
 from .disposal import drop_all, forget_home, put_into_quarantine

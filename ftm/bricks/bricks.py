@@ -21,7 +21,6 @@ from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message
 from ...actors.kernel.ref import current
 from ...checkpoint.protocol import DROPPED, MESSAGE, REPLY, Answer, Live, Outcome, Released, Snapshot, TurnEnd
-from .batch_end import sealed
 from .brick_messages import FORWARDED, Done, Ended, Inward, Outward, Request, StaleEpoch, Taken, Work
 from .letters import FOREVER as FOREVER
 from .peer_channel import Inbox, Posting
@@ -80,7 +79,7 @@ class Brick(Posting):
     @property
     def has_peer(self) -> bool:
         """Whether another replica has all that this one has acknowledged."""
-        return self._standing.peer_state == "live"
+        return self._standing.other.state == "live"
 
     # -- the other replica ------------------------------------------------------------------------------------------
 
@@ -208,10 +207,7 @@ class Proceed(Brick):
 
     def take_over(self) -> None:
         """The server reports here from now on. (Not from the start: a brick that is only prepared must not hear it.)"""
-        server = self._standing.server
-        server.on_more = self._go_on
-        server.outward = self._outward
-        server.hand_over = self._hand_over_before
+        self._standing.server.report_to(self)
 
     async def heard(self, outcome: Outcome) -> None:
         """An ask of the protected actor has an outcome; called before it gets it."""
@@ -223,7 +219,7 @@ class Proceed(Brick):
         if self._refuses() or self._knows(work):
             return
         self._works.append(work)
-        self._go_on()
+        self.go_on()
 
     def _knows(self, work: Work) -> bool:
         """Whether this came before (a duplicate on its way here), or was meant for a state that is not here any more.
@@ -231,7 +227,7 @@ class Proceed(Brick):
         To run it again is to do it twice.
         """
         if work.number <= FORWARDED:
-            return work.number != self._standing.forwarded_as
+            return work.number != self._standing.following.number
         if work.number < 0:  # A marker.
             return False
         is_known = work.number <= self._last and work.epoch == self._last_epoch
@@ -255,10 +251,10 @@ class Proceed(Brick):
     def _flushed(self) -> ReplyHandle[None]:
         handle: ReplyHandle[None] = self.ctx.reply_handle()
         self._flushes.append(handle)
-        self._go_on()
+        self.go_on()
         return handle
 
-    def _go_on(self) -> None:
+    def go_on(self) -> None:
         """See to it that what waits is handled. Called from our turns, and from the protected actor's."""
         if self._task is not None or self.ctx.closed:
             return
@@ -276,7 +272,7 @@ class Proceed(Brick):
                 if self._works:
                     self._work_now = self._works.popleft()
                     await self._batch(self._work_now)
-                elif server.more or server._snapshot_wanted:
+                elif server.reports.more or server.reports.is_snapshot_wanted:
                     more = server.take_more()
                     if not more:
                         break  # A snapshot that has to wait.
@@ -293,32 +289,33 @@ class Proceed(Brick):
 
     async def _batch(self, work: Work) -> None:
         server = self._standing.server
+        state = server.state
         self._number = work.number
         if work.number >= 0 and self.leads:
-            server.confirmed = server.handed  # It is sent when home has all that came before.
+            state.confirmed = state.handed  # It is sent when home has all that came before.
         pending = deque(work.requests)
         while True:
-            ends = await server.part(pending)
-            is_last = not pending or server.is_over
+            ends = await server.run_part(pending)
+            is_last = not pending or state.is_over
             live = None
             if is_last and work.go is not None:
                 is_live = server.life is not None and server.life.is_live
                 live = Live(0.0) if is_live else await server.go(work.go)
-            ends = await sealed(server, ends, pending)
-            if pending and not server.is_over:  # Some of it has to be run again.
+            ends = await server.seal_part(ends, pending)
+            if pending and not state.is_over:  # Some of it has to be run again.
                 is_last, live = False, None
             waits = not is_last and self.leads and server.runs_alone(pending[0])
             await self._hand(ends, is_last=is_last, live=live, wait=waits)
             if is_last:
                 return
 
-    async def _hand_over_before(self, ends: list[TurnEnd], wait: bool) -> None:
-        """A turn in hand has to wait until home has what came before it."""
+    async def hand_over_before(self, ends: list[TurnEnd], wait: bool) -> None:
+        """Hand over the ends before the turn in hand, which has to wait until home has them."""
         await self._hand(ends, is_last=False, live=None, wait=wait)
 
     async def _hand(self, ends: list[TurnEnd], *, is_last: bool, live: Live | None, wait: bool) -> None:
         server, standing = self._standing.server, self._standing
-        server.handed = part = server.handed + 1
+        server.state.handed = part = server.state.handed + 1
         more, behind = server.take_more(), server.last_ended
         while len(more) > 1 and any(isinstance(one, Snapshot) and len(one.data) > 1_000_000 for one in more):
             first, more = more[:1], more[1:]
@@ -346,11 +343,11 @@ class Proceed(Brick):
 
     @on(Ended)
     def _ended(self, message: Ended) -> None:
-        server = self._standing.server
+        state = self._standing.server.state
         if self._refuses(message.epoch):
             return
-        server.confirmed = max(server.confirmed, min(message.number, server.handed))
-        if self._at_home is not None and server.confirmed >= server.handed and not self._at_home.done():
+        state.confirmed = max(state.confirmed, min(message.number, state.handed))
+        if self._at_home is not None and state.confirmed >= state.handed and not self._at_home.done():
             self._at_home.set_result(None)
 
     @on(Inward)
@@ -362,7 +359,7 @@ class Proceed(Brick):
                 await self.heard(record)
             self._standing.server.inward(record)
 
-    def _outward(self, record: Released) -> None:
+    def tell_outward(self, record: Released) -> None:
         standing = self._standing
         if standing.leads and not standing.is_fenced:
             # Called in the protected actor's turn: a plain `tell` would be taken for one of its own.

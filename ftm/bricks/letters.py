@@ -109,7 +109,7 @@ class Letters(Actor):
                 else:
                     ref = await find()
                     out = self._sheets_of(ref, said.frame)
-                return await standing.wait_for(ref.ask(out, timeout=seconds))
+                return await standing.other.wait_for(ref.ask(out, timeout=seconds))
             except (PeerLost, AskTimeout, Refused):
                 raise
             except HoldfastError as error:  # It has died, which we shall be told, or its brick was exchanged.

@@ -214,17 +214,17 @@ class Posting(Letters):
         standing = self._standing
         codec = standing.node.codec
         body = codec.encoder.encode(message)
-        peer = standing.peer
+        peer = standing.other.path
         if standing.link is not None:
             if peer is None:
                 raise PeerLost("there is none")
             return codec.decode_reply(type(message), await self._ask_peer_sealed(standing.link, peer, message, body))  # type: ignore[no-any-return]
         while True:
-            if peer is None or standing.peer != peer:
+            if peer is None or standing.other.path != peer:
                 raise PeerLost("there is none")
             try:
                 async with self._sending:  # In order: finding the peer takes the first one longer than the others.
-                    if standing.peer != peer:
+                    if standing.other.path != peer:
                         continue
                     posted = self._post(await self._find_peer(peer), message, body)
                 reply = await self._reply_to(posted)
@@ -234,8 +234,8 @@ class Posting(Letters):
                 standing.fence()
                 raise
             except HoldfastError:  # It has died, which we shall be told, or its brick was exchanged.
-                standing.lost(self.slot)
-                await standing.changes(AGAIN)
+                standing.other.lose_brick(self.slot)
+                await standing.other.changes(AGAIN)
                 continue
             return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
 
@@ -244,7 +244,7 @@ class Posting(Letters):
 
     async def _reply_to(self, posted: Posted) -> bytes:
         try:
-            reply: bytes = await self._standing.wait_for(posted.answer)
+            reply: bytes = await self._standing.other.wait_for(posted.answer)
         finally:
             posted.close()
         return reply
@@ -258,11 +258,11 @@ class Posting(Letters):
         while True:
             try:
                 return await self._ask_sealed(
-                    link, peer, self.slot, part, find, lambda error: standing.lost(self.slot),
-                    lambda: standing.peer == peer,
+                    link, peer, self.slot, part, find, lambda error: standing.other.lose_brick(self.slot),
+                    lambda: standing.other.path == peer,
                 )  # fmt: skip
             except NotFollowing:  # It is told soon that it follows.
-                await standing.changes(AGAIN)
+                await standing.other.changes(AGAIN)
 
     async def ask_at(self, path: str, slot: str, message: Message[R]) -> R:
         """Ask a brick of a certain replica, once.
@@ -285,7 +285,7 @@ class Posting(Letters):
                     standing.link, path, slot, part, find, errors.append, lambda: not errors
                 )  # fmt: skip
             except PeerLost as lost:
-                standing.lost(key)
+                standing.other.lose_brick(key)
                 raise (errors or [lost])[0] from None
             return codec.decode_reply(type(message), back)  # type: ignore[no-any-return]
         try:
@@ -294,13 +294,13 @@ class Posting(Letters):
             standing.fence()
             raise
         except HoldfastError:
-            standing.lost(key)
+            standing.other.lose_brick(key)
             raise
         return codec.decode_reply(type(message), reply)  # type: ignore[no-any-return]
 
     async def _find_peer(self, path: str) -> Outbox:
         standing = self._standing
-        outbox = standing.brick(self.slot)
+        outbox = standing.other.brick(self.slot)
         if outbox is None:
             outbox = await self._find(path, self.slot, self.slot)
             standing.node.bind(self.ctx.cell, "peer", outbox.ref._cell)
@@ -308,12 +308,12 @@ class Posting(Letters):
 
     async def _find(self, path: str, slot: str, key: str) -> Outbox:
         standing = self._standing
-        outbox = standing.brick(key)
+        outbox = standing.other.brick(key)
         if outbox is None:
             where = Where(standing.config, slot)
             asked = standing.node.cell_at(f"{path}/protocol").ref.ask(where, timeout=PATIENCE)
-            outbox = Outbox(standing.node.cell_at(await standing.wait_for(asked)).ref)
-            standing.found(key, outbox)
+            outbox = Outbox(standing.node.cell_at(await standing.other.wait_for(asked)).ref)
+            standing.other.remember_brick(key, outbox)
         return outbox
 
     # -- taking -----------------------------------------------------------------------------------------------------

@@ -188,7 +188,7 @@ class RequestProtocol(Transfer):
             self._keep(done)
         if done.is_last and done.number == self._current:
             self._current = None
-            if standing.leads and done.number >= 0 and not standing.server.is_over:
+            if standing.leads and done.number >= 0 and not standing.server.state.is_over:
                 dropped = [number for number, one in standing.inside.items() if not standing.server.has_taken(one)]
                 if dropped:
                     self._end_dropped(done, dropped)
@@ -324,11 +324,12 @@ class RequestProtocol(Transfer):
         standing, server, epoch = self._standing, self._standing.server, order.epoch
         if standing.leads and standing.leading == epoch:
             return server.turn
-        if standing.follows and not standing.is_ready:  # It has diverged, or was never brought to the leader's state.
+        # It has diverged, or was never brought to the leader's state.
+        if standing.following.is_told and not standing.following.is_ready:
             raise CannotLead(path=standing.path)
-        standing.set_peer(order.peer, "live")
-        standing.is_fenced = standing.follows = False
-        standing.ready()
+        standing.other.replace(order.peer, "live")
+        standing.is_fenced = standing.following.is_told = False
+        standing.following.ready()
         # What the last leader gave us to compute ends first: only then is it known what is a duplicate.
         self._current = self._marker = marker = marker_of(epoch)
         self._least = order.turn
@@ -349,13 +350,13 @@ class RequestProtocol(Transfer):
 
     async def _begin_to_follow(self) -> int:
         standing = self._standing
-        standing.set_peer(None, "none")
-        standing.is_fenced, standing.leading, standing.follows = False, -1, True
+        standing.other.replace(None, "none")
+        standing.is_fenced, standing.leading, standing.following.is_told = False, -1, True
         self._held.clear()
         self._current = self._marker = self._wanted = None
         self._later, self._behind_turn = [], -1
         standing.inside.clear()
-        standing.unready()
+        standing.following.unready()
         await self._order(Assume(False))
         return standing.server.turn
 
@@ -363,7 +364,7 @@ class RequestProtocol(Transfer):
         """Have the replica do it, which obeys us alone."""
         parent = self.ctx.cell.parent
         assert parent is not None
-        return parent.ref.ask(Opened(self._standing.put_opened(message)), timeout=FOREVER)
+        return parent.ref.ask(Opened(self._standing.opened.put(message)), timeout=FOREVER)
 
     @on(Prepare)
     def _prepare(self, message: Prepare) -> Any:
@@ -443,7 +444,7 @@ class RequestProtocol(Transfer):
 
     def _doing(self, message: Computes) -> Doing:
         standing = self._standing
-        servers = (standing.server, *standing.shadows)
+        servers = (standing.server, *standing.server.shadows)
         computes = any(one.life is not None and one.life.feed is not None for one in servers)
         proceed = self.proceed._cell.actor
         hands_over = isinstance(proceed, Proceed) and proceed.is_at_work  # It hands it to whoever comes after.

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import asyncio
 import itertools
-from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,13 +21,13 @@ from ...actors.kernel.address_host import AddressHost
 from ...actors.kernel.cell import Cell
 from ...actors.values import decode_value, state_digest
 from ...checkpoint.life.recorded_life import FED
-from ...checkpoint.protocol import AWAITED, CRASH, DROPPED, FAILED, Answer, Outcome, TurnEnd
+from ...checkpoint.protocol import CRASH, DROPPED, FAILED, Answer, Outcome, TurnEnd
 from ...supervision.spec import child
 from ..replica.protected_actor import Server
 from ..replica.replica_life import ServerLife
 from ..votes.canonical import canonical, end_form
 from ..votes.voters import Agreed, AnyVoter, Undecided, _decide
-from .brick_messages import Beside, Done, Request, State, Work
+from .brick_messages import Done, Request, State, Work
 from .bricks import After, Before
 
 if TYPE_CHECKING:
@@ -172,12 +171,12 @@ class Shadow(Server):
         self._within = within
         self._why = ""
         self.hooks = main.hooks
-        self._is_again = True
+        self.state.is_again = True
 
     async def run(self, before: State, requests: list[Request], heard: list[Outcome]) -> Run | Missing:
         """Run requests from a state."""
-        self._why, self.objections, self.released = "", {}, {}
-        self.heard = {(one.turn, one.k): one for one in heard}
+        self._why = ""
+        self.traces.begin_anew(heard)
         ends, state = list[TurnEnd](), None
         try:
             async with asyncio.timeout(self._within):
@@ -188,33 +187,29 @@ class Shadow(Server):
             self._why = str(error) or type_name(type(error))
         if self._why:
             await self.drop_life()
-            self.point = None
+            self.points.point = None
             return Missing(self._why)
-        objections = sorted(self.objections.items())
-        return Run(ends, sorted(self.released.items()), state, objections=objections)
+        objections = sorted(self.traces.objections.items())
+        return Run(ends, sorted(self.traces.released.items()), state, objections=objections)
 
     async def _run(self, before: State, requests: list[Request]) -> tuple[list[TurnEnd], State | None]:
         self._place()
         await self._go_back(before)
-        pending, ends = deque(requests), list[TurnEnd]()
-        while pending and not self.is_over and not self._is_stopping:
-            new = await self.part(pending)
-            self._keep_tail(self.begun, new)
-            ends += new
-        self._skips.clear()
-        if self._is_stopping:  # Stopped in the middle: what has no end here may well have one elsewhere.
-            self._fail("its replica ends")
+        ends = await self._run_all(requests, even_stopping=False)
+        self.attempts.skips.clear()
+        if self.state.is_stopping:  # Stopped in the middle: what has no end here may well have one elsewhere.
+            self._give_up("its replica ends")
         if self._why:
             return ends, None
-        if self.is_over:
+        if self.state.is_over:
             self._why = "it has ended itself"
             return ends, None
         await self.ensure()
         return ends, self.capture()
 
     async def _go_back(self, before: State) -> None:
-        point, life = self.point, self.life
-        if life is not None and point is not None and not self.tail and point == before:
+        point, life = self.points.point, self.life
+        if life is not None and point is not None and not self.points.tail and point == before:
             return  # It stands there already.
         is_plain = not (before.stash or before.returned) and life is not None and not life.returned
         if is_plain and life is not None and life.is_live == before.live and life.feed is None:
@@ -233,7 +228,7 @@ class Shadow(Server):
         assert main.parent is not None
         name = f"shadow-{next(_NUMBERS)}"
         cell = node.cell_below(main.parent, name, AddressHost(FED, self, node.ports.here.parent))
-        self.standing.shadows.add(self)
+        self.standing.server.shadows.add(self)
         cell.spec = child(name, self._recipe)
         cell.extra().start = self._recipe
         claimed = main.extra().claimed
@@ -247,39 +242,23 @@ class Shadow(Server):
         if self.cell is not None:
             lifecycle.retire(self.cell, SHUTDOWN)
             self.cell = None
-            self.standing.shadows.discard(self)
+            self.standing.server.shadows.discard(self)
 
     # -- nothing leaves ---------------------------------------------------------------------------------------------
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
-        self._is_stopping = True
+        self.state.is_stopping = True
         self.kill(cell)
 
     def wants_out(self, life: ServerLife) -> None:
         if life is not self.life:
             return
-        known = [self.heard.get((life.turn, out.k)) for out in life.outs if out.verb in AWAITED]
-        if any(one is None for one in known):
-            self._fail("it has asked what the first run has not asked")
-            return
-        self._note_released(life)
-        life.outs = []
-        for one in known:
-            assert one is not None
-            life.to_life(one)
+        if not self._hears_as_before(life):
+            self._give_up("it has asked what the first run has not asked")
 
-    def _fail(self, why: str) -> None:
+    def _give_up(self, why: str) -> None:
         self._why = self._why or why
         self.abandon()
-
-    def tell_more(self, record: Beside) -> None:
-        """It goes nowhere."""
-
-    def take_more(self) -> list[Beside]:
-        return []
-
-    def want_snapshot(self) -> None:
-        """None is taken."""
 
 
 # -- deciding --------------------------------------------------------------------------------------------------------
@@ -290,7 +269,7 @@ class Remembering(Before):
 
     async def before(self, work: Work) -> Work:
         """Remember the requests of a batch."""
-        inputs = self._standing.inputs
+        inputs = self._standing.server.traces.inputs
         inputs.update((one.feed.id, one) for one in work.requests)
         while len(inputs) > MOST_INPUTS:
             del inputs[next(iter(inputs))]
@@ -314,23 +293,23 @@ class Deciding(After):
     async def after(self, done: Done) -> Done | None:
         """Have the part decided; what was found in place of what had come out goes on."""
         server = self._standing.server
-        if not done.ends or server.is_over or server.life is None:
+        if not done.ends or server.state.is_over or server.life is None:
             return done
         if server.life.feed is not None:  # A follower's turn waits in the middle: this cannot be decided here.
-            if any(end.id in server.objections for end in done.ends):
+            if any(end.id in server.traces.objections for end in done.ends):
                 raise HoldfastError(f"{self._standing.path}: an assertion has failed while a turn waits")
             return done
-        if server.previous is None:
+        if server.points.previous is None:
             await self.begun(done)
             return done  # The very first turn, `on_start`: there is nothing to begin again from.
-        before, asked = server.previous
+        before, asked = server.points.previous
         before = msgspec.structs.replace(before, live=server.life.is_live)
         dropped = {end.id for end in done.ends if end.status == DROPPED}
-        inputs = self._standing.inputs
+        inputs = self._standing.server.traces.inputs
         asked = [inputs.get(one.feed.id, one) for one in asked]
         requests = [one if one.feed.id in dropped else without_deadline(one) for one in asked]
         first = self._last_run(before, done.ends)
-        server.objections = {}
+        server.traces.objections = {}
         found = await self.choose(before, requests, first)
         if found is first:
             return done
@@ -339,15 +318,15 @@ class Deciding(After):
 
     def _last_run(self, before: State, ends: list[TurnEnd]) -> Run:
         server = self._standing.server
-        released = sorted((turn, one) for turn, one in server.released.items() if turn > before.turn)
+        released = sorted((turn, one) for turn, one in server.traces.released.items() if turn > before.turn)
         known = {end.id for end in ends}
-        objections = sorted((key, why) for key, why in server.objections.items() if key in known)
+        objections = sorted((key, why) for key, why in server.traces.objections.items() if key in known)
         return Run(ends, released, server.capture(), objections=objections)
 
     async def run_here(self, before: State, requests: list[Request]) -> Run:
         """Have the actor itself run requests, from a state."""
         server = self._standing.server
-        ends, _ = await server.again(before, requests)
+        ends = await server.run_again(before, requests)
         return self._last_run(before, ends)
 
     async def _take(
@@ -368,12 +347,12 @@ class Deciding(After):
                 else:
                     failed, state = self._failed(state, [TurnEnd(0, one.feed.id, FAILED, [], Answer())], run)
                     ends += failed
-        if server.point is not state or server.life is None:
+        if server.points.point is not state or server.life is None:
             await server.adopt(state)
         return ends
 
     def _taken(self, run: Run) -> list[TurnEnd]:
-        self._standing.server.released.update(run.released)
+        self._standing.server.traces.released.update(run.released)
         return run.ends
 
     def _failed(self, state: State, ends: list[TurnEnd], error: HoldfastError) -> tuple[list[TurnEnd], State]:
@@ -393,7 +372,7 @@ class Deciding(After):
 
     def heard(self, before: State) -> list[Outcome]:
         """What the actor's asks have come to since a state."""
-        return [one for one in self._standing.server.heard.values() if one.turn > before.turn]
+        return [one for one in self._standing.server.traces.heard.values() if one.turn > before.turn]
 
 
 def without_deadline(request: Request) -> Request:

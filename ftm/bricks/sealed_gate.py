@@ -50,7 +50,7 @@ class Gate(Brick):
 
     @on(Opened)
     def _opened(self, message: Opened) -> Any:
-        real = self._standing.take_opened(message.key, tuple(self.handlers))
+        real = self._standing.opened.take(message.key, tuple(self.handlers))
         if real is None:
             raise Refused(path=self._standing.path, reason="forged")
         self._is_opened = True

@@ -104,7 +104,7 @@ class Helping(Remembering):
     def _base(self, order: Compute) -> State | None:
         """The state that is here, if it is the one that is meant."""
         standing = self._standing
-        point = standing.server.point
+        point = standing.server.points.point
         if standing.server.life is not None or point is None or point.turn != order.turn:
             return None
         if point is not self._kept:
@@ -124,5 +124,5 @@ class Helping(Remembering):
         if order.state is not None:  # What is here may not be what has led to that.
             standing.log.replace(order.log)
         standing.log.add(entries)
-        standing.kept = epoch, run.state.turn  # It may have been told meanwhile that another one leads.
+        standing.following.computed = epoch, run.state.turn  # It may have been told meanwhile that another one leads.
         return True

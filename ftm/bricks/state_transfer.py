@@ -93,8 +93,8 @@ class Transfer(Gate):
     def _peer(self, message: Peer) -> None:
         self._check(message.epoch)
         standing = self._standing
-        if message.path != standing.peer:
-            standing.set_peer(message.path, "live")
+        if message.path != standing.other.path:
+            standing.other.replace(message.path, "live")
 
     @on(Join)
     def _join(self, message: Join) -> Any:
@@ -106,37 +106,37 @@ class Transfer(Gate):
         standing, server = self._standing, self._standing.server
         if not standing.leads:
             raise CannotJoin(path=path, why=f"{standing.path} does not lead")
-        if standing.peer == path:  # It follows anew, or has lived anew: whatever it had, it does not count on that.
-            standing.set_peer(path, "joining")
+        if standing.other.path == path:  # It follows, or lives, anew: it does not count on what it had.
+            standing.other.replace(path, "joining")
         epoch = standing.epoch
         self._holds += 1
         try:
             await self._quiet()
             standing.check(epoch)
             await server.ensure()
-            state = None
-            if server.has_access:
-                state = server.capture() if server.point is not None or server.turn >= 0 else None
-            elif server.point is not None and server.turn == server.point.turn and not server.point.data.size:
-                state = server.point  # It has begun afresh, and so does the other one.
+            state, point = None, server.points.point
+            if server.state.has_access:
+                state = server.capture() if point is not None or server.turn >= 0 else None
+            elif point is not None and server.turn == point.turn and not point.data.size:
+                state = point  # It has begun afresh, and so does the other one.
             elif server.turn >= 0:
                 why = "the state of the protected actor cannot be read, and it has handled requests already"
                 raise CannotJoin(path=path, why=why)
             log = standing.log.entries()
-            standing.set_peer(path, "joining", -2 if state is None else state.turn)
+            standing.other.replace(path, "joining", -2 if state is None else state.turn)
             asked = self.ctx.create_task(self._offer(Take(standing.path, state, log)))
         finally:
             self._holds -= 1
             self._go_on()
         turn = await asked
         if isinstance(turn, HoldfastError):
-            if standing.peer == path:
-                standing.set_peer(None, "none")
+            if standing.other.path == path:
+                standing.other.replace(None, "none")
             raise CannotJoin(path=path, why=str(turn))
-        if standing.peer == path:
-            standing.peer_state = "live"
+        if standing.other.path == path:
+            standing.other.state = "live"
             await self._drain_bricks()  # What left while it joined may have gone home ahead of the state behind it.
-        if standing.peer != path:
+        if standing.other.path != path:
             raise CannotJoin(path=path, why="another one has taken its place, or it was given up meanwhile")
         return turn
 
@@ -165,8 +165,8 @@ class Transfer(Gate):
         standing = self._standing
         if not standing.leads or standing.is_fenced:
             return
-        if standing.peer == path:
-            standing.set_peer(None, "none")
+        if standing.other.path == path:
+            standing.other.replace(None, "none")
         self.next.tell(Done(standing.epoch, standing.config, -1, [], False, None, [Strayed(path)]))
 
     @on(GoneAstray)
@@ -181,10 +181,10 @@ class Transfer(Gate):
 
     async def _taken(self, take: Take) -> int:
         standing, server = self._standing, self._standing.server
-        standing.set_peer(take.leader, "live")
+        standing.other.replace(take.leader, "live")
         if not self._is_further(take):
-            standing.unready()
-            standing.forwarded_as -= 1  # What is on its way to Proceed now, or in it, leads on from another state.
+            standing.following.unready()
+            standing.following.number -= 1  # What is on its way to Proceed now, or in it, leads on from another state.
             await self.proceed.ask(Abandon(), timeout=FOREVER)
             await server.drop_life()
             if not self._is_further(take):  # Nothing may come between this and the state.
@@ -193,12 +193,12 @@ class Transfer(Gate):
             standing.inside.clear()
             if standing.computes:
                 await server.ensure()
-        standing.ready()
+        standing.following.ready()
         return server.turn
 
     def _is_further(self, take: Take) -> bool:
         """Whether what was computed here for the leader, which waits for nobody to join, leads on from that state."""
-        return self._standing.kept > (self._standing.epoch, -1 if take.state is None else take.state.turn)
+        return self._standing.following.computed > (self._standing.epoch, -1 if take.state is None else take.state.turn)
 
     # -- out of the group ---------------------------------------------------------------------------------------------
 

@@ -55,7 +55,7 @@ class Asserting(Deciding):
         other = await self._at_peer(before, requests)
         alike = isinstance(other, Run) and plain(other) == plain(own)
         if isinstance(other, Run) and (not other.objections or (alike and is_crash(own))):
-            standing.node.emit(Objected(standing.address, standing.path, own.objection, standing.peer or ""))
+            standing.node.emit(Objected(standing.address, standing.path, own.objection, standing.other.path or ""))
             return own if alike else other
         why = f"here: {own.objection}; " + (f"there: {other.objection}" if isinstance(other, Run) else other)
         standing.node.emit(Objected(standing.address, standing.path, why, ""))
@@ -63,11 +63,11 @@ class Asserting(Deciding):
 
     async def _at_peer(self, before: State, requests: list[Request]) -> Run | str:
         standing = self._standing
-        if standing.peer is None:
+        if standing.other.path is None:
             return "there is no other replica"
         order = Compute(before.turn, b"", before, requests, self.heard(before), False, before.live)
         try:
-            done = await self.ask_at(standing.peer, "ad.before", order)
+            done = await self.ask_at(standing.other.path, "ad.before", order)
         except HoldfastError as error:
             return f"the other replica cannot compute it: {error}"
         if done.problem or done.state is None:

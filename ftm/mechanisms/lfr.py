@@ -31,6 +31,7 @@ from ..bricks.runs import Missing, Shadow, digest_of_state
 from ..bricks.standing import PeerLost
 from ..bricks.state_transfer import GoneAstray
 from ..model.mechanism import Mechanism, Role
+from ..replica.rewind_points import before_turn
 
 RUNS_AGAIN = 3
 """How often what has differed is computed again."""
@@ -104,14 +105,14 @@ class Forwarding(Before, Sender):
     async def before(self, work: Work) -> Work:
         """Forward a batch; one whose deadline is over is over on both sides."""
         standing = self._standing
-        if standing.peer is None:
+        if standing.other.path is None:
             return work
         now = standing.node.loop.time()
         requests = [decided(one, now) for one in work.requests]
         work = Work(work.epoch, work.config, work.number, requests, work.go)
         if requests or work.go is not None:
-            looks = standing.server.has_access and standing.looking.is_due(requests, now, self._every)
-            standing.forwarded.append(self.send_peer(Forward(work, looks)))
+            looks = standing.server.state.has_access and standing.looking.is_due(requests, now, self._every)
+            standing.other.forwarded.append(self.send_peer(Forward(work, looks)))
         return work
 
 
@@ -137,14 +138,14 @@ class Handling(Before):
         """Take a batch."""
         assert isinstance(message, Forward)
         standing = self._standing
-        await standing.until_ready()
+        await standing.following.until_ready()
         log = standing.log
         work = message.work
         left = [one for one in work.requests if log.find(one.feed.id) is None and one.feed.id not in standing.inside]
         standing.inside.update((one.feed.id, one) for one in left)
         if message.looks:
             standing.looking.name(left)
-        self.next.tell(Work(standing.epoch, work.config, standing.forwarded_as, left, work.go))
+        self.next.tell(Work(standing.epoch, work.config, standing.following.number, left, work.go))
 
 
 class Computing(Proceed, Sender):
@@ -155,13 +156,13 @@ class Computing(Proceed, Sender):
 
     async def heard(self, outcome: Outcome) -> None:
         """Pass on what the leader's turn has heard."""
-        if self.leads and self._standing.peer is not None:
-            self._standing.forwarded.append(self.send_peer(Heard(outcome)))
+        if self.leads and self._standing.other.path is not None:
+            self._standing.other.forwarded.append(self.send_peer(Heard(outcome)))
 
     async def from_peer(self, message: Message[Any]) -> None:
         """The leader's turn has heard this."""
         assert isinstance(message, Heard)
-        await self._standing.until_ready()
+        await self._standing.following.until_ready()
         self._standing.server.inward(message.outcome)
 
 
@@ -177,17 +178,17 @@ class Notifying(After, Sender):
         standing = self._standing
         if not done.ends:
             return done
-        if standing.peer is None:
+        if standing.other.path is None:
             if not self._was_alone:
                 self._was_alone = True
                 standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
             return done
         self._was_alone = False
-        if standing.peer_state == "live":
-            for task in list(standing.forwarded):
+        if standing.other.state == "live":
+            for task in list(standing.other.forwarded):
                 await task
-        standing.forwarded = [task for task in standing.forwarded if not task.done()]
-        released = standing.server.released
+        standing.other.forwarded = [task for task in standing.other.forwarded if not task.done()]
+        released = standing.server.traces.released
         digests = [(end.id, end.turn, digest(end, released.get(end.turn, []))) for end in done.ends]
         self.send_peer(Notify(digests, standing.looking.take(standing.server, done)))
         return done
@@ -209,10 +210,10 @@ class Comparing(After):
 
     async def after(self, done: Done) -> Done:
         """Remember what came out here."""
-        if done.number <= FORWARDED and done.number != self._standing.forwarded_as:
+        if done.number <= FORWARDED and done.number != self._standing.following.number:
             return done  # It leads on from a state that is given up.
         self._begin_anew()
-        inside, released = self._standing.inside, self._standing.server.released
+        inside, released = self._standing.inside, self._standing.server.traces.released
         for end in done.ends:
             request = inside.get(end.id)
             name = "" if request is None else request.feed.name
@@ -226,7 +227,7 @@ class Comparing(After):
     async def from_peer(self, message: Message[Any]) -> None:
         """Remember what came out there."""
         assert isinstance(message, Notify)
-        await self._standing.until_ready()
+        await self._standing.following.until_ready()
         self._begin_anew()
         self._theirs.extend(message.ends)
         self._compare()
@@ -236,8 +237,8 @@ class Comparing(After):
 
     def _begin_anew(self) -> None:
         """Another state was taken: what came before it is of no concern."""
-        if self._since != self._standing.forwarded_as:
-            self._since = self._standing.forwarded_as
+        if self._since != self._standing.following.number:
+            self._since = self._standing.following.number
             self._ours.clear()
             self._theirs.clear()
             self._states.clear()
@@ -271,11 +272,11 @@ class Comparing(After):
     def _stray(self, number: int, turn: int, name: str, known: set[int] | None) -> None:
         """From here on our state is not the leader's: we must not lead, and do not count until we have joined again."""
         standing = self._standing
-        if not standing.server.has_access:
+        if not standing.server.state.has_access:
             raise HoldfastError(f"{standing.path} has diverged from its leader at request {number}")
         self._has_diverged = True
-        standing.unready()
-        begin = standing.server.since_before(number, turn)
+        standing.following.unready()
+        begin = before_turn(standing.server.points, number, turn)
         if begin is not None:
             self.ctx.create_task(self._compute_again(*begin, number, name, known))
         self.ctx.cell.node.cell_at(standing.paths["protocol"]).ref.tell(GoneAstray())
@@ -288,7 +289,7 @@ class Comparing(After):
         `known`: digests of the outcomes that the request had; that it has one of these again is no proof of anything.
         """
         standing = self._standing
-        heard, shadow = list(standing.server.heard.values()), Shadow(standing, None)
+        heard, shadow = list(standing.server.traces.heard.values()), Shadow(standing, None)
         found: set[tuple[int, bytes]] = set()
         turn = before.turn
         try:

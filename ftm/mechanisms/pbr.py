@@ -49,21 +49,21 @@ class Checkpointing(After):
         if not done.ends:
             return done
         standing = self._standing
-        if standing.peer is None:
+        if standing.other.path is None:
             self._forget_unheard(self._heard + len(self._unheard))  # Whoever joins is given all of them.
             if self._was_alone != standing.path:
                 self._was_alone = standing.path
                 standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
             return done
         self._was_alone = None
-        captured = await self.state.ask(Capture(standing.peer_turn), timeout=FOREVER)
+        captured = await self.state.ask(Capture(standing.other.turn), timeout=FOREVER)
         state = captured.state
-        standing.peer_turn = state.turn
+        standing.other.turn = state.turn
         self._unheard += standing.entries(done.ends)
         checkpoint, said = Checkpoint(captured.change or state, list(self._unheard)), self._heard + len(self._unheard)
         self.taken()
         assert isinstance(self.mechanism, PBR)
-        if standing.peer_state == "joining":
+        if standing.other.state == "joining":
             self._send(checkpoint, said, state)  # It does not count yet: what it has not got does not hold up anybody.
         elif self.mechanism.acknowledge:
             await self._hand_over(checkpoint, said, state)
@@ -106,7 +106,7 @@ class StateUpdate(After):
         """Take a checkpoint."""
         assert isinstance(message, Checkpoint)
         standing = self._standing
-        await standing.until_ready()
+        await standing.following.until_ready()
         if message.state.turn < standing.server.turn:
             standing.log.add(message.log)  # Else what it says of these requests would be known to nobody here.
             return standing.server.turn  # It was overtaken.

@@ -112,7 +112,7 @@ class Opening(Before):
 
         for part in call.parts:
             message = codec.decode(OPENED[part.name], part.body)
-            opened = Opened(standing.put_opened(message))
+            opened = Opened(standing.opened.put(message))
             if call.stream != ORDERS:
                 self.next.tell(opened)
                 continue

@@ -80,7 +80,7 @@ class Voting(Deciding):
     async def _bring_others(self) -> None:
         """We lead from now on: what only we had computed for the last leader leaves when the others have it too."""
         server = self._standing.server
-        if server.turn < 0 or server.point is None:
+        if server.turn < 0 or server.points.point is None:
             return
         point = server.capture()
         order = Compute(point.turn, self._digest_of(point), None, [], [], True, point.live)
@@ -134,7 +134,7 @@ class Voting(Deciding):
         if self._point is not state and self._point != state:
             begin = time.perf_counter()
             self._point, self._digest = state, self._digests.of(state)
-            self._standing.took(time.perf_counter() - begin, state.data.size)
+            self._standing.server.took(time.perf_counter() - begin, state.data.size)
         return self._digest
 
     def _others(self) -> list[str]:

@@ -16,7 +16,7 @@ from .replica_life import ServerLife
 
 if TYPE_CHECKING:
     from ..bricks.standing import Standing
-    from .rewind_points import Points
+    from .protected_actor import Server
 
 
 class Tick(Message):
@@ -38,7 +38,7 @@ class Heart(Actor):
     def __init__(self, standing: Standing, name: str, interval: float, watch_turns: float) -> None:
         self._standing, self._name, self._usual = standing, name, (interval, watch_turns)
         self._interval, self._longest = self._usual
-        self._turns: dict[Points, tuple[Turn, float]] = {}  # with the seconds that they have taken
+        self._turns: dict[Server, tuple[Turn, float]] = {}  # with the seconds that they have taken
         self._seen = 0.0
 
     def on_start(self, restored: bool) -> None:
@@ -72,7 +72,7 @@ class Heart(Actor):
         now = self.ctx.cell.node.loop.time()
         gap, self._seen = min(now - self._seen, 2 * self._interval), now  # While this process stood still, no turn ran.
         before, self._turns = self._turns, {}
-        for server in (standing.server, *standing.shadows):
+        for server in (standing.server, *standing.server.shadows):
             life = server.life
             feed = None if life is None else life.feed
             if life is None or feed is None or feed.kind == START:

@@ -1,28 +1,32 @@
 """The protected actor inside a replica: its host, and how bricks drive it.
 
-An unmodified class lives a recorded life (`checkpoint.life.Life`) whose inputs come from Proceed.
+An unmodified class lives a recorded life (`checkpoint.life.Life`) whose inputs come from Proceed. What is known of it
+are states (`rewind_points.py`, `replica_state.py`), with the decisions as functions; the server carries them out.
 """
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import time
 from collections import deque
-from collections.abc import Callable
-from typing import Any, Final
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, Final, Protocol
 
 import msgspec
 
-from ...actors.errors import StartFailed
+from ...actors.errors import DamagedValue, StartFailed
 from ...actors.exit_reasons import ExitReason, pack_exit
-from ...actors.kernel import mailbox
-from ...actors.kernel.cell import RUNNING, Cell
+from ...actors.kernel import lifecycle, mailbox
+from ...actors.kernel.actor import Actor
+from ...actors.kernel.cell import DOWN, RUNNING, Cell
+from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
+from ...actors.values import encode_value
 from ...checkpoint.life.recorded_inbox import Fed, GoLive, StopRecorded
+from ...checkpoint.method import Method
 from ...checkpoint.protocol import (
-    AWAITED,
     FAILED,
-    START,
     Answer,
     Closed,
     Feed,
@@ -33,25 +37,112 @@ from ...checkpoint.protocol import (
     Outcome,
     PipeDone,
     Released,
+    Restore,
     Snapshot,
     SnapshotNow,
     ToHome,
     TurnEnd,
     Unsaved,
 )
-from ..bricks.brick_messages import Request, State
+from ...checkpoint.snapshot.key_variables import variables
+from ..alarms import ProtectionCostly, ProtectionLost
+from ..bricks.brick_messages import Beside, Request, State, WorkLost
+from ..bricks.state_images import Images
 from ..model.mechanism import has_state_access
-from .replica_life import BLOCKED, ENDED, OVER, UNDONE, ServerLife
-from .replica_reports import Reports
+from .actor_state import digest_of_life, names_of_state, point_of, rewind_to, snapshot_of, take_up
+from .replica_life import (
+    ABANDONED,
+    BLOCKED,
+    ENDED,
+    NOWHERE,
+    OVER,
+    UNDONE,
+    BeginAgain,
+    PartOver,
+    Rest,
+    ServerLife,
+    Skip,
+)
+from .replica_state import (
+    GIVE_UP,
+    GO_ON,
+    PART,
+    REWIND,
+    Attempts,
+    Part,
+    ReplicaState,
+    Reports,
+    Traces,
+    after_end,
+    is_front,
+    known_outcomes,
+    next_requests,
+    runs_alone,
+    size_after,
+)
+from .rewind_points import RewindPoints, is_blank, needs_point, stands_at, takes_delta
 
-PART: Final = 0.001
-"""Seconds of work after which the outcomes so far are handed over: a slow request does not hold up quick ones."""
+if TYPE_CHECKING:
+    from ..bricks.standing import Standing
+
+BEGUN_WITHIN: Final = 60.0
+"""Seconds that `on_start` of a life that begins at a point may take; then the replica cannot have one."""
 MOST_CRASHES: Final = 8
 """Ends of the life outside any turn, one after another, after which the replica is given up."""
+COSTLY: Final = 0.01
+"""Seconds from which on it is told what going through the state takes."""
+MOST_COPIED: Final = 16_000_000
+"""Bytes of a state that home gets a copy of."""
+
+TurnHook = Callable[[Any, TurnEnd], TurnEnd]
+"""Takes the server and the end of a turn, and returns what the end is to be."""
 
 
-class Server(Reports):
-    """The place of the protected actor, and its port home."""
+class Driver(Protocol):
+    """Whoever drives the server, and takes from it what goes home."""
+
+    def go_on(self) -> None:
+        """See to it that what waits to go home is taken."""
+        ...
+
+    def tell_outward(self, record: Released) -> None:
+        """Something leaves in the middle of a turn."""
+        ...
+
+    async def hand_over_before(self, ends: list[TurnEnd], wait: bool) -> None:
+        """Hand over the ends before the turn in hand, which waits for that."""
+        ...
+
+
+def is_dropped(life: ServerLife | None) -> bool:
+    """Whether a life was ended by whoever put something else in its place: that is no failure of whoever began it."""
+    return life is not None and life.port is NOWHERE
+
+
+class Server(lifecycle.HerePlace):
+    """The place of the protected actor: its lives, one after the other, what they run, and their port home."""
+
+    def __init__(self, standing: Standing, method: Method) -> None:
+        self.standing, self.method = standing, method
+        self.address = standing.address
+        self.cell: Cell | None = None
+        self.life: ServerLife | None = None
+        self.state, self.points = ReplicaState(), RewindPoints()
+        self.part, self.attempts = Part(deque()), Attempts()
+        self.traces, self.reports = Traces(), Reports()
+        self.hooks: list[TurnHook] = []  # see each end while the actor is as the turn has left it; the innermost first
+        self.shadows: set[Server] = set()  # more lives of it, which only compute
+        self._driver: Driver | None = None  # None: nothing goes home
+        self._rest = Rest(standing.node.loop)
+        self._images = Images()
+        self._beginning = asyncio.Lock()
+        self._live: Live | None = None
+        self._is_costly = False  # that was told
+        self._work_waited_for: list[asyncio.Future[None]] = []
+
+    def report_to(self, driver: Driver) -> None:
+        """Have this one drive the server from now on."""
+        self._driver = driver
 
     # -- as the host of its cell ------------------------------------------------------------------------------------
 
@@ -61,14 +152,13 @@ class Server(Reports):
         start = cell.extra().start
         assert start is not None
         kind: Any = start.kind
-        cell.table = kind._table
-        self.has_access = has_state_access(kind)
-        self.has_deltas = self.has_access and hasattr(kind, "get_delta") and hasattr(kind, "apply_delta")
-        if self._async is None:
-            handlers = kind._declared
-            table = kind._table
-            found = (one for one in handlers if inspect.iscoroutinefunction(table[one]))
-            self._async = frozenset(message_name(one) for one in found)
+        cell.table = table = kind._table
+        state = self.state
+        state.has_access = has_state_access(kind)
+        state.has_deltas = state.has_access and hasattr(kind, "get_delta") and hasattr(kind, "apply_delta")
+        state.waiting = frozenset(
+            message_name(one) for one in kind._declared if inspect.iscoroutinefunction(table[one])
+        )
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         """It ends: by itself, or with the replica. Only one that leads says good-bye."""
@@ -77,149 +167,427 @@ class Server(Reports):
         if self.standing.leads:
             cell.urge(StopRecorded(self.life, reason))
         else:
-            self._is_stopping = True
+            self.state.is_stopping = True
             self.kill(cell)
 
     def finish(self, reason: ExitReason) -> None:
         """End in good order, because the root wants it."""
         if self.life is not None:
-            self._is_stopping = True
+            self.state.is_stopping = True
             self.life.cell.urge(StopRecorded(self.life, reason))
 
     def retired(self, cell: Cell) -> None:
-        self._is_stopping = True
+        self.state.is_stopping = True
 
     def _life_ended(self, life: ServerLife, reason: ExitReason) -> None:
         """The life is over, and nobody here has ended it."""
         if life is not self.life:
             return
         self.life = None
-        self.note_work(life)
-        if not self._is_stopping and self._failed is None and reason.is_clean and life.stage.ignored_why is None:
-            self.is_over = True
+        self._note_work(life)
+        is_failure = self.state.is_stopping or self.attempts.failed is not None
+        if not is_failure and reason.is_clean and life.stage.ignored_why is None:
+            self.state.is_over = True
             self.tell_more(Closed(0, pack_exit(reason), False))
-        self.at_rest(ENDED)
+        self._rest.reach(ENDED)
+
+    # -- lives ------------------------------------------------------------------------------------------------------
+
+    def install(self, point: State | None) -> None:
+        """The state to begin with, whenever a life is wanted; a life that runs is not touched."""
+        self.points.install(point)
+        self.state.confirmed = self.state.handed
+
+    @property
+    def turn(self) -> int:
+        """The last turn."""
+        return self.points.turn if self.life is None else self.life.turn
+
+    @property
+    def last_ended(self) -> int:
+        """The last turn that is over."""
+        life = self.life
+        return self.turn if life is None or life.feed is None else life.turn - 1
+
+    async def ensure(self) -> None:
+        """See to it that there is a life, and that it has begun.
+
+        The replica, its protocol and Proceed all come here, each in its own time: one of them begins the life, and the
+        others wait until it has. Otherwise whoever comes second is given a life that is still replaying, and what it
+        gives to that takes the place of what the first one waits for.
+
+        Raises:
+            StartFailed: it cannot begin.
+        """
+        if self.life is not None and not self._beginning.locked():
+            return
+        async with self._beginning:
+            if self.life is None and not self.state.is_over:
+                await self._begin()
+
+    async def _begin(self) -> None:
+        """Begin a life where the point is, and handle again what was handed over since."""
+        await self._begin_at_point()
+        if not self.points.tail or not self.state.has_access or self.life is None:
+            return
+        self.state.is_quiet = True
+        try:
+            life = self.life
+            why = await self._give([(one.feed, end) for one, end in self.points.tail])
+        finally:
+            self.state.is_quiet = False
+        if why is not OVER and not is_dropped(life):
+            raise StartFailed(self.address, "what it has handled before cannot be handled again")
+
+    async def _begin_at_point(self) -> None:
+        cell, point, state = self.cell, self.points.point, self.state
+        assert cell is not None
+        start = cell.extra().start
+        assert start is not None
+        life = ServerLife(cell, self, self.method)
+        has_state = point is not None and not is_blank(point)
+        if point is not None and has_state:
+            try:
+                data = point.data.whole()
+            except DamagedValue as error:
+                raise StartFailed(self.address, str(error)) from error
+            life.to_life(Restore(data))
+        turn = state.start_turn if point is None else point.turn
+        life.begin(start, turn, [] if point is None else point.stash_ids)
+        self.life = life
+        if state.is_work_lost:
+            state.is_work_lost = False
+            self.tell_more(WorkLost(turn))
+        actor: Any = cell.actor
+        life.begun_names = set(variables(actor)) if state.has_access else set()
+        if point is not None:
+            take_up(life, point, has_deltas=state.has_deltas)
+        elif state.has_deltas:
+            actor.get_delta()
+        greets = type(actor).on_start is not Actor.on_start
+        if point is not None and point.live:
+            self._put([GoLive(life, Go(has_state, turn))])
+        elif point is None and turn >= 0:  # Its state is lost: it begins as without recovery, and is live at once.
+            self._put([*([BeginAgain(life, "on_start")] if greets else []), GoLive(life, Go(False, turn))])
+        elif has_state and greets:
+            self._put(())  # `on_start(restored=True)` must have returned before anybody counts on this life.
+        else:
+            return
+        try:
+            async with asyncio.timeout(BEGUN_WITHIN):
+                why = await self._rest.wait()
+        except TimeoutError:
+            await self.drop_life()
+            raise StartFailed(self.address, f"its on_start did not return within {BEGUN_WITHIN:g} s") from None
+        if why is not OVER and not is_dropped(life):
+            raise StartFailed(self.address, str(cell.extra().reason))
+
+    def abandon(self) -> None:
+        """What is being run does not count: another state takes the place of what it leads to."""
+        self._rest.reach(ABANDONED)
+
+    async def drop_life(self) -> None:
+        """End the life without a word: its state is kept as bytes. Whoever waits for it to come to rest is told."""
+        cell = self.cell
+        life, self.life = self.life, None
+        self._note_work(life)
+        self.work_back()
+        if life is not None:
+            life.port = NOWHERE
+        if self._rest.is_awaited:
+            self.abandon()
+        if life is None or cell is None or cell.state is DOWN:
+            return
+        gone = cell.ended()
+        self.kill(cell)
+        await gone
+
+    def _note_work(self, life: ServerLife | None) -> None:
+        """A life has ended; its background work has ended with it, and nobody runs its turns again to begin it anew."""
+        if life is not None and life.pipes and self.standing.leads:
+            self.state.is_work_lost = True
+
+    async def until_work_is_back(self) -> None:
+        """Wait until no background work is out: it is part of no state."""
+        while self.life is not None and self.life.pipes:
+            back: asyncio.Future[None] = self.life.cell.node.loop.create_future()
+            self._work_waited_for.append(back)
+            await back
+
+    def work_back(self) -> None:
+        """No background work is out any more, or its life is over."""
+        waiting, self._work_waited_for = self._work_waited_for, []
+        for one in waiting:
+            if not one.done():
+                one.set_result(None)
+
+    def _put(self, items: Iterable[Item]) -> None:
+        cell = self.cell
+        assert cell is not None
+        queue = mailbox.queue_of(cell)
+        queue.extend(items)
+        queue.append(PartOver(self._rest))
+        cell.schedule()
+
+    def _give(self, feeds: Iterable[tuple[Feed, TurnEnd | None]]) -> asyncio.Future[str]:
+        """Give inputs to the life, with the end of those that fail without being run; the future says how it rests."""
+        life = self.life
+        assert life is not None
+        resting, queue = self._rest.wait(), mailbox.queue_of(life.cell)
+        for feed, end in feeds:
+            if end is None:
+                life.to_life(feed)
+            else:
+                queue.append(Skip(life, end))
+        self._put(())
+        return resting
+
+    async def go(self, go: Go) -> Live | None:
+        """Replay is over: new inputs come from here on."""
+        await self.ensure()
+        life = self.life
+        if life is None:
+            return None
+        resting = self._rest.wait()
+        self._live = None
+        self._put([GoLive(life, go)])
+        if await resting is not OVER:
+            if self.state.is_over:
+                return None
+            reason = self.cell.extra().reason if self.cell is not None else ""
+            raise StartFailed(self.address, str(reason))
+        return self._live
+
+    # -- points -----------------------------------------------------------------------------------------------------
+
+    def capture(self) -> State:
+        """The state after the last turn, as bytes. Only between two turns.
+
+        Raises:
+            UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
+        """
+        life, points, has_deltas = self.life, self.points, self.state.has_deltas
+        point = points.point
+        if life is None:
+            assert point is not None
+            return point
+        assert life.feed is None, "a state is captured between two turns, never in the middle of one"
+        if point is not None and stands_at(points, life.turn, live=life.is_live):
+            return point
+        actor: Any = life.cell.actor
+        if has_deltas and point is not None and takes_delta(points):
+            delta = encode_value(actor.get_delta(), where=f"{self.address}.get_delta()")
+            made = point_of(life, point.data, [*point.deltas, delta])
+        else:
+            data = self._images.take(actor, None if point is None else point.data)
+            if has_deltas:
+                actor.get_delta()
+            made = point_of(life, data, [])
+        points.go_on_to(made)
+        points.names = names = names_of_state(actor)
+        if names is not None:
+            made.absent = sorted(life.begun_names - names)
+        return made
+
+    def state_digest(self) -> bytes:
+        """A digest of the state after the last turn, the same on each replica. Only between two turns.
+
+        Raises:
+            UnsavableValue, StateMismatch, what `get_state` raises: it cannot be saved.
+        """
+        assert self.life is not None
+        return digest_of_life(self.life)
+
+    def forget_point(self) -> None:
+        """The state was replaced in no turn: no earlier point leads to it."""
+        points = self.points
+        points.point, points.tail, points.previous = None, [], None
+        if self.life is not None and self.state.has_access:
+            self.capture()
+
+    def rewind(self, point: State) -> None:
+        """Put the state of a point back, in place: the actor's object goes on. Only between two turns."""
+        life = self.life
+        assert life is not None
+        assert life.feed is None
+        begin = time.perf_counter()
+        rewind_to(life, point, self.points.names, has_deltas=self.state.has_deltas)
+        self.standing.server.took(time.perf_counter() - begin, point.data.size)
+        self.points.go_back_to(point)
+
+    def took(self, seconds: float, size: int) -> None:
+        """The state was gone through to compare runs: tell, once, if that takes long."""
+        if seconds > COSTLY and not self._is_costly:
+            self._is_costly, standing = True, self.standing
+            standing.node.emit(ProtectionCostly(standing.address, standing.path, seconds, size))
+
+    async def _go_back_to(self, point: State) -> None:
+        """Have the life stand at a point: the one that there is, or one that begins there."""
+        if self.life is None:
+            self.points.go_back_to(point)
+            await self.ensure()
+        else:
+            self.rewind(point)
+
+    def skip_to(self, turn: int) -> None:
+        """These numbers are used, though no turn has left anything."""
+        if self.life is not None and self.points.point is not None:
+            self.life.turn = turn
+            self.points.skip_to(turn)
+
+    async def adopt(self, state: State) -> None:
+        """Go on from this state, with a life of its own; what led to it has happened elsewhere."""
+        live = state.live or (self.life is not None and self.life.is_live)
+        self.state.is_work_lost = (
+            self.standing.leads
+        )  # What the turns that lead there have begun, they began elsewhere.
+        await self.drop_life()
+        confirmed = self.state.confirmed
+        self.install(msgspec.structs.replace(state, live=live))
+        self.state.confirmed = confirmed  # The part that has led there is not at home yet: nothing may overtake it.
+        await self.ensure()
 
     # -- turns ------------------------------------------------------------------------------------------------------
 
     def runs_alone(self, request: Request) -> bool:
-        """Whether it has to stand at the front: it may want something released before its end."""
-        if self._is_again or (self.is_lazy and not self.standing.leads):
-            return False
-        feed = request.feed
-        if feed.kind == START or (feed.kind, feed.name) in self.alone:
-            return True
-        return not self.has_access and self._async is not None and feed.name in self._async
+        """Whether a request has to stand at the front: it may want something released before its end."""
+        return runs_alone(self.state, request.feed, leads=self.standing.leads)
 
-    def _next(self, pending: deque[Request]) -> list[Request]:
-        """The next few that can be given to the server at once."""
-        if self.runs_alone(pending[0]):
-            is_early = self.standing.leads and self.confirmed < self.handed
-            return [] if self.begun or self.ends or is_early else [pending.popleft()]
-        chunk: list[Request] = []
-        if self._singles:
-            if self.begun:
-                return []
-            self._singles -= 1
-            return [pending.popleft()]
-        while pending and len(chunk) < self._chunk and not (chunk and self.runs_alone(pending[0])):
-            chunk.append(pending.popleft())
-        return chunk
-
-    async def part(self, pending: deque[Request]) -> list[TurnEnd]:
+    async def run_part(self, pending: deque[Request]) -> list[TurnEnd]:
         """Run requests until enough are done; returns their ends. What has not been run is left in `pending`."""
-        begin = time.perf_counter()
-        self.begun, self.ends, self._is_abandoned, self._has_released = [], [], False, False
-        self._is_given_up = False
-        self._pending = pending
-        while pending and not self.is_over:
+        begin, state, attempts = time.perf_counter(), self.state, self.attempts
+        part = self.part = Part(pending)
+        while pending and not state.is_over:
             await self.ensure()
             if self.life is None:  # It was dropped again: another state is put here.
-                self._give_up(pending)
+                part.give_up()
                 break
-            chunk = self._next(pending)
+            chunk = next_requests(state, part, attempts, leads=self.standing.leads)
             if not chunk:
                 break  # It runs alone, when home has all that comes before it.
-            self.begun += chunk
+            part.begun += chunk
             at = time.perf_counter()
-            why = await self._go((one.feed, self._skips.get(one.feed.id)) for one in chunk)
+            why = await self._give((one.feed, attempts.skips.get(one.feed.id)) for one in chunk)
             while why is BLOCKED:
                 why = await self._blocked()
             if why is OVER:
-                self._crashes = 0
+                attempts.crashes = 0
                 now = time.perf_counter()
-                if now - at < PART / 4 and len(chunk) >= self._chunk:
-                    self._chunk = min(256, self._chunk * 2)
-                elif now - at > PART and self._chunk > 1:
-                    self._chunk //= 2
-                if (now - begin > PART and not self._is_again) or self._has_released:
+                attempts.size = size_after(attempts.size, len(chunk), now - at)
+                if (now - begin > PART and not state.is_again) or part.has_released:
                     break
             elif why is UNDONE:
-                self._take_back(pending)
-            elif not self._after_end(pending, chunk):
+                self._take_back()
+            elif not self._goes_on(chunk, why):
                 break
-        ends, self.ends = self.ends, []
+        ends, part.ends = part.ends, []
         return ends
 
-    async def part_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
+    async def _run_part_again(self, pending: deque[Request], *, single: bool) -> list[TurnEnd]:
         """Nothing of the last part has happened: run it, and no more, again. `single`: one request at a time."""
         if single:
-            self._singles = len(self.begun)
+            self.attempts.singles = len(self.part.begun)
         behind = list(pending)
         pending.clear()
-        self._take_back(pending)
-        ends = await self.part(pending)
-        if not self._is_given_up:
+        self._take_back()
+        ends = await self.run_part(pending)
+        if not self.part.is_given_up:
             pending.extend(behind)
         return ends
 
-    def _take_back(self, pending: deque[Request]) -> None:
+    def _take_back(self) -> None:
         """Nothing of this part has happened: the life, which has ended, begins again where it began.
 
         Somebody else may have begun it already: that one is as good, and it must not be begun twice.
         """
-        pending.extendleft(reversed(self.begun))
-        self.begun, self.ends, self._withheld = [], [], []
-        last = -1 if self.point is None else self.point.turn
-        self.released = {turn: digests for turn, digests in self.released.items() if turn <= last}
-        self.more = [one for one in self.more if not isinstance(one, PipeDone) or one.turn <= last]
+        self.part.take_back()
+        self.traces.go_back_to(self.points.turn)
+        self.reports.take_back(self.points.turn)
 
-    def _give_up(self, pending: deque[Request]) -> None:
-        """What was to be run does not count any more: another state is put in the place of what it leads to."""
-        self._is_given_up = True
-        pending.clear()
-        self.begun, self.ends = [], []
-
-    def _after_end(self, pending: deque[Request], chunk: list[Request]) -> bool:
+    def _goes_on(self, chunk: list[Request], why: str) -> bool:
         """The life has ended in the middle of a part. Whether to go on."""
-        failed, self._failed = self._failed, None
-        if self._is_abandoned:
-            self._is_abandoned = False
-            self._give_up(pending)
-            return False
-        if self._is_stopping or self.is_over:
+        part, attempts, points = self.part, self.attempts, self.points
+        failed, attempts.failed = attempts.failed, None
+        then = after_end(self.state, part, failed, why, has_point=points.point is not None)
+        if then is GIVE_UP:
+            part.give_up()
+        if then not in (REWIND, GO_ON):
             return False
         if failed is None:
-            self._crashes += 1
-            if self._crashes >= MOST_CRASHES:
+            attempts.crashes += 1
+            if attempts.crashes >= MOST_CRASHES:
                 raise StartFailed(self.address, "its life ends again and again outside its turns")
         else:
-            self._crashes = 0
-            end = self.ends[-1]
-            request = next((one for one in self.begun if one.feed.id == failed), None)
-            if request is not None and request.feed.kind == START:
-                return False
-            self._skips[failed] = end
-        if self.has_access and (self.point is not None or failed is None):
-            self._take_back(pending)
+            attempts.crashes = 0
+            attempts.skips[failed] = part.ends[-1]
+        if then is REWIND:
+            self._take_back()
             return True
-        known = {end.id for end in self.ends}
-        left = [one for one in chunk if one.feed.id not in known]
-        self.begun = [one for one in self.begun if one.feed.id in known]
-        pending.extendleft(reversed(left))
-        self._start_turn = max(self._start_turn, self.ends[-1].turn if self.ends else -1)
-        self.point = None
+        known = {end.id for end in part.ends}
+        part.send_back({one.feed.id for one in chunk if one.feed.id not in known})
+        self.state.start_turn = max(self.state.start_turn, part.ends[-1].turn if part.ends else -1)
+        points.point = None
         return True
+
+    async def seal_part(self, ends: list[TurnEnd], pending: deque[Request]) -> list[TurnEnd]:
+        """End a part that was run: it is not undone any more. Returns its ends as they are after that.
+
+        What its turns have left may turn out to be no state that can be saved. The turn that has left it so fails:
+        whoever asked gets the error, and the state goes back to where it was before. It must never end the replica:
+        its successor would be given the same request, and end too.
+        """
+        while True:
+            begun, tail = list(self.part.begun), list(self.points.tail)
+            try:
+                self._seal(ends)
+            except Exception as error:  # What the user's own values and methods raise; it is passed on to who asked.
+                self.part.begun, self.points.tail = begun, tail
+                if self.state.is_lazy:
+                    self._go_on_without_point(ends)
+                    return ends
+                if self.points.point is None or not begun:
+                    raise
+                if len(begun) == 1 and self.life is not None and self.life.cell.actor is not None:
+                    self._fail(begun[0], ends[-1], error)
+                await self.drop_life()
+                ends = await self._run_part_again(pending, single=len(begun) > 1)
+            else:
+                return ends
+
+    def _seal(self, ends: list[TurnEnd]) -> None:
+        life, points = self.life, self.points
+        begun, self.part.begun = self.part.begun, []
+        self.attempts.skips.clear()
+        if life is None or self.state.is_over:
+            return
+        if not self.state.has_access:
+            self.state.start_turn = life.turn
+            self.traces.forget(life.turn)
+            return
+        before = points.point
+        points.keep_tail(begun, ends)
+        if not needs_point(points, is_lazy=self.state.is_lazy, live=life.is_live):
+            return
+        handed = [one for one, _ in points.tail]
+        self.capture()
+        if before is not None and handed:
+            points.previous = before, handed
+        self.traces.forget(-1 if before is None else before.turn)
+
+    def _go_on_without_point(self, ends: list[TurnEnd]) -> None:
+        """Nobody looks at the state now: what is handled goes on; but no other replica can take it."""
+        begun, self.part.begun = self.part.begun, []
+        self.points.keep_tail(begun, ends)
+        standing = self.standing
+        if self.state.can_save:
+            self.state.can_save = False
+            standing.node.emit(ProtectionLost(standing.address, standing.path, standing.epoch))
+
+    def _fail(self, request: Request, end: TurnEnd, error: BaseException) -> None:
+        """This turn has left what is no state: run again, it fails."""
+        codec = self.standing.node.codec
+        answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()
+        self.attempts.skips[end.id] = TurnEnd(end.turn, end.id, FAILED, [], answer)
 
     def has_taken(self, request: Request) -> bool:
         """Whether the life has a request without an end: its stash has it, or it is the tick of a cancelled timer."""
@@ -236,185 +604,135 @@ class Server(Reports):
         life, cell = self.life, self.cell
         if cell is None or life is None or life.feed is None or life.feed.id != number:
             return
-        if not again or not self.has_access:
+        if not again or not self.state.has_access:
             life.fail_turn(TimeoutError(f"the turn of {life.feed.name} does not end"))
         self.kill(cell)
 
     # -- the front --------------------------------------------------------------------------------------------------
 
-    @property
-    def is_front(self) -> bool:
-        """Whether home has the ends of all turns before the one in hand."""
-        return self.standing.leads and not self.ends and self.confirmed >= self.handed
-
     def wants_out(self, life: ServerLife) -> None:
         """A turn wants its outputs to leave before it ends."""
         if life is not self.life:
             return
-        if self._is_quiet or self._is_again or not self.standing.leads:
-            asked = [out for out in life.outs if out.verb in AWAITED]
-            known = [self.heard.get((life.turn, out.k)) for out in asked]
-            if all(one is not None for one in known):
-                self._note_released(life)
-                life.outs = []
-                for one in known:
-                    assert one is not None
-                    life.to_life(one)
-                return
-        if self.is_front:
+        state, leads = self.state, self.standing.leads
+        if (state.is_quiet or state.is_again or not leads) and self._hears_as_before(life):
+            return
+        if is_front(state, self.part, leads=leads):
             self._let_out(life)
             return
-        if not self.standing.leads:  # The leader has sent it; we may have to, when we lead.
-            self._note_released(life)
-            self._withheld += life.outs
+        if not leads:  # The leader has sent it; we may have to, when we lead.
+            self.traces.release(life.turn, life.outs)
+            self.traces.withheld += life.outs
             life.outs = []
         life.cell.node.loop.call_soon(self._look, life, life.feed)
 
-    def _note_released(self, life: ServerLife) -> None:
-        self.released.setdefault(life.turn, []).extend(out.digest() for out in life.outs)
+    def _hears_as_before(self, life: ServerLife) -> bool:
+        """Have a turn hear what its asks came to when it was run before, if that is known: they do not leave again."""
+        known = known_outcomes(self.traces, life.turn, life.outs)
+        if known is None:
+            return False
+        self.traces.release(life.turn, life.outs)
+        life.outs = []
+        for one in known:
+            life.to_life(one)
+        return True
 
     def _let_out(self, life: ServerLife) -> None:
         """What has left cannot be undone: the part ends with this turn, whatever was to come after it."""
-        self._note_released(life)
-        self._has_released = True
-        queue, feed = mailbox.queue_of(life.cell), life.feed
-        left = set[int]()
+        self.traces.release(life.turn, life.outs)
+        self.part.has_released = True
+        queue, left = mailbox.queue_of(life.cell), set[int]()
         for index, item in enumerate(queue):
             if type(item) is Fed and item.life is life:
                 left.add(item.feed.id)
                 queue[index] = mailbox.NOTHING  # Not removed: the run loop has counted them.
-        if left and feed is not None:
-            self._pending.extendleft(reversed([one for one in self.begun if one.feed.id in left]))
-            self.begun = [one for one in self.begun if one.feed.id not in left]
+        if left and life.feed is not None:
+            self.part.send_back(left)
         life.release_now()
 
     def _look(self, life: ServerLife, feed: Feed | None) -> None:
         """A turn that is not at the front has wanted to release something: does it wait for that?"""
         if self.life is life and life.feed is feed:
-            self.at_rest(BLOCKED)
+            self._rest.reach(BLOCKED)
 
     async def _blocked(self) -> str:
         """The turn in hand waits for what it has not been allowed to send."""
-        life = self.life
+        life, state, standing = self.life, self.state, self.standing
         feed = None if life is None else life.feed
-        if life is None or feed is None or self._missed is not None:
-            return await self._on_to_rest()  # It has its outcome meanwhile.
-        looks_at_state = self.standing.leads or not self.is_lazy  # Somebody does, when outcomes are handed over.
-        if looks_at_state and self.ends and self.has_access and not self._is_again:
-            self.alone.add((feed.kind, feed.name))
+        if life is None or feed is None or self._rest.is_missed:
+            return await self._rest.wait_on()  # It has its outcome meanwhile.
+        looks_at_state = standing.leads or not state.is_lazy  # Somebody does, when outcomes are handed over.
+        if looks_at_state and self.part.ends and state.has_access and not state.is_again:
+            state.alone.add((feed.kind, feed.name))
             await self.drop_life()
             return UNDONE
-        resting = self._on_to_rest()
-        if not self._is_again:
-            leads = self.standing.leads
-            await self._hand_over_before(feed)
-            if self.standing.leads and not leads:  # Since then: home has to have what was handed over before.
-                await self._hand_over_before(feed)
-        if self.standing.leads and self.life is life and life.feed is feed:
-            self._take_up_withheld(life)
+        resting = self._rest.wait_on()
+        if not state.is_again:
+            leads = standing.leads
+            await self._hand_over_before()
+            if standing.leads and not leads:  # Since then: home has to have what was handed over before.
+                await self._hand_over_before()
+        if standing.leads and self.life is life and life.feed is feed:
+            if self.traces.withheld:  # What the last leader may have sent, and may not.
+                self.traces.released.pop(life.turn, None)
+                life.outs = self.traces.withheld + life.outs
+                self.traces.withheld = []
             if life.outs:
                 self._let_out(life)
         return await resting
 
-    async def _hand_over_before(self, feed: Feed) -> None:
+    async def _hand_over_before(self) -> None:
         """Hand over the ends before the turn in hand, while it stands still."""
-        if self.hand_over is None:
+        if self._driver is None:
             return
-        ends, self.ends = self.ends, []
-        known = {end.id for end in ends}
-        handed = [one for one in self.begun if one.feed.id in known]
-        self.begun = [one for one in self.begun if one.feed.id not in known]
-        self._keep_tail(handed, ends)
-        if ends or (self.standing.leads and self.confirmed < self.handed):
-            await self.hand_over(ends, self.standing.leads)
+        handed, ends = self.part.hand_out()
+        self.points.keep_tail(handed, ends)
+        if ends or (self.standing.leads and self.state.confirmed < self.state.handed):
+            await self._driver.hand_over_before(ends, self.standing.leads)
 
     def lead(self) -> None:
         """A turn that waits for an outcome may ask for it itself, when home has what comes before it."""
         life = self.life
-        if life is not None and life.feed is not None and self._withheld:
+        if life is not None and life.feed is not None and self.traces.withheld:
             self._look(life, life.feed)
-
-    def _take_up_withheld(self, life: ServerLife) -> None:
-        """What the last leader may have sent, and may not."""
-        if self._withheld:
-            self.released.pop(life.turn, None)
-            life.outs = self._withheld + life.outs
-            self._withheld = []
 
     # -- the last part once more -----------------------------------------------------------------------------------
 
-    async def again(
-        self, since: State | None = None, feeds: list[Request] | None = None
-    ) -> tuple[list[TurnEnd], State]:
-        """Rewind to the point before the last part, and run that part again; returns ends and state.
+    async def run_again(self, before: State, requests: list[Request]) -> list[TurnEnd]:
+        """Rewind to an earlier state, and run requests from there again; returns their ends.
 
         Nothing is handed over. Asks get the outcomes that they had.
-
-        Args:
-            since: rewind to this state instead.
-            feeds: run these requests instead.
         """
-        previous = self.previous
-        before, requests = previous if previous is not None else (since, feeds)
-        before, requests = since or before, requests if feeds is None else feeds
-        assert before is not None
-        assert requests is not None
-        self.objections.clear()
-        if self.life is None:
-            self.point, self.tail = before, []
-            await self.ensure()
-        else:
-            self.rewind(before)
-        self.released = {turn: digests for turn, digests in self.released.items() if turn <= before.turn}
-        pending, ends = deque(requests), list[TurnEnd]()
-        self._is_again = True
+        previous = self.points.previous
+        self.traces.objections.clear()
+        await self._go_back_to(before)
+        self.traces.go_back_to(before.turn)
+        self.state.is_again = True
         try:
-            while pending and not self.is_over:
-                new = await self.part(pending)
-                self._keep_tail(self.begun, new)
-                ends += new
+            ends = await self._run_all(requests, even_stopping=True)
         finally:
-            self._is_again = False
+            self.state.is_again = False
         await self.ensure()
-        skips = dict(self._skips)
-        self._skips.clear()
+        skips, self.attempts.skips = self.attempts.skips, {}
         try:
-            state = self.capture()
-        except BaseException as error:  # What the user's own values and methods raise: as in `sealed`.
+            self.capture()
+        except BaseException as error:  # What the user's own values and methods raise: as when a part is sealed.
             if len(requests) != 1 or len(ends) != 1 or skips:
                 raise
-            self.fail(requests[0], ends[0], error)
+            self._fail(requests[0], ends[0], error)
             await self.drop_life()
-            return await self.again(before, requests)
-        self.previous = previous
-        return ends, state
+            return await self.run_again(before, requests)
+        self.points.previous = previous
+        return ends
 
-    def fail(self, request: Request, end: TurnEnd, error: BaseException) -> None:
-        """This turn has left what is no state: run again, it fails."""
-        codec = self.standing.node.codec
-        answer = Answer(*codec.encode_error(error)) if request.feed.is_ask else Answer()
-        self._skips[end.id] = TurnEnd(end.turn, end.id, FAILED, [], answer)
-
-    async def adopt(self, state: State) -> None:
-        """Go on from this state, with a life of its own; what led to it has happened elsewhere."""
-        live = state.live or (self.life is not None and self.life.is_live)
-        self._is_work_lost = self.standing.leads  # What the turns that lead there have begun, they began elsewhere.
-        await self.drop_life()
-        confirmed = self.confirmed
-        self.install(msgspec.structs.replace(state, live=live))
-        self.confirmed = confirmed  # The part that has led there is not at home yet: nothing may overtake it.
-        await self.ensure()
-
-    async def back(self) -> State:
-        """Rewind to the point before the last part, for good: it leaves no trace but its numbers."""
-        assert self.previous is not None
-        before, _ = self.previous
-        if self.life is None:
-            self.point, self.tail = before, []
-            await self.ensure()
-        else:
-            self.rewind(before)
-        return before
+    async def _run_all(self, requests: list[Request], *, even_stopping: bool) -> list[TurnEnd]:
+        """Run requests, part by part, until all have ended. `even_stopping`: also when the life is ended meanwhile."""
+        pending, ends = deque(requests), list[TurnEnd]()
+        while pending and not self.state.is_over and (even_stopping or not self.state.is_stopping):
+            new = await self.run_part(pending)
+            self.points.keep_tail(self.part.begun, new)
+            ends += new
+        return ends
 
     # -- as the port home -------------------------------------------------------------------------------------------
 
@@ -422,16 +740,18 @@ class Server(Reports):
         """What the life says, in order."""
         match record:
             case TurnEnd():
-                self._withheld = []
-                if self.hooks and not self._is_quiet and record.id not in self._skips:
+                self.traces.withheld = []
+                if self.state.is_quiet:
+                    return
+                if record.id not in self.attempts.skips:
                     for hook in self.hooks:
                         record = hook(self, record)
-                if record.status == FAILED and not self._is_quiet and record.id not in self._skips:
-                    self._failed = record.id
-                if not self._is_quiet:
-                    self.ends.append(record)
+                    if record.status == FAILED:
+                        self.attempts.failed = record.id
+                self.part.ends.append(record)
             case Released():
-                self.outward(record)
+                if self._driver is not None:
+                    self._driver.tell_outward(record)
             case Live():
                 self._live = record
             case Snapshot() | PipeDone() | Unsaved() | Ignored() | Hooked():
@@ -449,30 +769,62 @@ class Server(Reports):
         if life is not None and cell is not None:
             cell.node.loop.call_soon(self._life_ended, life, cell.extra().reason)
 
-    # -- records from home ------------------------------------------------------------------------------------------
-
     def inward(self, record: Outcome | SnapshotNow) -> None:
-        """Take what came past the bricks."""
-        life = self.life
+        """Take what came from home past the bricks."""
         if isinstance(record, Outcome):
-            self.heard[record.turn, record.k] = record
-            if life is not None:
-                life.to_life(record)
+            self.traces.heard[record.turn, record.k] = record
+            if self.life is not None:
+                self.life.to_life(record)
         else:
             self.want_snapshot()
 
-    async def go(self, go: Go) -> Live | None:
-        """Replay is over: new inputs come from here on."""
-        await self.ensure()
-        life = self.life
-        if life is None:
-            return None
-        resting = self._rest()
-        self._live = None
-        self._put([GoLive(life, go)])
-        if await resting is not OVER:
-            if self.is_over:
-                return None
-            reason = self.cell.extra().reason if self.cell is not None else ""
-            raise StartFailed(self.address, str(reason))
-        return self._live
+    # -- what goes home beside the ends of turns ---------------------------------------------------------------------
+
+    def tell_more(self, record: Beside) -> None:
+        """Something goes home behind the ends of the part at hand, or by itself."""
+        if self._driver is not None:
+            self.reports.more.append(record)
+            self._driver.go_on()
+
+    def take_more(self) -> list[Beside]:
+        """What goes home behind the ends that are handed over now."""
+        reports = self.reports
+        if reports.is_snapshot_wanted:
+            self._take_snapshot()
+        more, reports.more = reports.more, []
+        return more
+
+    def want_snapshot(self) -> None:
+        """A snapshot goes home with the next part, or at once."""
+        if self._driver is not None:
+            self.reports.is_snapshot_wanted = True
+            self._driver.go_on()
+
+    def last_snapshot(self) -> None:
+        """The life ends in good order."""
+        if self._driver is not None:
+            self.reports.is_snapshot_wanted = True
+            self._take_snapshot()
+            self._driver.go_on()
+
+    def _take_snapshot(self) -> None:
+        life, reports = self.life, self.reports
+        if life is None or life.pipes or life.feed is not None or not life.is_live or not self.method.snapshots:
+            return
+        reports.is_snapshot_wanted = False
+        try:
+            reports.more += snapshot_of(life, self.points)
+        except Exception as error:  # What the user's own `get_state` raises is no reason to lose what it has.
+            reports.more.append(Unsaved(str(error)))
+
+    def copied(self) -> list[Snapshot]:
+        """The state as it is between two turns, for a home that keeps nothing otherwise; [] if it cannot be had."""
+        life, state, reports = self.life, self.state, self.reports
+        if life is None or life.feed is not None or not life.is_live or not state.has_access or reports.is_large:
+            return []
+        try:
+            found = snapshot_of(life, self.points)
+        except Exception:  # What the user's own `get_state` raises: there is no copy then.
+            return []
+        reports.is_large = sum(len(one.data) for one in found) > MOST_COPIED
+        return [] if reports.is_large else found

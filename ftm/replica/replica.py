@@ -353,12 +353,12 @@ class Replica(Supervisor):
             standing.leads = leads
         roles = [one.role(leads=standing.leads) for one in woven.layers]
         standing.computes = standing.leads or all(role.computes for role in roles)
-        self._server.is_lazy = not any("state_access" in one.needs for one in woven.layers)
         server = self._server
-        if not server.is_lazy and server.tail and server.life is not None and server.life.feed is None:
+        server.state.is_lazy = not any("state_access" in one.needs for one in woven.layers)
+        if not server.state.is_lazy and server.points.tail and server.life is not None and server.life.feed is None:
             server.capture()  # From here on, the last part is what was handled since the last point.
         standing.paths = {slot: self._cell(name).path for slot, name in woven.names.items()}
-        standing.forget_bricks()
+        standing.other.forget_bricks()
         self._bind_all(woven)
         self._pass_on(held)
         if BEAT in self._children and detection_in(old.layers) != detection_in(woven.layers):
@@ -370,7 +370,7 @@ class Replica(Supervisor):
             await self._end_bricks(left)
         if not standing.computes:
             await self._keep_state()
-        elif standing.leads or standing.is_ready:
+        elif standing.leads or standing.following.is_ready:
             await self._server.ensure()
 
     def _secure(self) -> None:
@@ -391,7 +391,7 @@ class Replica(Supervisor):
     async def _keep_state(self) -> None:
         """The protected actor does not live here any more: its state stays, as bytes."""
         server = self._server
-        if server.life is not None and server.life.feed is None and server.has_access:
+        if server.life is not None and server.life.feed is None and server.state.has_access:
             server.capture()
         await server.drop_life()
 
@@ -473,7 +473,7 @@ class Replica(Supervisor):
     @on(Opened)
     def _ordered(self, message: Opened) -> Any:
         """From its own RequestProtocol, which has seen how it came; nobody else gives it orders."""
-        order = self._standing.take_opened(message.key, ORDERS)
+        order = self._standing.opened.take(message.key, ORDERS)
         if order is None:
             return self._fail(Refused(path=self.ctx.path, reason="forged"))
         handle: ReplyHandle[Any] = self.ctx.reply_handle()
@@ -594,7 +594,7 @@ class Replica(Supervisor):
 
     async def _change_to(self, woven: Woven) -> int:
         await self._take_up(woven, behind=True)
-        self._standing.peer_turn = -2  # What the other one has is not known to the new bricks.
+        self._standing.other.turn = -2  # What the other one has is not known to the new bricks.
         return self._server.turn
 
     async def _catch_up(self) -> None:

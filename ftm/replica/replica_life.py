@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final
@@ -20,7 +21,60 @@ if TYPE_CHECKING:
 
 
 # Why the server came to rest.
-OVER, BLOCKED, ENDED, UNDONE = "over", "blocked", "ended", "undone"
+OVER, BLOCKED, ENDED, ABANDONED, UNDONE = "over", "blocked", "ended", "abandoned", "undone"
+
+
+class Rest:
+    """Coming to rest: whoever has given something to the life waits until that is done, or cannot go on."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._loop = loop
+        self._number = 0  # of what was given last
+        self._missed: str | None = None  # it has come to rest while nobody waited
+        self._waiting: asyncio.Future[str] | None = None
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether somebody waits for it."""
+        return self._waiting is not None
+
+    @property
+    def is_missed(self) -> bool:
+        """Whether it has come to rest while nobody waited."""
+        return self._missed is not None
+
+    def next_number(self) -> int:
+        """Return the number of what is given now; what was given before is of no concern any more."""
+        self._number += 1
+        return self._number
+
+    def wait(self) -> asyncio.Future[str]:
+        """Wait for what is given now."""
+        self._missed = None
+        return self.wait_on()
+
+    def wait_on(self) -> asyncio.Future[str]:
+        """Wait on for what was given before; that may have come to rest while nobody waited."""
+        waiting: asyncio.Future[str] = self._loop.create_future()
+        missed, self._missed = self._missed, None
+        if missed is not None:
+            waiting.set_result(missed)
+        else:
+            self._waiting = waiting
+        return waiting
+
+    def reach(self, why: str) -> None:
+        """What was given is done, or cannot go on."""
+        waiting, self._waiting = self._waiting, None
+        if waiting is None:
+            self._missed = why
+        elif not waiting.done():
+            waiting.set_result(why)
+
+    def end(self, number: int) -> None:
+        """All of what was given with this number is done; if that was to an earlier life, nobody wants to know."""
+        if number == self._number:
+            self.reach(OVER)
 
 
 class ServerContext(RecordedContext):
@@ -52,7 +106,8 @@ class ServerLife(Life):
         super().__init__(cell, server, method, None)
         self.server = server
         self.ended: Feed | None = None  # what the last turn has handled
-        self.saving.is_needed = server.has_access
+        self.begun_names: set[str] = set()  # the variables of the actor when `__init__` had run
+        self.saving.is_needed = server.state.has_access
 
     def _context(self, cell: Cell) -> RecordedContext:
         made = self._context_made = ServerContext(cell, self.server.address)
@@ -98,13 +153,13 @@ class Nowhere:
     """The way home of a life that does not count any more."""
 
     def to_home(self, record: ToHome) -> None:
-        """Nobody hears it."""
+        """A record that nobody hears."""
 
     def when_told(self, then: Callable[[], None]) -> None:
         """There is nobody to tell."""
 
     def closed(self) -> None:
-        """Nobody waits for it."""
+        """The end of a life that nobody waits for."""
 
 
 NOWHERE: Final = Nowhere()
@@ -113,14 +168,14 @@ NOWHERE: Final = Nowhere()
 class PartOver(Item):
     """Stands behind what the server was given: it has come to rest, between two turns."""
 
-    __slots__ = ("number", "server")
+    __slots__ = ("number", "rest")
 
-    def __init__(self, server: Server, number: int) -> None:
-        self.server, self.number = server, number
+    def __init__(self, rest: Rest) -> None:
+        self.rest, self.number = rest, rest.next_number()
 
     @staticmethod
     def run(actor: Any, item: Any) -> object:
-        item.server.part_over(item.number)
+        item.rest.end(item.number)
         return None
 
 

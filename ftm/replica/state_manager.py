@@ -10,9 +10,9 @@ from ...actors.errors import DamagedValue
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.bindings import Binding
 from ...actors.kernel.message import Message
-from ...checkpoint.protocol import TurnEnd
 from ..bricks.brick_messages import Change, State
 from ..bricks.state_images import Misfit
+from .rewind_points import change_since, led_to
 
 if TYPE_CHECKING:
     from ..bricks.standing import Standing
@@ -43,28 +43,6 @@ class Apply(Message[int]):
     state: State | Change
 
 
-class Ran(msgspec.Struct):
-    """What a run of the last part has come to: its ends, all that they sent, and the state it has left."""
-
-    ends: list[TurnEnd]
-    released: list[tuple[int, list[int]]]
-    state: State
-
-
-class LastRun(Message[Ran]):
-    """What the last part has come to, as it was handed over."""
-
-    ends: list[TurnEnd]
-
-
-class RunAgain(Message[Ran]):
-    """Rewind to where the last part began, and run it again."""
-
-
-class Undo(Message[State]):
-    """Rewind to where the last part began, for good; the reply is that state."""
-
-
 class StateManager(Actor):
     """Between the bricks and the protected actor's state. It is asked between two parts, never while one runs."""
 
@@ -77,17 +55,19 @@ class StateManager(Actor):
 
     @on(Capture)
     def capture(self, message: Capture) -> Captured:
-        """Save the state."""
+        """Save the state, and work out what has changed in it."""
         server = self._standing.server
         state = server.capture()
-        return Captured(state, server.since(message.since))
+        change = change_since(server.points, message.since)
+        server.points.given = state  # Whoever asked has all of it from now on.
+        return Captured(state, change)
 
     @on(Apply)
     async def apply(self, message: Apply) -> int:
-        """Take a state."""
+        """Have the state that the other replica has said."""
         server = self._standing.server
         try:
-            state = server.led_to(message.state)
+            state = led_to(server.points.point, message.state)
         except (Misfit, DamagedValue):
             return MISFIT
         had_life = server.life is not None
@@ -97,21 +77,3 @@ class StateManager(Actor):
         if had_life:
             await server.ensure()
         return server.turn
-
-    @on(LastRun)
-    def last_run(self, message: LastRun) -> Ran:
-        """The last part."""
-        server = self._standing.server
-        return Ran(message.ends, sorted(server.released.items()), server.capture())
-
-    @on(RunAgain)
-    async def run_again(self, message: RunAgain) -> Ran:
-        """The last part once more."""
-        server = self._standing.server
-        ends, state = await server.again()
-        return Ran(ends, sorted(server.released.items()), state)
-
-    @on(Undo)
-    async def undo(self, message: Undo) -> State:
-        """The last part leaves no trace."""
-        return await self._standing.server.back()

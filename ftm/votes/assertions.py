@@ -95,7 +95,7 @@ class Inspector:
     def __call__(self, server: Server, end: TurnEnd) -> TurnEnd:
         why = self._objection(server, end)
         if why:
-            server.objections[end.id] = why
+            server.traces.objections[end.id] = why
         return end
 
     def _objection(self, server: Server, end: TurnEnd) -> str:

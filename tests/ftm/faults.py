@@ -40,7 +40,6 @@ def way(layers: Layers) -> list[Step]:
         steps.append((f"{name}.after", "Done", True))
         steps += [(f"{name}.protocol", "Done", True)] if name in inner else []
     steps += [("state", "Capture", True)] if "pbr" in names else []
-    steps += [("state", "LastRun", True), ("state", "RunAgain", True)] if "tr" in names else []
     steps.append(("protocol", "Done", True))
     return steps + ([("sec.after", "Done", True)] if is_secured else [])
 

@@ -42,7 +42,7 @@ async def test_who_was_not_told_that_it_follows_takes_nothing(system: hf.ActorSy
     """It was meant for the life before, which had another state."""
     driver = await pair(system)
     assert await driver.ask(Add(1)) == 1
-    state = driver.standing("r2").server.point
+    state = driver.standing("r2").server.points.point
     with pytest.raises(NotFollowing):
         await said(driver, msgspec.structs.replace(state, turn=9), epoch=driver.epoch + 1)
     assert driver.standing("r2").server.turn == 1
@@ -52,7 +52,7 @@ async def test_who_was_not_told_that_it_follows_takes_nothing(system: hf.ActorSy
 async def test_a_state_that_was_overtaken_does_not_come_back(system: hf.ActorSystem) -> None:
     driver = await pair(system)
     assert await driver.ask(Add(1)) == 1
-    old = driver.standing("r2").server.point
+    old = driver.standing("r2").server.points.point
     assert await driver.ask(Add(2)) == 3
     assert await said(driver, old, epoch=driver.epoch) == 2
     await driver.stop_replica("r1")
@@ -138,7 +138,7 @@ async def test_what_a_follower_hears_before_it_has_the_state_does_not_keep_the_s
     await driver.add("r2")
     joining = asyncio.ensure_future(driver.join("r2"))
     async with asyncio.timeout(10):
-        while driver.standing("r1").peer_state != "joining":
+        while driver.standing("r1").other.state != "joining":
             await asyncio.sleep(0.001)
     for (turn, k), out in driver.released.items():
         driver.inward(Outcome(turn, k, answer(out)))

@@ -48,7 +48,7 @@ class Heard:
 
 
 def point(driver: Any, name: str) -> State:
-    found: State = driver.standing(name).server.point
+    found: State = driver.standing(name).server.points.point
     return found
 
 

@@ -167,7 +167,7 @@ async def test_a_follower_that_has_diverged_does_not_lead(system: hf.ActorSystem
             while not any(isinstance(one, Diverged) for one in events.take()):
                 await asyncio.sleep(0.001)
     async with asyncio.timeout(10):
-        while driver.standing("r1").peer is not None:
+        while driver.standing("r1").other.path is not None:
             await asyncio.sleep(0.001)
     assert await driver.ask(Add(2)) == 3, "no reply counts on it any more"
     await driver.stop_replica("r1")

@@ -69,7 +69,7 @@ async def heard(events: Any, *kinds: type[Any]) -> list[Any]:
 async def until_run_again(driver: Any) -> None:
     """Wait until the follower has computed again what has differed."""
     async with asyncio.timeout(30):
-        while Watched.runs.get("r2", 0) < Watched.runs["r1"] + RUNS_AGAIN or driver.standing("r2").shadows:
+        while Watched.runs.get("r2", 0) < Watched.runs["r1"] + RUNS_AGAIN or driver.standing("r2").server.shadows:
             await asyncio.sleep(0)
 
 
@@ -87,7 +87,7 @@ async def test_one_wrong_value_is_told_and_is_not_the_application_s_fault(
         await until_run_again(driver)
         assert [one.path for one in driver.more if isinstance(one, Strayed)] == [driver.path("r2")]
         async with asyncio.timeout(30):
-            while driver.standing("r1").peer_state != "live":
+            while driver.standing("r1").other.state != "live":
                 await asyncio.sleep(0)
         assert await driver.ask(Add(3)) == 6
         for _ in range(200):

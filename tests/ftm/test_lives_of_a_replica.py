@@ -61,7 +61,7 @@ async def test_a_life_is_begun_once_though_two_want_it(server: Any) -> None:
 
     async def handled() -> None:
         while pending:
-            ends.extend(await server.part(pending))
+            ends.extend(await server.run_part(pending))
 
     first, work = asyncio.ensure_future(server.ensure()), asyncio.ensure_future(handled())
     await asyncio.sleep(0)

@@ -67,7 +67,7 @@ async def test_a_reply_leaves_only_when_the_backup_has_its_state(system: hf.Acto
     assert key not in driver.ends
     await system.resume(backup)
     assert await driver.reply(key) == 1
-    assert driver.standing("r2").server.point.turn == driver.ends[key].turn
+    assert driver.standing("r2").server.points.turn == driver.ends[key].turn
 
 
 async def test_a_primary_whose_backup_is_gone_goes_on_alone_and_says_so(system: hf.ActorSystem) -> None:
@@ -170,7 +170,7 @@ async def test_a_part_may_be_over_before_any_turn_that_is_run_again(
 ) -> None:
     """What a slow machine has left for the next part is not run with the one that is run again."""
     driver = await pair(system)
-    driver.standing("r1").server._chunk = 1
+    driver.standing("r1").server.attempts.size = 1
     monkeypatch.setattr("holdfast.ftm.replica.protected_actor.time", _Slow(every))
     keys = driver.send(Add(1), Spoil(2), Add(3), Fail(4), Spoil(5), Add(6), Add(7))
     assert await driver.reply(keys[6]) == 17
@@ -237,8 +237,8 @@ async def test_only_what_has_changed_goes_to_the_backup(system: hf.ActorSystem) 
     keys = driver.send(Add(3), Fail(4), Add(5))
     await driver.until(keys[2])
     backup = driver.standing("r2").server
-    assert len(backup.point.deltas) >= 3
-    assert all(len(one) < 100 for one in backup.point.deltas)
+    assert len(backup.points.point.deltas) >= 3
+    assert all(len(one) < 100 for one in backup.points.point.deltas)
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
     assert await driver.ask(Read()) == [1, 2, 2, 3, 5]
@@ -275,7 +275,7 @@ async def test_lower_epochs_and_other_configurations_are_refused(system: hf.Acto
     driver = await pair(system)
     await driver.ask(Add(1))
     after = system.node.cell_at(driver.path("r2") + "/after").ref
-    state = driver.standing("r2").server.point
+    state = driver.standing("r2").server.points.point
     body = system.node.codec.encoder.encode(Checkpoint(state, []))
     name = "holdfast.ftm.mechanisms.pbr:Checkpoint"
     with pytest.raises(StaleEpoch):

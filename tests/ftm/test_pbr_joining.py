@@ -50,7 +50,7 @@ async def test_a_backup_that_follows_anew_gets_the_state_anew(system: hf.ActorSy
     assert await driver.ask(Add(1)) == 1
     await driver.join("r2")
     assert await driver.ask(Add(2)) == 3, "the primary waits for a backup that waits for its state"
-    assert driver.standing("r2").is_ready
+    assert driver.standing("r2").following.is_ready
     await driver.stop_replica("r1")
     await driver.fail_over("r2")
     assert await driver.ask(Read()) == [1, 2]
@@ -77,11 +77,11 @@ async def test_a_backup_counts_only_when_it_has_all_that_has_left(system: hf.Act
     stuck = _Stuck(driver, "r1")
     joining = asyncio.ensure_future(driver.join("r2"))
     async with asyncio.timeout(5):
-        while driver.standing("r1").peer_state == "none":
+        while driver.standing("r1").other.state == "none":
             await asyncio.sleep(0)
     assert await driver.ask(Add(1)) == 1, "it left without its state"
     async with asyncio.timeout(5):
-        while driver.standing("r1").peer_state != "live":
+        while driver.standing("r1").other.state != "live":
             await asyncio.sleep(0.001)
     await asyncio.sleep(0.02)
     assert not joining.done(), "what has left is not there yet"
@@ -100,7 +100,7 @@ async def test_an_outcome_whose_checkpoint_is_overtaken_is_known_to_the_backup(s
     stuck = _Stuck(driver, "r1")
     joining = asyncio.ensure_future(driver.join("r2"))
     async with asyncio.timeout(5):
-        while driver.standing("r1").peer_state == "none":
+        while driver.standing("r1").other.state == "none":
             await asyncio.sleep(0)
     real, lost = driver.take, list[Any]()
     driver.take = lost.append  # type: ignore[method-assign,assignment]  # the replies are lost on their way
@@ -108,7 +108,7 @@ async def test_an_outcome_whose_checkpoint_is_overtaken_is_known_to_the_backup(s
     async with asyncio.timeout(5):
         while not lost:
             await asyncio.sleep(0.001)
-    while driver.standing("r1").peer_state != "live":
+    while driver.standing("r1").other.state != "live":
         await asyncio.sleep(0.001)
     stuck.only_first = True
     driver.out_now = None

@@ -112,7 +112,7 @@ async def test_what_a_joiner_computes_while_it_takes_a_state_is_not_overwritten_
     await system.suspend(proceed)
     joining = asyncio.create_task(driver.join("r3"))
     async with asyncio.timeout(30):
-        while driver.standing("r3").peer != driver.path("r1") or driver.standing("r3").is_ready:
+        while driver.standing("r3").other.path != driver.path("r1") or driver.standing("r3").following.is_ready:
             await asyncio.sleep(0)
     for _ in range(50):  # It waits for its Proceed to drop what that has.
         await asyncio.sleep(0)

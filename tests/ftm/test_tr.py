@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any
 
 import pytest
@@ -140,3 +141,23 @@ async def test_a_turn_that_leaves_an_unsavable_state_fails(
     with pytest.raises(UnsavableValue, match="spoilt"):
         await driver.reply(keys[1])
     assert await driver.ask(Read()) == [1, 3]
+
+
+class Slow(Total):
+    """Takes longer than whoever asks waits."""
+
+    @hf.on(Add)
+    async def add(self, message: Add) -> int:  # type: ignore[override]
+        self.seen.append(message.n)
+        await asyncio.sleep(1.0)
+        return sum(self.seen)
+
+
+async def test_what_was_begun_in_time_is_not_dropped_by_the_other_runs(system: hf.ActorSystem) -> None:
+    """The second run begins when the deadline is over; that is no difference between the runs."""
+    driver = await pair(system, Slow, TR(), others=())
+    with system.events() as events:
+        (key,) = driver.send(Add(1), deadline=system.node.loop.time() + 0.5)
+        assert await driver.reply(key) == 1
+        assert not [one for one in events.take() if isinstance(one, Masked)]
+    assert await driver.ask(Read()) == [1]

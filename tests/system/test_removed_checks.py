@@ -77,7 +77,7 @@ CHECKS = {
         "test_a_request_that_waited",
     ),
     "an address that somebody else has leads nowhere else": Check(
-        "checkpoint/home/addresses.py",
+        "checkpoint/addresses.py",
         "        if path in self._left:\n",
         "        if False:\n",
         COMMIT,
@@ -91,7 +91,7 @@ CHECKS = {
         "test_a_root_that_is_killed and finish-task",
     ),
     "an address that was left has another journal": Check(
-        "checkpoint/home/addresses.py",
+        "checkpoint/addresses.py",
         "        if path in self._keys or path not in taken:\n",
         "        if True:\n",
         MOVED,

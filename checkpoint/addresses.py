@@ -10,15 +10,15 @@ from __future__ import annotations
 import functools
 from typing import TYPE_CHECKING
 
-from ...actors.errors import HoldfastError
-from ...actors.kernel.cell import Cell
-from ..engine_calls import Called
+from ..actors.errors import HoldfastError
+from ..actors.kernel.cell import Cell
+from .engine_calls import Called
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from ...actors.kernel.node import Node
-    from ..journal import Journal
+    from ..actors.kernel.node import Node
+    from .journal import Journal
 
 LEFT = "moved from "
 """How the note begins that an address was left; the address follows, and the note is where its actor lives now."""
