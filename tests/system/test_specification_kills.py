@@ -63,7 +63,8 @@ def draw(dice: random.Random, change: hf.Change, tree: list[str], number: int) -
         case 1:
             change.add(above, hf.supervisor(f"t{number}", children=[counter("z")]))
         case 2:
-            change.remove(one)
+            if not any(path.rpartition("/")[2] in ("r", "s") for path in paths if f"{path}/".startswith(f"{one}/")):
+                change.remove(one)  # The two stay: what is acknowledged at them is looked at.
         case 3:
             change.move(one, above)
         case 4:
