@@ -71,8 +71,7 @@ class Addresses:
         for old, now in left.items():
             self._put(old, renamed(names, now))
         for was, now in names.items():
-            if was not in self._left:
-                self._put(was, now)
+            self._put(was, now)
         for path in list(self._left):
             if self._at(path) is not None or self._left[path] == path:
                 self._put(path, None)

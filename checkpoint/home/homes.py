@@ -165,6 +165,22 @@ class Homes:
         """
         paths = {path: renamed(names, path) for path in {*self._stored, *self._switches}}
         paths = {was: now for was, now in paths.items() if was != now}
+        try:
+            self._move_stored(names, paths)
+        finally:  # Whatever the store says, they have moved.
+            self.journal.rename(paths)
+            self._switches = {paths.get(path, path): switch for path, switch in self._switches.items()}
+            self._stored = {paths.get(path, path) for path in self._stored}
+            self._blamed = {paths.get(path, path) for path in self._blamed}
+            self._returns = {paths.get(path, path): times for path, times in self._returns.items()}
+            self.planted = {paths.get(path, path): saved for path, saved in self.planted.items()}
+            for path, switch in self._switches.items():
+                if switch.path != path:
+                    switch.readdress(path)
+                switch.ties.rename(lambda one: renamed(names, one))
+            self.rejoin.rename(paths)
+
+    def _move_stored(self, names: Mapping[str, str], paths: Mapping[str, str]) -> None:
         for path in {now for now in paths.values() if now not in paths and self.knows(now)}:
             self._erase(path)  # Whoever had it is not there any more, and what comes there has a journal of its own.
         self.addresses.rename(paths)
@@ -175,17 +191,6 @@ class Homes:
                 self.journal.note(key, None)
                 self.journal.note(child_key(now, name), value)
         self.quarantine.rename(paths)
-        self.journal.rename(paths)
-        self._switches = {paths.get(path, path): switch for path, switch in self._switches.items()}
-        self._stored = {paths.get(path, path) for path in self._stored}
-        self._blamed = {paths.get(path, path) for path in self._blamed}
-        self._returns = {paths.get(path, path): times for path, times in self._returns.items()}
-        self.planted = {paths.get(path, path): saved for path, saved in self.planted.items()}
-        for path, switch in self._switches.items():
-            if switch.path != path:
-                switch.readdress(path)
-            switch.ties.rename(lambda one: renamed(names, one))
-        self.rejoin.rename(paths)
 
     def vacate(self, path: str, why: str) -> None:
         """What is known here of an address where nobody lives is not true any more; the store is somebody else's."""

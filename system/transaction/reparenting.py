@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, ClassVar
 
+from ...actors.errors import HoldfastError
 from ...checkpoint.home.recorded_home import switch_of
 from ...checkpoint.home.switch import Switch
 from ...checkpoint.protocol import SnapshotNow
@@ -135,7 +137,8 @@ class Move(Operation):
     async def finish(self, system: ActorSystem) -> None:
         for rest in self._rests.values():
             if rest.task is not None:
-                await asyncio.shield(rest.task)
+                with contextlib.suppress(HoldfastError):  # Its life has ended: the next one begins where it is now.
+                    await asyncio.shield(rest.task)
 
     async def release(self, system: ActorSystem) -> None:
         for rest in self._rests.values():

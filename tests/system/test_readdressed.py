@@ -348,6 +348,26 @@ async def test_it_waits_for_the_background_work_of_the_actor(tmp_path: Path) -> 
         assert await one.ask(Add(1)) == 41
 
 
+async def test_it_has_moved_though_the_store_has_refused_to_note_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with program(tmp_path / "store") as system:
+        one = ref(system, "/app/here/one")
+        assert await one.ask(Add(7)) == 7
+
+        def refuse(names: Any) -> None:
+            raise hf.HoldfastError("the disk is gone")
+
+        with monkeypatch.context() as broken, system.events() as events:
+            broken.setattr(system.homes.addresses, "moved", refuse)
+            await moved(system)
+            (event,) = (event for event in events.take() if isinstance(event, hf.TransactionCommitted))
+        assert "the disk is gone" in event.problems[0]
+        assert await one.ask(Add(1)) == 8
+        one.kill()
+        assert await ref(system, "/app/there/one").ask(Add(1), IN_TIME) == 9
+
+
 async def test_without_snapshots_all_turns_would_be_repeated_under_another_address(tmp_path: Path) -> None:
     async with hf.ActorSystem("app", log=False) as system:
         spec = hf.child("one", hf.start(Friend), recovery=hf.replay_only())

@@ -127,8 +127,8 @@ CHECKS = {
     ),
     "who is watched is known by its new address": Check(
         "checkpoint/home/homes.py",
-        "            switch.ties.rename(lambda one: renamed(names, one))\n",
-        "            pass\n",
+        "                switch.ties.rename(lambda one: renamed(names, one))\n",
+        "                pass\n",
         MOVED,
         "test_who_knows_it and task",
     ),

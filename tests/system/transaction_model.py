@@ -78,8 +78,9 @@ class Spec:
         self.late: set[int] = set()
         """Who was added there, or bound by its spec to such a one: started only when the transaction is in force."""
         self.reworked: set[int] = set()
-        self.relocated: set[int] = set()
         """Whose state an earlier step of it has replaced."""
+        self.relocated: set[int] = set()
+        """Who is to live elsewhere by an earlier step of it."""
 
     def copy(self) -> Spec:
         """The same specification, to be changed."""

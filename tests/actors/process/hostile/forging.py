@@ -122,6 +122,7 @@ BREACHES: dict[str, Callable[[], bytes]] = {
     "no watch of another": lambda: command(VICTIM, "demonitor", watcher=OTHER),
     "a link of others": lambda: command(VICTIM, "link", peer=OTHER),
     "no link of others": lambda: command(VICTIM, "unlink", peer=OTHER),
+    "an address that it was never told": lambda: command(EVIL, "readdressed"),
     "a subscription of another": lambda: command(VICTIM, "subscribe", topic="/t"),
     "no subscription of another": lambda: command(VICTIM, "unsubscribe", topic="/t"),
     "a topic that is none": lambda: command(EVIL, "subscribe", topic=5),
