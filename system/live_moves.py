@@ -309,11 +309,10 @@ class Moves:
 
     def _made(self, cell: Cell, spec: ChildSpec, timeout: float) -> Move:
         """The move that brings the actor to where its spec says."""
-        parent = cell.host.parent
-        if isinstance(parent, FarParent):
+        if isinstance(cell.host, OutsideHost) or isinstance(cell.host.parent, FarParent):
             from ..ftm.migration.subtree_moves import move_below
 
-            return move_below(cell, parent, spec, timeout)
+            return move_below(cell, spec, timeout)
         return Move(cell, leaving(cell), self._entering(self._node.ports.host_for(spec), spec.limits), timeout)
 
     @staticmethod
@@ -371,10 +370,6 @@ def _spec_there(cell: Cell, isolation: Isolation, limits: Limits | None) -> Chil
     spec, kind = _spec_of(cell), cell_kind(cell)
     if kind is not None and issubclass(kind, Supervisor):
         raise CannotMove(cell.path, "it is a supervisor: its children live where it does")
-    is_recorded = isinstance(cell.host.home, JournalHome)
-    if isinstance(cell.host, OutsideHost) or (isinstance(cell.host.parent, FarParent) and not is_recorded):
-        why = "its supervisor lives in another process, and it has no recovery: there, its spec says where it lives"
-        raise CannotMove(cell.path, why)
     try:
         return dataclasses.replace(spec, isolation=isolation, limits=limits if limits is not None else spec.limits)
     except SpecError as error:

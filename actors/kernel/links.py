@@ -57,10 +57,22 @@ def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
     if target.is_dead:
         watcher.push(Down(watch, NOPROC, recovering=False))
     else:
-        target.extra().ties.monitors.append(watch)
-        watcher.extra().ties.watching[watch] = None
+        note_watch(watch)
         target.host.told(target, "monitor", {"watcher": watcher.path, "for_good": for_good})
     return watch
+
+
+def note_watch(watch: Monitor) -> Monitor:
+    """Have a watch here that is kept on the other side of a border already: nobody is told of it."""
+    watch.target.extra().ties.monitors.append(watch)
+    watch.watcher.extra().ties.watching[watch] = None
+    return watch
+
+
+def drop_watch(watch: Monitor) -> None:
+    """A watch is kept on the other side of a border alone from now on: nobody is told of that."""
+    watch.forget()
+    watch.target.extra().ties.monitors.remove(watch)
 
 
 def demonitor(watcher: Cell, target: Cell, *, for_good: bool) -> None:

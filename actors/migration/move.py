@@ -74,7 +74,9 @@ class Luggage:
     data: bytes = b""  # its variables alone, as a snapshot has them
     restore: Callable[[Actor], None] = lambda actor: None  # gives them to an actor in this process
     stash: list[Any] = dataclasses.field(default_factory=list)
-    owed: dict[int, Ask] = dataclasses.field(default_factory=dict[int, "Ask"])  # promised replies, for a home
+    owed: dict[int, Ask] = dataclasses.field(
+        default_factory=dict[int, "Ask"]
+    )  # promised replies, by the numbers in the state
     # These are known when the new life is up:
     queue: list[Any] = dataclasses.field(default_factory=list)
     waiting: list[Any] = dataclasses.field(default_factory=list)  # for room in a bounded mailbox, behind the queue

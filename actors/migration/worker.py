@@ -70,8 +70,10 @@ class ToWorker(Entering):
     async def begin(self) -> None:
         cell, move, luggage, worker = self.cell, self.move, self.move.luggage, self.worker
         assert worker is not None
-        move.say(worker, "luggage", state=luggage.state, rest=luggage.rest)
-        await self.launch(worker, {"bounded": cell.extra().bound is not None, "moved": True})
+        numbers = [[number, worker.expect(ask)] for number, ask in luggage.owed.items()]
+        move.say(worker, "luggage", state=luggage.state, rest=luggage.rest, owed=numbers)
+        bound = luggage.bound or cell.extra().bound
+        await self.launch(worker, {"bounded": bound is not None, "moved": True})
         if not worker.is_alive():
             raise CannotMove(cell.path, "the new process has died")
 
@@ -98,6 +100,8 @@ class ToWorker(Entering):
         outlet.worker = worker
         cell.queue = deque(luggage.queue)
         send_queue(cell)
+        for item in luggage.waiting:
+            cell.admit(cell, item)
         worker.connection.flush()
         return []
 
@@ -209,6 +213,12 @@ class FromWorker(FromOwnWorker):
             luggage.state, luggage.rest, luggage.restore = told["state"], told["rest"], self._restore
             luggage.stash = unpack_items(cell, told["stash"], known)
             self._queued = unpack_items(cell, told["queue"], known)
+            waiting = {id(item) for item in (*luggage.stash, *self._queued)}
+            luggage.owed = {
+                number: ask
+                for number, ask in self._asks.items()
+                if id(ask) not in waiting and not isinstance(ask, OrderAsk)
+            }
         except BaseException as error:  # What a class of the state raises when it is read.
             self.move.give_up(error_text(error))
             return

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from ..errors import HoldfastError, error_text
 from ..exit_reasons import ExitReason, unpack_exit
-from ..kernel import lifecycle, mailbox
+from ..kernel import lifecycle, links, mailbox
 from ..kernel.actor import Actor, Start
 from ..kernel.cell import RUNNING, Cell
 from ..kernel.context import ActorContext
@@ -156,15 +156,18 @@ class GuestMove:
         for path in rest["links"]:
             peer = self._guest.node.cell_at(path)
             cell.extra().ties.links[peer] = peer.extra().ties.links[cell] = None
-        unpack(actor, luggage["state"], rest, self._owed, lambda path, for_good: _found(watches, path, for_good))
+        numbers = dict(luggage["owed"])  # Those of the root, for what was packed by other ones.
+        unpack(
+            actor,
+            luggage["state"],
+            rest,
+            lambda key: self._owed(numbers.get(key, key)),
+            lambda path, for_good: _found(watches, path, for_good),
+        )
         return await_up(cell, start)
 
     def _watch(self, cell: Cell, path: str, for_good: bool) -> Monitor:
-        """A watch that the root keeps already."""
-        watch = Monitor(cell, self._guest.node.cell_at(path), for_good)
-        watch.target.extra().ties.monitors.append(watch)
-        cell.extra().ties.watching[watch] = None
-        return watch
+        return links.note_watch(Monitor(cell, self._guest.node.cell_at(path), for_good))  # The root keeps it already.
 
     def _owed(self, key: int) -> Ask:
         """An ask that the root waits with for its reply."""

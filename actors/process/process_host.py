@@ -562,7 +562,8 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
             node.topics.unsubscribe(frame.data["topic"], cell)
         case "born":
             data = frame.data
-            worker.inner.born(cell, data["path"], data["kind"], data["life"], data.get("bindings", {}))
+            bound, last = data.get("bindings", {}), unpack_exit(data["last"]) if "last" in data else KILLED
+            worker.inner.born(cell, data["path"], data["kind"], data["life"], bound, last)
         case "gone":
             reason, with_parent = unpack_exit(frame.data.get("reason")), bool(frame.data.get("with_parent"))
             worker.inner.gone(frame.data["path"], reason, with_parent=with_parent)

@@ -32,8 +32,10 @@ class Inner:
         """All of them that are there."""
         return self._cells.values()
 
-    def born(self, home: Cell, path: str, kind: str, life: int, bound: Mapping[str, str]) -> None:
+    def born(self, home: Cell, path: str, kind: str, life: int, bound: Mapping[str, str], last: ExitReason) -> None:
         """A life has begun at `path` below `home`; its bindings lead there, as its process says.
+
+        `last`: why the life before it ended, if there was one.
 
         Raises:
             BadFrame: that address is not for this process to give.
@@ -43,6 +45,8 @@ class Inner:
             cell = self._node.cell_below(*self._place(home, path), self._host)
             self._cells[path] = cell
             cell.state, cell.admit = RUNNING, self._admit
+        elif cell.life != life:
+            lifecycle.tell_enders(cell.extra(), last)
         cell.life = life
         know(cell, kind)
         above = cell_kind(home)

@@ -271,7 +271,8 @@ class Guest(Peer):
         kind = type(cell.actor) if cell.actor is not None else None if start is None else start.kind
         if kind is not None:
             bound = {port: target.path for port, target in cell.extra().bindings.items()}
-            born = {"path": path, "kind": message_name(kind), "life": cell.life, "bindings": bound}
+            last = pack_exit(cell.extra().reason)  # how the life before it ended, if there was one
+            born = {"path": path, "kind": message_name(kind), "life": cell.life, "bindings": bound, "last": last}
             self.command(root, "born", born)
 
     def _on_event(self, event: Event) -> None:

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
-from ...actors import exit_reasons
 from ...actors.control.orders_lane import Call
 from ...actors.errors import ControlFailed, StartFailed, StartIgnored
 from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
@@ -156,7 +155,7 @@ class RecordedChild:
         respec(cell, Respec(**told["spec"]))
         child_at_root(self._guest, cell.spec).take_up(cell, told["number"])
         obey_commands(cell, commands)
-        farewell(old, StopRecorded(life, exit_reasons.Shutdown("moved into a group of replicas")))
+        farewell(old, StopRecorded(life, unpack_exit(told["reason"])))
 
     def _come(self, cell: Cell, told: dict[str, Any]) -> None:
         """Begin the life that comes back; it handles nothing yet."""

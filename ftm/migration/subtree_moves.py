@@ -8,10 +8,12 @@ nobody's messages overtake each other. If the process dies meanwhile, the child 
 from __future__ import annotations
 
 import asyncio
+from collections import deque
 from typing import TYPE_CHECKING, Any, cast
 
 from ...actors.errors import CannotMove, HoldfastError, StartFailed, error_text
-from ...actors.exit_reasons import ExitReason, unpack_exit
+from ...actors.exit_reasons import ExitReason, pack_exit, unpack_exit
+from ...actors.kernel import links
 from ...actors.kernel.bindings import settle_claims, unclaimed
 from ...actors.kernel.cell import GONE, Cell
 from ...actors.kernel.envelope import Item
@@ -19,7 +21,7 @@ from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.message import message_name
 from ...actors.migration.move import Entering, Leaving, Move
 from ...actors.migration.quiesce import now
-from ...actors.migration.worker import BUSY
+from ...actors.migration.worker import BUSY, ToWorker
 from ...actors.overflow import Overflow
 from ...actors.process.resource_limits import limits_data
 from ...actors.process.wire import frames
@@ -44,6 +46,7 @@ from .unrecorded_luggage import pack, pack_owed, refuse, unpack, unpack_owed
 if TYPE_CHECKING:
     from ...actors.kernel.address_host import AddressHost
     from ...actors.kernel.cell import Admit
+    from ...checkpoint.home.switch import Switch
     from ...supervision.spec import ChildSpec
 
 NUMBER = 0
@@ -98,16 +101,24 @@ def spec_data(host: AddressHost, spec: ChildSpec) -> dict[str, Any]:
     return {"layers": layers_of(host), "isolation": spec.isolation, "limits": limits_data(spec.limits)}
 
 
-def move_below(cell: Cell, parent: FarParent, spec: ChildSpec, timeout: float) -> Move:
-    """The move of a recorded child between the process of its supervisor and one of its own, to where its spec says.
+def move_below(cell: Cell, spec: ChildSpec, timeout: float) -> Move:
+    """The move of a child between the process of its supervisor and one of its own, to where its spec says.
 
     Raises:
         CannotMove: it cannot.
     """
-    home = cell.host.home
-    assert isinstance(home, JournalHome)
+    old, home, parent = cell.host, cell.host.home, cell.host.parent
+    if isinstance(old, OutsideHost):
+        parent = parent_of(cell, old)
+        settle_claims(cell, spec.bindings)
+        host = to_process_below(parent, spec, UNKEPT)
+        return Move(cell, FromSubtree(cell, parent, spec, host), ToWorker(host, spec.limits), timeout)
+    assert isinstance(parent, FarParent)
+    is_recorded = isinstance(home, JournalHome)
     if spec.isolation == "task":
-        return Move(cell, leaving(cell), ToRecordedSubtree(cell, parent), timeout)
+        to_subtree = ToRecordedSubtree if is_recorded else ToSubtree
+        return Move(cell, leaving(cell), to_subtree(cell, parent), timeout)
+    assert isinstance(home, JournalHome)
     host = to_process_below(parent, spec, home.method)
     return Move(cell, FromRecordedSubtree(cell, parent, spec, host), ToRecordedWorker(host, spec.limits), timeout)
 
@@ -122,7 +133,7 @@ def to_process_below(parent: FarParent, spec: ChildSpec, method: Method) -> Addr
 
 
 class FromRecordedSubtree(Leaving):
-    """A recorded life leaves the process of its supervisor, for a group."""
+    """A recorded life leaves the process of its supervisor, for one of its own or a group."""
 
     def __init__(self, cell: Cell, parent: FarParent, spec: ChildSpec, host: AddressHost) -> None:
         self._parent, self._spec, self._host = parent, spec, host
@@ -153,7 +164,8 @@ class FromRecordedSubtree(Leaving):
         cell, parent = self.cell, self._parent
         assert parent.wanted is not None
         parent.comes_to_root(cell, parent.wanted)
-        self.move.say_now(self._worker, "leave", number=parent.number, spec=spec_data(self._host, self._spec))
+        spec, reason = spec_data(self._host, self._spec), pack_exit(self.move.reason())
+        self.move.say_now(self._worker, "leave", number=parent.number, spec=spec, reason=reason)
         cell.extra().start = self._spec.start
         return []
 
@@ -171,13 +183,15 @@ class FromRecordedSubtree(Leaving):
 
 
 class FromSubtree(Leaving):
-    """A life without recovery leaves the process of its supervisor, for a group."""
+    """A life without recovery leaves the process of its supervisor, for one of its own or a group."""
 
     def __init__(self, cell: Cell, parent: FarParent, spec: ChildSpec, host: AddressHost) -> None:
         self._parent, self._spec, self._host = parent, spec, host
+        self._is_for_home = isinstance(host.home, JournalHome)  # as long as a group lives it
         self._worker = worker_of(parent, cell)
         self._admit: Admit = cell.admit
         self._held: list[Any] = []  # what has been sent to it here meanwhile
+        self._bound: Bounded | None = None
         self._told: dict[str, Any] = {}
         cell.table = spec.start.kind._table
 
@@ -187,7 +201,7 @@ class FromSubtree(Leaving):
         self._left: asyncio.Future[None] = move.node.loop.create_future()
         parent.arriving, parent.on_lost = lambda record: None, self._lost
         move.hear(self._worker, self._heard)
-        move.say_now(self._worker, "take")
+        move.say_now(self._worker, "take", for_home=self._is_for_home)
         await move.within(self._taken, move.timeout, lambda: BUSY)
 
     def _heard(self, step: str, told: dict[str, Any]) -> None:
@@ -214,8 +228,15 @@ class FromSubtree(Leaving):
     def _has_come_to_rest(self, told: dict[str, Any]) -> None:
         cell, move, luggage = self.cell, self.move, self.move.luggage
         move.rest_at, luggage.rest, luggage.data = float(told["at"]), told["rest"], told["state"]
+        luggage.state = luggage.data
         luggage.suspended, luggage.traps = bool(luggage.rest["suspended"]), bool(luggage.rest["trap_exits"])
         luggage.stash = unpack(self._worker, cell, told["stash"])
+        luggage.owed = unpack_owed(self._worker, cell, told["owed"])
+        if told["bound"] is not None:
+            capacity, overflow = told["bound"]
+            self._bound = Bounded(capacity, cast("Overflow", overflow))
+        if not self._is_for_home and self._bound is not None:
+            luggage.bound = Bound(self._bound.capacity, self._bound.overflow)
         cell.admit = self._hold
         move.at_rest()
         self._taken.set_result(None)
@@ -228,25 +249,37 @@ class FromSubtree(Leaving):
 
     async def let_go(self) -> None:
         self.move.is_bound = True
-        self.move.say_now(self._worker, "leave", number=NUMBER, spec=spec_data(self._host, self._spec))
+        spec, reason = spec_data(self._host, self._spec), pack_exit(self.move.reason())
+        self.move.say_now(self._worker, "leave", number=NUMBER, spec=spec, reason=reason)
         await asyncio.shield(self._left)
 
     def part(self) -> list[Item]:
         cell, luggage, more, told = self.cell, self.move.luggage, self.cell.extra(), self._told
         self._quit()
-        chosen = None
-        if told["bound"] is not None:
-            capacity, overflow = told["bound"]
-            chosen = Bounded(capacity, cast("Overflow", overflow))
-            more.bound = Bound(capacity, chosen.overflow)
+        chosen = self._bound
+        if chosen is not None:
+            more.bound = Bound(chosen.capacity, chosen.overflow)
         luggage.queue = unpack(self._worker, cell, told["queue"])
-        luggage.owed = unpack_owed(self._worker, cell, told["owed"])
+        luggage.owed.update(unpack_owed(self._worker, cell, told["owed"]))
         luggage.waiting, self._held = self._held, []
+        self._keep_watches([(str(path), bool(for_good)) for path, for_good in told["watches"]])
         kind = self._spec.start.kind
         wanted = Wanted(NUMBER, message_name(kind), list(kind._topics), UNKEPT, chosen)
         self._parent.comes_to_root(cell, wanted)
         more.start = self._spec.start
         return []
+
+    def _keep_watches(self, told: list[tuple[str, bool]]) -> None:
+        """What it watches in the process that it leaves is known here from now on; all else that it watches is."""
+        cell, top = self.cell, self._worker.cell
+        assert top is not None
+        for watch in [one for one in cell.extra().ties.watching if one.target.path.startswith(f"{top.path}/")]:
+            if (watch.target.path, watch.for_good) in told:
+                told.remove((watch.target.path, watch.for_good))
+            else:
+                links.drop_watch(watch)  # It was kept when it came to that process.
+        for path, for_good in told:
+            links.note_watch(links.Monitor(cell, cell.node.cell_at(path), for_good))
 
     def _let_go(self, held: list[Any]) -> None:
         """What has waited here goes where the actor lives."""
@@ -291,14 +324,12 @@ class FromSubtree(Leaving):
 
 
 class IntoSubtree(Entering):
-    """A life enters the process of its supervisor, from a group: what both kinds have in common."""
+    """A life enters the process of its supervisor: what both kinds have in common."""
 
     to = "to the process of its supervisor"
 
     def __init__(self, cell: Cell, parent: FarParent) -> None:
-        home = cell.host.home
-        assert isinstance(home, JournalHome)
-        self.parent, self._from = parent, home
+        self.parent, self._from = parent, cell.host.home
         self.worker = worker_of(parent, cell)
 
     async def prepare(self) -> None:
@@ -324,6 +355,7 @@ class ToRecordedSubtree(IntoSubtree):
 
     async def begin(self) -> None:
         cell, move, parent = self.cell, self.move, self.parent
+        assert isinstance(self._from, JournalHome)
         parent.home.method = self._from.method
         switch, live, _ = parent.home.open(cell)
         beginning = self._beginning = Beginning(move, switch)
@@ -364,16 +396,23 @@ class ToRecordedSubtree(IntoSubtree):
 
 
 class ToSubtree(IntoSubtree):
-    """A life without recovery enters it."""
+    """A life without recovery enters it: from a group, and so from a home, or from a process."""
+
+    @property
+    def _switch(self) -> Switch | None:
+        return self._from.switch if isinstance(self._from, JournalHome) else None
 
     async def begin(self) -> None:
         move, luggage = self.move, self.move.luggage
         self._up: asyncio.Future[None] = move.node.loop.create_future()
         self.parent.arriving = self._said
         move.hear(self.worker, self._heard)
-        assert self._from.switch is not None
-        owed = [number for number, ask in self._from.switch.calls.later.items() if not ask.is_done]
-        move.say_now(self.worker, "come", state=luggage.data, traps=luggage.traps, owed=owed)
+        if self._switch is None:
+            packed: dict[str, Any] = {"state": luggage.state, "rest": luggage.rest, "owed": list(luggage.owed)}
+        else:
+            owed = [number for number, ask in self._switch.calls.later.items() if not ask.is_done]
+            packed = {"state": luggage.data, "rest": None, "owed": owed}
+        move.say_now(self.worker, "come", traps=luggage.traps, **packed)
         await move.within(self._up, move.timeout, lambda: "its new life was not up")
 
     def _said(self, record: ToHome) -> None:
@@ -398,13 +437,15 @@ class ToSubtree(IntoSubtree):
     def take_over(self) -> list[Item]:
         """What waits at the home goes there, with all that ties the actor to others."""
         cell, move, luggage, more, worker = self.cell, self.move, self.move.luggage, self.cell.extra(), self.worker
-        switch, node = self._from.switch, cell.node
-        assert switch is not None
+        switch, node, bound = self._switch, cell.node, luggage.bound if self._switch is None else None
         self.parent.arriving = None
-        topics = dict.fromkeys([*self.parent.topics(cell), *switch.topics])
-        for topic in topics:
-            node.topics.unsubscribe(topic, inlet(switch, topic))
-            node.topics.subscribe(topic, cell)
+        if switch is not None:
+            for topic in dict.fromkeys([*self.parent.topics(cell), *switch.topics]):
+                node.topics.unsubscribe(topic, inlet(switch, topic))
+                node.topics.subscribe(topic, cell)
+        if bound is not None:
+            luggage.waiting += bound.waiting
+            bound.waiting = deque()
         told = {
             "stash": pack(worker, cell, luggage.stash),
             "queue": pack(worker, cell, [*luggage.queue, *luggage.waiting]),
@@ -414,14 +455,14 @@ class ToSubtree(IntoSubtree):
             "links": [peer.path for peer in more.ties.links],
             "monitors": [[watch.watcher.path, watch.for_good] for watch in more.ties.monitors],
             "watches": [[watch.target.path, watch.for_good] for watch in more.ties.watching],
-            "topics": list(topics),
+            "topics": list(more.belongings.topics),
         }
-        for watch in list(more.ties.watching):
-            watch.cancel()  # It begins to watch again, there.
         move.say_now(worker, "settle", **told)
         self.parent.goes_for_good()
-        more.outlet, more.suspended = None, 0
+        more.outlet, more.bound, more.suspended = None, None, 0
         self.host = worker.inner.lived_there(cell)
+        if bound is not None:
+            bound.release()
         return []
 
     def go_on(self) -> None:

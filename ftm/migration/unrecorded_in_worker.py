@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from ...actors.errors import HoldfastError, StartFailed
-from ...actors.exit_reasons import Shutdown
+from ...actors.exit_reasons import unpack_exit
 from ...actors.kernel import lifecycle, links
 from ...actors.kernel.cell import RUNNING, Cell
-from ...actors.kernel.envelope import Item
+from ...actors.kernel.envelope import Ask, Item
 from ...actors.kernel.lifecycle import Stop
+from ...actors.kernel.links import Monitor
 from ...actors.kernel.mailbox import Bound, Bounded
 from ...actors.kernel.timers import Timer
 from ...actors.kernel.topics import Topics
 from ...actors.migration.here import Arrival
 from ...actors.migration.luggage import check_sendable, pack_rest
+from ...actors.migration.luggage import unpack as unpack_life
 from ...actors.migration.quiesce import Take, farewell, now, obey_commands, part, resume, sorted_out
 from ...actors.migration.words import say
 from ...actors.process.wire.frames import BadFrame
@@ -43,11 +46,13 @@ class PlainChild:
         self._arrival: Arrival | None = None  # beside it: the life that comes back
         self._held: list[Any] | None = None  # what has been sent to it here meanwhile
         self._owed: dict[int, Any] = {}  # the asks that it has promised to answer
+        self._expected: list[int] = []  # the numbers that the root was given for them, while it may stay
+        self._watches: list[Monitor] = []  # those that its state holds
 
     def obey(self, step: str, told: dict[str, Any]) -> None:
         match step:
             case "take":
-                self._come_to_rest()
+                self._come_to_rest(for_home=bool(told["for_home"]))
             case "back":
                 self._go_on()
             case "leave":
@@ -66,12 +71,14 @@ class PlainChild:
 
     # -- leaving ----------------------------------------------------------------------------------------------------
 
-    def _come_to_rest(self) -> None:
+    def _come_to_rest(self, *, for_home: bool) -> None:
+        """`for_home`: its state is packed as a home has it; else as a process takes it, with its handles."""
         cell = self._guest.node.find(self._path)
         if cell is None or cell.state is not RUNNING or cell.host is not self._guest.node.ports.here:
             self._say("refused", why="it is being restarted; try again")
             return
-        take = Take(_owe, self._at_rest, lambda why: self._say("refused", why=why))
+        at_rest = self._at_rest_for_home if for_home else self._at_rest
+        take = Take(self._owe, at_rest, lambda why: self._say("refused", why=why))
         self._take, self._cell = take, cell
 
         def ended(done: asyncio.Future[Any]) -> None:
@@ -81,24 +88,42 @@ class PlainChild:
         cell.ended().add_done_callback(ended)
         lifecycle.urge(cell, take)
 
-    def _at_rest(self, actor: Actor, state: bytes) -> None:
+    def _owe(self, ask: Ask) -> int:
+        """The number by which the packed state knows an ask that it has promised to answer."""
+        number = next((number for number, one in self._owed.items() if one is ask), len(self._owed) + 1)
+        self._owed[number] = ask
+        return number
+
+    def _at_rest_for_home(self, actor: Actor, state: bytes) -> None:
         """Called in its place between two turns; if this raises, the actor goes on."""
-        cell = actor.ctx.cell
-        check_sendable(cell)
-        rest, stash = pack_rest(actor), pack(self._guest, cell, cell.extra().stash or ())
         state, self._owed = save_owing(actor)
-        self._say("taken", at=now(), state=state, rest=rest, stash=stash)
+        self._at_rest(actor, state, [])
+
+    def _at_rest(self, actor: Actor, state: bytes, owed: list[list[Any]] | None = None) -> None:
+        """The same; `owed` is told when it leaves."""
+        guest, cell = self._guest, actor.ctx.cell
+        check_sendable(cell)
+        bound = cell.extra().bound
+        rest, stash = pack_rest(actor), pack(guest, cell, cell.extra().stash or ())
+        if owed is None:
+            owed = pack_owed(guest, self._owed)
+            self._expected = [key for _, key, _ in owed]
+        room = None if bound is None else [bound.capacity, bound.overflow]
+        self._say("taken", at=now(), state=state, rest=rest, stash=stash, owed=owed, bound=room)
 
     def _go_on(self) -> None:
         take, self._take, cell = self._take, None, self._cell
         if take is None or cell is None:
             return
         take.is_void = True
+        for key in self._expected:
+            self._guest.pending.pop(key, None)
+        self._owed, self._expected = {}, []
         if take.is_done and cell.state is RUNNING:
             resume(cell)
 
     def _leave(self, told: dict[str, Any]) -> None:
-        """The group lives it from now on; nobody hears of that but the actor itself."""
+        """It is lived at the root from now on; nobody hears of that but the actor itself."""
         guest, cell, self._take = self._guest, self._cell, None
         assert cell is not None
         more, bound = cell.extra(), cell.extra().bound
@@ -108,9 +133,9 @@ class PlainChild:
         old = part(cell)
         items, commands = sorted_out(cell)
         queue = pack(guest, cell, (*items, *waiting))
-        self._hand_ties_over(cell)
-        room = None if bound is None else [bound.capacity, bound.overflow]
-        self._say("left", queue=queue, bound=room, owed=pack_owed(guest, self._owed))
+        watches = self._hand_ties_over(cell)
+        owed = [] if self._expected else pack_owed(guest, self._owed)
+        self._say("left", queue=queue, owed=owed, watches=watches)
         respec(cell, Respec(**told["spec"]))
         guest.recovery.begins(cell.path)
         place = child_at_root(guest, cell.spec)
@@ -120,19 +145,27 @@ class PlainChild:
         if bound is not None:
             bound.release()
         obey_commands(cell, commands)
-        farewell(old, Stop(Shutdown("moved into a group of replicas")))
+        farewell(old, Stop(unpack_exit(told["reason"])))
 
-    def _hand_ties_over(self, cell: Cell) -> None:
-        """Links, and monitors that reach out of this process, are the root's from now on; so are subscriptions."""
+    def _hand_ties_over(self, cell: Cell) -> list[list[Any]]:
+        """Links, and monitors that reach out of this process, are the root's from now on; so are subscriptions.
+
+        Returns what it watches in this process: the root hears of that from here.
+        """
         more, guest = cell.extra(), self._guest
+        assert guest.node.root is not None
+        here, watches = f"{guest.node.root.path}/", list[list[Any]]()
         for peer in more.ties.links:
             guest.command(cell, "link", {"peer": peer.path})
         for watch in [one for one in more.ties.watching if one.life == cell.life]:
-            watch.cancel()
-            guest.command(watch.target, "monitor", {"watcher": cell.path, "for_good": watch.for_good})
+            if watch.target.path.startswith(here):
+                watches.append([watch.target.path, watch.for_good])
+            else:
+                links.drop_watch(watch)
         more.ties.monitors = [one for one in more.ties.monitors if one.watcher.host is guest.node.ports.here]
         for topic in list(more.belongings.topics):
             Topics.unsubscribe(guest.node.topics, topic, cell)
+        return watches
 
     # -- coming back ------------------------------------------------------------------------------------------------
 
@@ -147,18 +180,26 @@ class PlainChild:
         arrival = Arrival(cell)
         self._cell, self._arrival = cell, arrival
 
-        self._owed = {number: EarlyAsk.early(self._guest) for number in told["owed"]}
-
-        def restore(actor: Actor) -> None:
-            restore_owing(actor, told["state"], self._owed)
-
         try:
-            up = arrival.begin(start, restore, trap_exits=told["traps"])
+            up = arrival.begin(start, self._restoring(cell, told), trap_exits=told["traps"])
         except StartFailed as error:
             self._fail(arrival, error.reason)
             return
         up.add_done_callback(lambda done: self._is_up(arrival, done))
         arrival.other.ended().add_done_callback(lambda done: self._fail(arrival, str(done.result())))
+
+    def _restoring(self, cell: Cell, told: dict[str, Any]) -> Callable[[Actor], None]:
+        """What gives the life that comes its state: that of a home, or that of a process, with its handles."""
+        guest, rest = self._guest, told["rest"]
+        self._owed = {number: EarlyAsk.early(guest) for number in told["owed"]}
+        if rest is None:
+            return lambda actor: restore_owing(actor, told["state"], self._owed)
+
+        def watched(path: str, for_good: bool) -> Monitor:
+            self._watches.append(Monitor(cell, guest.node.cell_at(path), for_good))
+            return self._watches[-1]
+
+        return lambda actor: unpack_life(actor, told["state"], rest, self._owed.__getitem__, watched)
 
     def _fail(self, arrival: Arrival, why: str) -> None:
         if self._arrival is arrival and self._held is None:  # Else it is the one already, as far as the root knows.
@@ -182,7 +223,7 @@ class PlainChild:
         self._held.append(item)
 
     def _stay(self) -> None:
-        """The group goes on."""
+        """It goes on at the root."""
         cell, arrival, held = self._cell, self._arrival, self._held or []
         self._arrival = self._held = None
         if arrival is not None:
@@ -233,11 +274,20 @@ class PlainChild:
             links.link(node.cell_at(path), cell)
         for path, for_good in told["monitors"]:
             links.monitor(node.cell_at(path), cell, for_good=for_good)
-        for path, for_good in told["watches"]:
-            links.monitor(cell, node.cell_at(path), for_good=for_good)
+        kept = list(cell.extra().ties.watching)  # in this process
+        for path, for_good in told["watches"]:  # The root keeps those that reach out of it, and tells of their ends.
+            own, held = _taken_from(kept, path, for_good), _taken_from(self._watches, path, for_good)
+            if own is None or held is not None:
+                links.note_watch(held or Monitor(cell, node.cell_at(path), for_good))
+                if own is not None:
+                    links.drop_watch(own)
         for topic in told["topics"]:
             node.topics.subscribe(topic, cell)
 
 
-def _owe(ask: Any) -> int:
-    return 0  # It is numbered when the state is saved.
+def _taken_from(watches: list[Monitor], path: str, for_good: bool) -> Monitor | None:
+    """Such a watch, out of the list; None if there is none."""
+    found = next((one for one in watches if one.target.path == path and one.for_good is for_good), None)
+    if found is not None:
+        watches.remove(found)
+    return found

@@ -209,7 +209,7 @@ class Wait(hf.Message[int]): ...
 
 
 class Slow(Counter):
-    """A turn that lasts as long as there is a file."""
+    """A turn that lasts as long as there is a file; another one tells that it has begun."""
 
     def __init__(self, file: str) -> None:
         super().__init__()
@@ -217,9 +217,16 @@ class Slow(Counter):
 
     @hf.on(Wait)
     async def wait(self, message: Wait) -> int:
+        self._file.with_suffix(".begun").touch()
         while self._file.exists():
             await asyncio.sleep(0.005)
         return self.total
+
+
+async def begun(file: Path) -> None:
+    async with asyncio.timeout(30):
+        while not file.with_suffix(".begun").exists():
+            await asyncio.sleep(0.005)
 
 
 @pytest.mark.parametrize("verb", ["attach", "detach", "transition"])

@@ -1,6 +1,6 @@
-"""Children without recovery below a supervisor in another process: a mechanism is attached to them and detached again.
+"""Children without recovery below a supervisor in another process: they get a mechanism, or a process of their own.
 
-They have no home before, and none afterwards: what they have goes along.
+They have no home before, and none afterwards: what they have goes along, there and back.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import Add, Boom, Counter, Later, Load, Tags
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
 from tests.ftm.test_subtree import Heard, Watch, Watcher, at, bank, bank_pid
-from tests.ftm.test_subtree_changes import Bad, Slow, Wait, attach, detach, kill_subtree, names_of
+from tests.ftm.test_subtree_changes import Bad, Slow, Wait, attach, begun, detach, kill_subtree, names_of
 
 # A refused or failed transaction ends with its block.
 # ruff: noqa: PT012
@@ -33,6 +33,26 @@ from tests.ftm.test_subtree_changes import Bad, Slow, Wait, attach, detach, kill
 
 def plain(name: str = "alice", recipe: Any = None, **options: Any) -> hf.ChildSpec:
     return hf.child(name, recipe or hf.start(Counter), **options)
+
+
+async def apart(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    await system.set_isolation(ref, "process", timeout=60.0)
+
+
+async def together(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
+    await system.set_isolation(ref, "task", timeout=60.0)
+
+
+WAYS = {"replicas": (attach, detach), "process": (apart, together)}
+BOTH_WAYS = pytest.mark.parametrize("way", list(WAYS))
+REFUSED = (hf.TransactionFailed, hf.TransactionRefused, hf.CannotMove)
+
+
+def is_out(system: hf.ActorSystem, ref: hf.ActorRef[Any], way: str) -> bool:
+    """Whether it lives outside the process of its supervisor, as it does this way."""
+    if way == "replicas":
+        return isinstance(ref._cell.host.place, GroupPlace)
+    return system.pid_of(ref) != bank_pid(system)
 
 
 class Talk(hf.Message[int]):
@@ -68,21 +88,24 @@ class Talking:
         return list(range(self.first, self.next))
 
 
-async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.ActorSystem) -> None:
+@BOTH_WAYS
+async def test_there_and_back_under_load_nothing_is_lost(system: hf.ActorSystem, way: str) -> None:
     """From outside and from a sibling, once and in order; nothing is left of a home."""
     await system.start(bank(plain(mailbox=hf.bounded(64)), plain("sibling", hf.start(Sibling))))
     alice = at(system, "alice")
     load, talking = Load(alice), Talking(at(system, "sibling"), 1_000_000)
+    out, home = WAYS[way]
     for _ in range(2):
         await load.reached(30)
-        await attach(system, alice)
-        assert isinstance(alice._cell.host.place, GroupPlace)
+        await out(system, alice)
+        assert is_out(system, alice, way)
         await load.reached(30)
-        await two_again(alice)
-        os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
-        await load.reached(30)
-        await two_again(alice)
-        await detach(system, alice)
+        if way == "replicas":
+            await two_again(alice)
+            os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+            await load.reached(30)
+            await two_again(alice)
+        await home(system, alice)
         assert isinstance(alice._cell.host, OutsideHost)
         assert system.homes.at(alice.path) is None
     await load.reached(30)
@@ -103,18 +126,22 @@ def is_to_rest(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> bool:
         return group_of(ref).is_stopping
     top = system.node.cell_at("/app/bank").host.place
     assert isinstance(top, SubtreePlace)
-    return top.at(ref.path).arriving is not None
+    move = system._moves._under_way.get(ref._cell)
+    return top.at(ref.path).arriving is not None or (move is not None and hasattr(move.leaving, "taken"))
 
 
-async def test_what_waits_goes_along_in_order_both_ways(system: hf.ActorSystem, tmp_path: Path) -> None:
+@BOTH_WAYS
+async def test_what_waits_goes_along_in_order_both_ways(system: hf.ActorSystem, tmp_path: Path, way: str) -> None:
     file = tmp_path / "slow"
     slow = plain(recipe=hf.start(Slow, str(file)))
     await system.start(bank(slow, plain("sibling", hf.start(Sibling)), plain("other")))
     alice, sibling = at(system, "alice"), at(system, "sibling")
     tag = 0
-    for change in (attach, detach):
+    for change in WAYS[way]:
         file.touch()
+        file.with_suffix(".begun").unlink(missing_ok=True)
         waiting: list[Any] = [asyncio.ensure_future(alice.ask(Wait(), timeout=30.0))]
+        await begun(file)
         alice.tell(Add(tag))
         waiting.append(asyncio.ensure_future(sibling.ask(Talk(tag + 1), timeout=30.0)))
         changing = asyncio.ensure_future(change(system, alice))
@@ -133,25 +160,29 @@ async def test_what_waits_goes_along_in_order_both_ways(system: hf.ActorSystem, 
         assert tags.index(first + 1) < tags.index(first + 2)
 
 
-async def test_timers_and_ties_go_along(system: hf.ActorSystem) -> None:
+@BOTH_WAYS
+@pytest.mark.parametrize("whom", ["/app/target", "/app/bank/target"])
+async def test_timers_and_ties_go_along(system: hf.ActorSystem, way: str, whom: str) -> None:
     """Who watches it, inside or outside, hears once of its end; it hears of those it watches."""
-    await system.start(bank(plain(recipe=hf.start(Watching)), plain("inside", hf.start(Watcher))))
+    await system.start(bank(plain(recipe=hf.start(Watching)), plain("inside", hf.start(Watcher)), plain("target")))
     outside = await system.start(hf.child("outside", hf.start(Watcher)))
     alice, inside = at(system, "alice"), at(system, "inside")
-    target = await system.start(hf.child("target", hf.start(Counter)))
+    await system.start(hf.child("target", hf.start(Counter)))
+    target = system.ref(whom, Counter)
     await inside.ask(Watch("monitor"))
     await outside.ask(Watch("monitor"))
-    await alice.ask(See("/app/target"))
+    await alice.ask(See(whom))
     await alice.ask(Later(0.3, 7))
-    await attach(system, alice)
+    out, home = WAYS[way]
+    await out(system, alice)
     await system.terminate(target)
-    await seen(alice, ["/app/target"])
+    await seen(alice, [whom])
     await ticked(alice, [7])
     await alice.ask(Later(0.3, 8))
-    await alice.ask(See("/app/target"))
-    await detach(system, alice)
+    await alice.ask(See(whom))
+    await home(system, alice)
     await system.terminate(target)
-    await seen(alice, ["/app/target"] * 2)
+    await seen(alice, [whom] * 2)
     await ticked(alice, [7, 8])
     house = system.ref("/app/bank", hf.Supervisor)
     await house.ask(hf.TerminateChild("alice"))
@@ -269,12 +300,13 @@ class Keeper(hf.Actor):
         return [one for one in self.read if not one.isdigit()] if not self.is_open else self.read
 
 
-async def test_what_is_put_aside_and_subscribed_to_goes_along(system: hf.ActorSystem) -> None:
+@BOTH_WAYS
+async def test_what_is_put_aside_and_subscribed_to_goes_along(system: hf.ActorSystem, way: str) -> None:
     await system.start(bank(plain(recipe=hf.start(Keeper))))
     alice = at(system, "alice")
     await alice.ask(Follow())
     kept = []
-    for tag, change in enumerate((attach, detach, None)):
+    for tag, change in enumerate((*WAYS[way], None)):
         kept.append(asyncio.ensure_future(alice.ask(Keep(tag), timeout=30.0)))
         await system.publish("/news", News("abc"[tag]))
         assert await alice.ask(Read()) == list("abc"[: tag + 1])
@@ -285,25 +317,34 @@ async def test_what_is_put_aside_and_subscribed_to_goes_along(system: hf.ActorSy
     assert await alice.ask(Read()) == ["0", "1", "2"]
 
 
-@pytest.mark.parametrize("victim", ["subtree", "replica"])
-async def test_whatever_dies_while_it_is_handed_over_it_is_there_again(system: hf.ActorSystem, victim: str) -> None:
+@pytest.mark.parametrize(
+    ("way", "victim"), [("replicas", "subtree"), ("replicas", "replica"), ("process", "subtree"), ("process", "own")]
+)
+async def test_whatever_dies_while_it_is_handed_over_it_is_there_again(
+    system: hf.ActorSystem, way: str, victim: str
+) -> None:
     """With a replica nothing is lost; with the subtree the child begins afresh, as the specs say then."""
-    rng = random.Random(f"{SEED} {victim}")
+    rng = random.Random(f"{SEED} {victim}" if way == "replicas" else f"{SEED} {way} {victim}")
+    out, home = WAYS[way]
     await system.start(bank(plain()))
     tag = 0
-    for change in (attach, detach, attach, detach):
+    for change in (out, home, out, home):
         alice = at(system, "alice")
         before = await alice.ask(Tags(), timeout=30.0)
         answering = [asyncio.ensure_future(alice.ask(Add(tag + number), timeout=30.0)) for number in range(5)]
         changing = asyncio.ensure_future(change(system, alice))
         await asyncio.sleep(rng.random() * 0.4)
-        path = "/app/bank" if victim == "subtree" else f"/app/bank/alice/ftm/{rng.choice(['r1', 'r2'])}"
+        replica = f"/app/bank/alice/ftm/{rng.choice(['r1', 'r2'])}"
+        path = {"subtree": "/app/bank", "own": "/app/bank/alice", "replica": replica}[victim]
         pid = system._workers.processes().get(path)
         if pid is not None:
             with contextlib.suppress(ProcessLookupError):  # It has just ended.
                 os.kill(pid, signal.SIGKILL)
-        with contextlib.suppress(hf.TransactionFailed, hf.TransactionRefused):
+        with contextlib.suppress(*REFUSED):
             await changing
+        async with asyncio.timeout(30):
+            while pid is not None and system._workers.processes().get(path) == pid:
+                await asyncio.sleep(0.005)
         said = await asyncio.gather(*answering, return_exceptions=True)
         alice = await back(system)
         tags = await alice.ask(Tags(), timeout=30.0)
@@ -314,16 +355,19 @@ async def test_whatever_dies_while_it_is_handed_over_it_is_there_again(system: h
         tag += 5
         with contextlib.suppress(hf.TransactionRefused):  # Then it is as it should be already.
             await change(system, alice)
-        assert isinstance(alice._cell.host.place, GroupPlace) is (change is attach)
+        assert is_out(system, alice, way) is (change is out)
 
 
+@BOTH_WAYS
 @pytest.mark.parametrize("step", ["take", "leave", "come", "settle"])
 async def test_the_process_dies_at_a_step_and_the_child_begins_afresh(
-    system: hf.ActorSystem, step: str, monkeypatch: pytest.MonkeyPatch
+    system: hf.ActorSystem, step: str, way: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing of the group is left if it was not to be, and nobody who has asked waits for ever."""
-    change, say = attach if step in ("take", "leave") else detach, Move.say_now
-    await system.start(bank(plain(mechanism=None if change is attach else PBR())))
+    """Nothing of what was begun is left if it was not to be, and nobody who has asked waits for ever."""
+    (out, home), say = WAYS[way], Move.say_now
+    change = out if step in ("take", "leave") else home
+    there: dict[str, Any] = {"mechanism": PBR()} if way == "replicas" else {"isolation": "process"}
+    await system.start(bank(plain(**({} if change is out else there))))
     alice, pid = at(system, "alice"), bank_pid(system)
     asking: list[asyncio.Future[int]] = []
 
@@ -331,14 +375,14 @@ async def test_the_process_dies_at_a_step_and_the_child_begins_afresh(
         return await alice.ask(Add(tag), timeout=30.0)
 
     def said(move: Move, worker: Any, which: str, **told: Any) -> None:
-        if which == step and not asking:  # Else it is done again, of the next life.
+        if which == step and worker.pid == pid and not asking:  # Else it is done again, of the next life.
             asking.extend(asyncio.ensure_future(ask(tag)) for tag in (1, 2))
             os.kill(pid, signal.SIGKILL)
         say(move, worker, which, **told)
 
     monkeypatch.setattr(Move, "say_now", said)
     assert await alice.ask(Add(0)) == 1
-    with contextlib.suppress(hf.TransactionFailed):
+    with contextlib.suppress(*REFUSED):
         await change(system, alice)
     said_to = await asyncio.gather(*asking, return_exceptions=True)
     assert not [one for one in said_to if isinstance(one, hf.AskTimeout)]
@@ -346,12 +390,12 @@ async def test_the_process_dies_at_a_step_and_the_child_begins_afresh(
     tags = await alice.ask(Tags())
     assert tags in ([], [1], [2], [1, 2])
     monkeypatch.undo()
-    if not isinstance(alice._cell.host.place, GroupPlace):  # Each step is done, or is not.
+    if not is_out(system, alice, way):  # Each step is done, or is not.
         async with asyncio.timeout(20):
-            while [path for path in system._workers.processes() if path.startswith("/app/bank/alice/ftm")]:
+            while [path for path in system._workers.processes() if path.startswith("/app/bank/alice")]:
                 await asyncio.sleep(0.01)
-        await attach(system, alice)
-    await detach(system, alice)
+        await out(system, alice)
+    await home(system, alice)
     assert await alice.ask(Add(3)) == len(tags) + 1
 
 
@@ -384,22 +428,26 @@ async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSy
         load.check(await ref.ask(Tags()))
 
 
-@pytest.mark.parametrize("verb", ["attach", "detach"])
+@pytest.mark.parametrize("verb", ["attach", "detach", "apart", "together"])
 async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tmp_path: Path, verb: str) -> None:
     file = tmp_path / "slow"
     file.touch()
-    mechanism = None if verb == "attach" else PBR()
-    await system.start(bank(plain(recipe=hf.start(Slow, str(file)), mechanism=mechanism)))
+    there: dict[str, Any] = {"detach": {"mechanism": PBR()}, "together": {"isolation": "process"}}.get(verb, {})
+    await system.start(bank(plain(recipe=hf.start(Slow, str(file)), **there)))
     alice = at(system, "alice")
     waiting = [asyncio.ensure_future(alice.ask(message, timeout=30)) for message in (Wait(), Add(0))]
 
     async def change(seconds: float) -> None:
         async with system.transaction(timeout=seconds) as collected:
-            if verb == "attach":
-                collected.attach(alice, PBR())
-            else:
-                collected.detach(alice)
+            match verb:
+                case "attach":
+                    collected.attach(alice, PBR())
+                case "detach":
+                    collected.detach(alice)
+                case _:
+                    collected.isolation(alice, "process" if verb == "apart" else "task")
 
+    await begun(file)
     with pytest.raises(hf.TransactionFailed):
         await change(1.0)
     file.unlink()
@@ -418,15 +466,18 @@ class Unfit(Counter):
             raise RuntimeError("not now")
 
 
-async def test_a_new_life_that_cannot_begin_leaves_the_old_one(system: hf.ActorSystem, tmp_path: Path) -> None:
+@BOTH_WAYS
+async def test_a_new_life_that_cannot_begin_leaves_the_old_one(
+    system: hf.ActorSystem, tmp_path: Path, way: str
+) -> None:
     file = tmp_path / "veto"
     await system.start(bank(plain(recipe=hf.start(Unfit, str(file))), plain("sibling", hf.start(Sibling))))
     alice, sibling = at(system, "alice"), at(system, "sibling")
-    for number, change in enumerate((attach, detach)):
+    for number, change in enumerate(WAYS[way]):
         file.touch()
         load, talking = Load(alice, clients=2), Talking(sibling, 1_000_000 * (number + 1))
         await load.reached(5)
-        with pytest.raises(hf.TransactionFailed, match="not now"):
+        with pytest.raises(REFUSED, match="not now"):
             await change(system, alice)
         await load.reached(5)
         said = await talking.stop()

@@ -25,7 +25,6 @@ TIMES = int(os.environ.get("HOLDFAST_MATRIX", "1"))
 # Each note: the actors it is about, what the refusal says.
 NOTES: dict[str, tuple[set[str], str]] = {
     "¹": (set(KINDS), "its replicas know it|no supervisor looks after it|a life cannot enter or leave"),
-    "²": ({"plain"}, "its supervisor lives in another process"),
 }
 
 
@@ -51,8 +50,8 @@ def refusal(kind: str, note: str) -> str:
 
 def test_the_notes_become_fewer() -> None:
     used = {cell.values[3] for cell in cells()} - {""}
-    assert used == {*NOTES, "³"}  # The last one is no refusal.
-    assert len(NOTES) <= 2
+    assert used == {*NOTES, "²"}  # The last one is no refusal.
+    assert len(NOTES) <= 1
 
 
 @pytest.fixture
@@ -104,8 +103,6 @@ class Walk:
             for place, kind, step, note in (cell.values for cell in cells())
             if (place, kind) == (self.place, self._kind) and not refusal(kind, note)
         ]
-        if self._kind == "plain" and self._is_below:  # Of these, `replicas` says what is true near the root.
-            options = [step for step in options if step not in ("task", "process")]
         step = self._draw.choice(options)
         fault = self._draw.choice(("none", "given up", "killed"))
         self.steps.append(f"{step} ({fault})")
@@ -170,7 +167,6 @@ def faults(monkeypatch: pytest.MonkeyPatch) -> Faults:
 async def test_random_walks_lose_double_and_reorder_nothing(system: hf.ActorSystem, faults: Faults, seed: int) -> None:
     draw = random.Random(seed)
     kind, place = draw.choice(list(KINDS)), draw.choice(["a task", "a process", BELOW, OWN_BELOW])
-    place = BELOW if (kind, place) == ("plain", OWN_BELOW) else place  # It stays where it is there.
     await system.start(tree(place, kind))
     walk = Walk(system, kind, place, draw, faults)
     luggage, stream = Luggage(system, walk.ref), Stream(walk.ref)

@@ -342,6 +342,8 @@ def _born(gate: Gate, to: str, frame: frames.Command) -> None:
     _below(gate, to, frame)
     text(frame, "kind")
     gate.claims(frame.data.get("bindings", {}))
+    if "last" in frame.data:
+        unpack_exit(frame.data["last"])
     life = frame.data.get("life")
     if type(life) is not int or not 0 <= life < MOST_LIVES:
         raise BadFrame(f"a life with the number {life!r}")

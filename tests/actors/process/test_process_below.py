@@ -158,38 +158,38 @@ async def test_who_waits_for_room_is_let_in_by_the_next_life(system: hf.ActorSys
     assert await ref.ask(Total()) == 9
 
 
-async def test_it_moves_to_its_supervisor_and_back_and_stays_there(system: hf.ActorSystem) -> None:
-    await system.start(team(hf.hybrid()))
+@RECORDED
+async def test_it_moves_to_its_supervisor_and_back_and_stays_there(
+    system: hf.ActorSystem, recovery: hf.Method | None
+) -> None:
+    await system.start(team(recovery))
     alice = at(system, "alice")
     assert await alice.ask(Add(1)) == 101
     await system.set_isolation(alice, "task", timeout=60.0)
     assert system.pid_of(alice) == pids(system)[0]
+    assert await alice.ask(Add(0)) == 101
     alice.tell(Fail("oops"))
-    assert await alice.ask(Add(1), timeout=30.0) == 102
+    assert await alice.ask(Add(1), timeout=30.0) == (102 if recovery else 101)
     assert system.pid_of(alice) == pids(system)[0]
     await system.set_isolation(alice, "process", timeout=60.0)
-    for total in (103, 104):
+    assert await alice.ask(Add(0)) == (102 if recovery else 101)
+    for total in (103, 104) if recovery else (102, 101):
         assert await alice.ask(Add(1), timeout=30.0) == total
         assert len(set(pids(system))) == 2
         os.kill(system.pid_of(alice), signal.SIGKILL)
-    assert await alice.ask(Add(1), timeout=30.0) == 105
+    assert await alice.ask(Add(1), timeout=30.0) == (105 if recovery else 101)
+    above, own = pids(system)
+    os.kill(above, signal.SIGKILL)
+    await is_gone(own)
+    assert await alice.ask(Add(1), timeout=30.0) == (106 if recovery else 101)
+    assert len(set(pids(system))) == 2
 
 
-async def test_without_recovery_it_stays_where_its_spec_says(system: hf.ActorSystem) -> None:
-    await system.start(team())
-    alice, bob = at(system, "alice"), at(system, "bob")
-    await system.set_isolation(alice, "process")  # There it is.
-    await system.set_isolation(bob, "task")
-    for ref, isolation in ((alice, "task"), (bob, "process")):
-        before = system.pid_of(ref)
-        with pytest.raises(hf.CannotMove, match="it has no recovery: there, its spec says where it lives"):
-            await system.set_isolation(ref, isolation)  # type: ignore[arg-type]  # one of both
-        assert await ref.ask(Add(0)) > 0
-        assert system.pid_of(ref) == before
-
-
-async def test_it_is_protected_and_lives_there_again_after_that(system: hf.ActorSystem) -> None:
-    await system.start(team(hf.hybrid()))
+@RECORDED
+async def test_it_is_protected_and_lives_there_again_after_that(
+    system: hf.ActorSystem, recovery: hf.Method | None
+) -> None:
+    await system.start(team(recovery))
     alice = at(system, "alice")
     for mechanism in (hf.PBR(), hf.LFR(), None):
         async with system.transaction(timeout=60.0) as change:
@@ -197,7 +197,7 @@ async def test_it_is_protected_and_lives_there_again_after_that(system: hf.Actor
         assert await alice.ask(Add(1), timeout=30.0) > 100
     assert len(set(pids(system))) == 2
     os.kill(system.pid_of(alice), signal.SIGKILL)
-    assert await alice.ask(Total(), timeout=30.0) == 103
+    assert await alice.ask(Total(), timeout=30.0) == (103 if recovery else 100)
     assert len(set(pids(system))) == 2
 
 
@@ -213,3 +213,16 @@ async def test_limits_are_those_of_its_spec(system: hf.ActorSystem) -> None:
     await system.start(team(limits=hf.Limits(niceness=3)))
     above, own = (psutil.Process(pid).nice() for pid in pids(system))
     assert own == min(above + 3, 19)
+
+
+@pytest.mark.parametrize("who", ["alice", "bob"])
+@RECORDED
+async def test_whoever_terminates_it_hears_when_it_has_ended(
+    system: hf.ActorSystem, recovery: hf.Method | None, who: str
+) -> None:
+    await system.start(team(recovery))
+    ref, reason = at(system, who), hf.Shutdown("enough")
+    assert await ref.ask(Add(1)) > 10
+    for _ in range(2):
+        assert await system.terminate(ref, reason, timeout=30.0) == reason
+        assert await ref.ask(Total(), timeout=30.0) in (10, 11, 100, 101)
