@@ -18,10 +18,11 @@ if TYPE_CHECKING:
 class Monitor:
     """One watch of `target` by `watcher`."""
 
-    __slots__ = ("active", "for_good", "life", "target", "watcher")
+    __slots__ = ("active", "for_good", "life", "name", "target", "watcher")
 
-    def __init__(self, watcher: Cell, target: Cell, for_good: bool) -> None:
+    def __init__(self, watcher: Cell, target: Cell, for_good: bool, name: str = "") -> None:
         self.watcher, self.target, self.for_good = watcher, target, for_good
+        self.name = name or target.path  # the address that the watcher knows, also if the target has moved
         self.active = True
         self.life = watcher.life  # a watch ends with the life that set it
 
@@ -46,14 +47,14 @@ class Ties:
     __slots__ = ("links", "monitors", "watching")
 
     def __init__(self) -> None:
-        self.links: dict[Cell, None] = {}
+        self.links: dict[Cell, str] = {}  # and the address that each is known by here, also if it has moved
         self.monitors: list[Monitor] = []
         self.watching: dict[Monitor, None] = {}
 
 
-def monitor(watcher: Cell, target: Cell, *, for_good: bool) -> Monitor:
-    """Start a watch; if nobody lives there, DOWN with NOPROC comes at once."""
-    watch = Monitor(watcher, target, for_good)
+def monitor(watcher: Cell, target: Cell, *, for_good: bool, name: str = "") -> Monitor:
+    """Start a watch; if nobody lives there, DOWN with NOPROC comes at once. `name`: the address that was given."""
+    watch = Monitor(watcher, target, for_good, name)
     if target.is_dead:
         watcher.push(Down(watch, NOPROC, recovering=False))
     else:
@@ -83,15 +84,15 @@ def demonitor(watcher: Cell, target: Cell, *, for_good: bool) -> None:
             return
 
 
-def link(one: Cell, other: Cell) -> None:
-    """Link two lives; at most one link per pair."""
+def link(one: Cell, other: Cell, name: str = "") -> None:
+    """Link two lives; at most one link per pair. `name`: the address of the other that was given."""
     if one is other:
         return
     if other.is_dead:
-        one.push(Exit(other, NOPROC))
+        one.push(Exit(other, NOPROC, name))
         return
-    one.extra().ties.links[other] = None
-    other.extra().ties.links[one] = None
+    one.extra().ties.links[other] = name or other.path
+    other.extra().ties.links[one] = one.path
     other.host.told(other, "link", {"peer": one.path})
 
 
@@ -123,8 +124,9 @@ def announce(cell: Cell, reason: ExitReason, *, recovering: bool) -> None:
     if ties.links and not recovering:
         peers, ties.links = ties.links, {}
         for peer in peers:
-            if peer.more is not None and peer.more.ties.links.pop(cell, 0) is None:
-                peer.push(Exit(cell, reason))
+            name = peer.more.ties.links.pop(cell, "") if peer.more is not None else ""
+            if name:
+                peer.push(Exit(cell, reason, name))
     if ties.monitors:
         stay: list[Monitor] = []
         for watch in ties.monitors:
@@ -169,10 +171,11 @@ def down_arrived(watcher: Cell, target: Cell, reason: ExitReason, *, recovering:
 class Exit(Item):
     """An EXIT signal over a link, in its place after earlier messages."""
 
-    __slots__ = ("active", "reason", "source")
+    __slots__ = ("active", "name", "reason", "source")
 
-    def __init__(self, source: Cell, reason: ExitReason) -> None:
+    def __init__(self, source: Cell, reason: ExitReason, name: str = "") -> None:
         self.source, self.reason = source, reason
+        self.name = name or source.path  # the address that it is known by where this goes
         self.active = True
 
     @staticmethod

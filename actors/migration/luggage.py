@@ -111,7 +111,7 @@ class StatePacker:
         if isinstance(value, ActorRef):
             return Held("ref", value.path)
         if isinstance(value, Monitor):
-            return Held("watch", [value.target.path, value.for_good])
+            return Held("watch", [value.name, value.for_good])
         return value
 
 
@@ -127,14 +127,14 @@ def pack_rest(actor: Actor) -> dict[str, Any]:
     for timer in more.belongings.timers:
         message, left, interval, queued = timer.packed()
         timers.append([message_name(type(message)), codec.encode(message, cell.path), left, interval, queued])
-    watches = [[watch.target.path, watch.for_good] for watch in more.ties.watching if watch.life == cell.life]
+    watches = [[watch.name, watch.for_good] for watch in more.ties.watching if watch.life == cell.life]
     downs = [item.watch for item in cell.queue or () if type(item) is Down and item.watch.active]
-    watches += [[watch.target.path, watch.for_good] for watch in downs if watch not in more.ties.watching]
+    watches += [[watch.name, watch.for_good] for watch in downs if watch not in more.ties.watching]
     return {
         "timers": timers,
         "trap_exits": more.trap_exits,
         "suspended": bool(more.suspended & mailbox.BY_USER),
-        "links": [peer.path for peer in more.ties.links],
+        "links": list(more.ties.links.values()),
         "watches": watches,
     }
 

@@ -221,9 +221,9 @@ def settle(twin: Cell, cell: Cell) -> None:
     for name in had.names:
         node.names[name] = cell
         has.names.append(name)
-    for peer in tied.links:
+    for peer, name in tied.links.items():
         peer.extra().ties.links.pop(twin, None)
-        peer.extra().ties.links[cell] = ties.links[peer] = None
+        peer.extra().ties.links[cell], ties.links[peer] = cell.path, name
     for watch in tied.watching:
         watch.watcher, watch.life = cell, cell.life
         ties.watching[watch] = None

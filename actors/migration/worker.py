@@ -231,7 +231,7 @@ class FromWorker(FromOwnWorker):
 
     def _watched(self, path: str, for_good: bool) -> Monitor:
         watching: dict[Monitor, None] = self.cell.extra().ties.watching
-        return next(watch for watch in watching if watch.target.path == path and watch.for_good is for_good)
+        return next(watch for watch in watching if watch.name == path and watch.for_good is for_good)
 
     def died(self, cell: Cell, reason: ExitReason) -> None:
         outlet: Outlet = cell.extra().outlet

@@ -155,7 +155,7 @@ class GuestMove:
         watches = [self._watch(cell, path, for_good) for path, for_good in rest["watches"]]
         for path in rest["links"]:
             peer = self._guest.node.cell_at(path)
-            cell.extra().ties.links[peer] = peer.extra().ties.links[cell] = None
+            cell.extra().ties.links[peer], peer.extra().ties.links[cell] = path, cell.path
         numbers = dict(luggage["owed"])  # Those of the root, for what was packed by other ones.
         unpack(
             actor,
@@ -274,4 +274,4 @@ def _number(ask: Ask) -> int:
 
 
 def _found(watches: list[Monitor], path: str, for_good: bool) -> Monitor:
-    return next(watch for watch in watches if watch.target.path == path and watch.for_good is for_good)
+    return next(watch for watch in watches if watch.name == path and watch.for_good is for_good)

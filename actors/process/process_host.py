@@ -554,7 +554,8 @@ def on_frame(node: Node, worker: Worker, frame: frames.AnyFrame) -> None:
 
 def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
     """What an actor process wants done to an address, or tells of its own."""
-    cell = node.cell_at(worker.connection.names.from_wire(frame.to))
+    path = worker.connection.names.from_wire(frame.to)
+    cell = node.cell_at(path)
     match frame.verb:
         case "subscribe":
             node.topics.subscribe(frame.data["topic"], cell)
@@ -572,7 +573,7 @@ def _command(node: Node, worker: Worker, frame: frames.Command) -> None:
         case "readdressed":
             pass  # Its gate has heard it.
         case _:
-            obey(node, cell, frame)
+            obey(node, cell, path, frame)
 
 
 def keep(worker: Worker, frame: frames.Command) -> None:

@@ -452,9 +452,9 @@ class ToSubtree(IntoSubtree):
             "owed": pack_owed(worker, luggage.owed),
             "timers": luggage.timers,
             "is_suspended": luggage.suspended,
-            "links": [peer.path for peer in more.ties.links],
+            "links": list(more.ties.links.values()),
             "monitors": [[watch.watcher.path, watch.for_good] for watch in more.ties.monitors],
-            "watches": [[watch.target.path, watch.for_good] for watch in more.ties.watching],
+            "watches": [[watch.name, watch.for_good] for watch in more.ties.watching],
             "topics": list(more.belongings.topics),
         }
         move.say_now(worker, "settle", **told)

@@ -287,7 +287,7 @@ class PlainChild:
 
 def _taken_from(watches: list[Monitor], path: str, for_good: bool) -> Monitor | None:
     """Such a watch, out of the list; None if there is none."""
-    found = next((one for one in watches if one.target.path == path and one.for_good is for_good), None)
+    found = next((one for one in watches if one.name == path and one.for_good is for_good), None)
     if found is not None:
         watches.remove(found)
     return found

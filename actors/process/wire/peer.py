@@ -462,11 +462,11 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
     """Carry an EXIT or DOWN over; other items of the runtime never cross a border."""
     connection = peer.connection
     if isinstance(item, links.Exit):
-        data: dict[str, Any] = {"source": item.source.path, "reason": pack_exit(item.reason)}
+        data: dict[str, Any] = {"source": item.name, "reason": pack_exit(item.reason)}
         connection.send(frames.Command(connection.names.to_wire(path), "exit", data))
     elif isinstance(item, links.Down):
         data = {
-            "source": item.watch.target.path,
+            "source": item.watch.name,
             "reason": pack_exit(item.reason),
             "recovering": item.recovering,
             "for_good": item.watch.for_good,
@@ -476,8 +476,10 @@ def send_signal(peer: Peer, path: str, item: Item) -> None:
         raise HoldfastError(f"{type(item).__name__} cannot be sent to {path}")
 
 
-def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
+def obey(node: Node, cell: Cell, name: str, frame: frames.Command) -> None:
     """Do what the other side wants of an actor on this one: stop and kill, and all about links and monitors.
+
+    `name` is the address that it has given; the actor may have moved since.
 
     Raises:
         BadFrame, DecodeError: it is no such command.
@@ -490,18 +492,19 @@ def obey(node: Node, cell: Cell, frame: frames.Command) -> None:
             cell.kill()
         case "exit":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
+            known = cell.more.ties.links.get(source) if cell.more is not None else None
             if links.sever(cell, source):  # Else it was unlinked while this was on its way.
-                cell.push(links.Exit(source, reason))
+                cell.push(links.Exit(source, reason, known or ""))
         case "down":
             source, reason = named(node, frame, "source"), unpack_exit(data.get("reason"))
             recovering, for_good = bool(data.get("recovering")), bool(data.get("for_good"))
             links.down_arrived(cell, source, reason, recovering=recovering, for_good=for_good)
         case "monitor":
-            links.monitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
+            links.monitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")), name=name)
         case "demonitor":
             links.demonitor(named(node, frame, "watcher"), cell, for_good=bool(data.get("for_good")))
         case "link":
-            links.link(named(node, frame, "peer"), cell)
+            links.link(named(node, frame, "peer"), cell, name)
         case "unlink":
             links.sever(named(node, frame, "peer"), cell)
         case verb:

@@ -1,0 +1,95 @@
+"""Who is linked with an actor that is moved to another supervisor, or watches it, hears of its end: once."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any
+
+import pytest
+
+import holdfast as hf
+
+IN_TIME = 30.0
+
+
+class Tie(hf.Message[bool]):
+    verb: str
+    path: str
+
+
+class Heard(hf.Message[list[str]]): ...
+
+
+class Party(hf.Actor):
+    """Is tied to others, and notes what it hears."""
+
+    def __init__(self) -> None:
+        self.heard: list[str] = []
+
+    def on_start(self, restored: bool) -> None:
+        self.ctx.trap_exits = True
+
+    @hf.on(Tie)
+    def tie(self, message: Tie) -> bool:
+        getattr(self.ctx, message.verb)(self.ctx.find(message.path, Party))
+        return True
+
+    @hf.on(Heard, readonly=True)
+    def told(self, message: Heard) -> list[str]:
+        return self.heard
+
+    def on_down(self, source: hf.ActorRef[Any], reason: hf.ExitReason, recovering: bool) -> None:
+        if not recovering:
+            self.heard.append("down")
+
+    def on_exit(self, source: hf.ActorRef[Any], reason: hf.ExitReason) -> None:
+        self.heard.append("exit")
+
+
+PLACES: dict[str, dict[str, Any]] = {
+    "task": {},
+    "process": {"isolation": "process"},
+    "recorded": {"recovery": hf.hybrid()},
+    "recorded process": {"recovery": hf.hybrid(), "isolation": "process"},
+}
+
+
+@pytest.mark.parametrize("verb", ["monitor", "watch", "link"])
+@pytest.mark.parametrize("when", ["before", "after", "its own move", "the move of both"])
+@pytest.mark.parametrize("target", list(PLACES))
+@pytest.mark.parametrize("watcher", list(PLACES))
+async def test_it_hears_of_the_end_once(watcher: str, target: str, when: str, verb: str) -> None:
+    """`when`: the tie is made before the move, or behind it by the address that the target had.
+
+    If both are moved, each goes into a process, or out of its own, behind that.
+    """
+    children = [
+        hf.child("watcher", hf.start(Party), **PLACES[watcher]),
+        hf.child("target", hf.start(Party), **PLACES[target]),
+    ]
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.supervisor("here", children=children, intensity=100))
+        await system.start(hf.supervisor("there"))
+        one, other = system.ref("/app/here/watcher", Party), system.ref("/app/here/target", Party)
+        path = other.path
+        if when != "after":
+            assert await one.ask(Tie(verb, path), IN_TIME)
+        async with system.transaction(timeout=IN_TIME) as change:
+            if when != "its own move":
+                change.move(other, "/app/there")
+            if when in ("its own move", "the move of both"):
+                change.move(one, "/app/there")
+        if when == "after":
+            assert await one.ask(Tie(verb, path), IN_TIME)
+        if when == "the move of both":
+            for ref, place in ((one, watcher), (other, target)):
+                await system.set_isolation(ref, "task" if "process" in place else "process", timeout=IN_TIME)
+        assert await other.ask(Heard(), IN_TIME) == []
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove(other)
+        wanted = ["exit" if verb == "link" else "down"]
+        async with asyncio.timeout(IN_TIME):
+            while await one.ask(Heard(), IN_TIME) != wanted:
+                await asyncio.sleep(0.005)
+        for _ in range(3):
+            assert await one.ask(Heard(), IN_TIME) == wanted
