@@ -331,16 +331,28 @@ class Node(RunLoop):
         more = cell.extra()
         soon = more.turn.rebinds if more.turn is not None else None
         before = (soon or {}).get(port) or more.bindings.get(port)
-        if before is not None and before.path != target.path and cell.host.recovers(KILLED):
-            led = self.led.setdefault(cell.path, {})
-            same = {before.path, target.path, *led.get(before.path, ()), *led.get(target.path, ())}
-            led.update(dict.fromkeys(same, same))
+        if before is not None:
+            self._alike(cell, before.path, target.path)
         more.claimed = more.claimed | {port} if is_claimed else more.claimed - {port}
         if more.turn is None:
             more.bindings[port] = target
         else:  # One turn sees one target, also if it waits meanwhile.
             more.turn.rebinds = {**(more.turn.rebinds or {}), port: target}
         cell.host.told(cell, "bind", {"port": port, "target": target.path, "is_claimed": is_claimed})
+
+    def tell_binding(self, cell: Cell, port: str, was: str) -> None:
+        """Tell whoever lives the life at a cell that the target of a binding has left the address `was`."""
+        more = cell.extra()
+        target = more.bindings[port]
+        self._alike(cell, was, target.path)
+        cell.host.told(cell, "bind", {"port": port, "target": target.path, "is_claimed": port in more.claimed})
+
+    def _alike(self, cell: Cell, was: str, now: str) -> None:
+        """What was sent through a binding to one address may be sent again to the other, if turns are replayed."""
+        if was != now and cell.host.recovers(KILLED):
+            led = self.led.setdefault(cell.path, {})
+            same = {was, now, *led.get(was, ()), *led.get(now, ())}
+            led.update(dict.fromkeys(same, same))
 
 
 def _void() -> None:

@@ -15,6 +15,7 @@ from ...actors.kernel.actor import Start
 from ...actors.kernel.cell import GONE, RUNNING, Cell
 from ...actors.kernel.ref import ActorRef
 from ...actors.process.process_host import WorkerPlace
+from ...checkpoint.addresses import renamed
 from ...supervision.admin import ChangeSupervisor
 from ...supervision.children import Child, new_cell
 from ...supervision.spec import ChildSpec, Flags
@@ -128,6 +129,8 @@ class Arrangement:
             for cell in every_cell(taken[child].cell):
                 if isinstance(cell.host.place, WorkerPlace):
                     cell.host.place.readdress(cell)
+        if moved:
+            tell_bindings(system.node.root, {new: old for old, new in now.items()})
 
     async def finish(self, system: ActorSystem) -> None:
         """Tell those that live in other processes."""
@@ -172,6 +175,15 @@ def settle_bindings(root: Cell | None) -> None:
                 lives = cell.node.successor(target) if target.state is GONE else None
                 if bindings is not None and lives is not None:
                     bindings[port] = lives
+
+
+def tell_bindings(root: Cell | None, was: dict[str, str]) -> None:
+    """Have processes bind their actors to those that have moved by the addresses that these have now."""
+    for cell in every_cell(root):
+        for port, target in (cell.more.bindings if cell.more is not None else {}).items():
+            old = renamed(was, target.path)
+            if old != target.path:
+                cell.node.tell_binding(cell, port, old)
 
 
 def planned_spec(place: Place, *, in_force: bool) -> ChildSpec:

@@ -169,7 +169,10 @@ WAITING = "recorded actors may have to repeat what they sent to it: their snapsh
 
 def is_unsettled(switch: Switch) -> bool:
     """Whether what it has sent may be sent again, to be compared."""
-    return switch.ledger.has_sent
+    ledger, method = switch.ledger, switch.method
+    if not (method.replays or method.snapshots):  # Protected, without recovery: only the turn in hand is made again.
+        return bool(ledger.released)
+    return ledger.has_sent
 
 
 def is_saved(switch: Switch) -> bool:

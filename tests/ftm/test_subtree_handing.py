@@ -432,8 +432,8 @@ async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSy
 async def test_a_turn_that_does_not_end_rolls_it_back(system: hf.ActorSystem, tmp_path: Path, verb: str) -> None:
     file = tmp_path / "slow"
     file.touch()
-    there: dict[str, Any] = {"detach": {"mechanism": PBR()}, "together": {"isolation": "process"}}.get(verb, {})
-    await system.start(bank(plain(recipe=hf.start(Slow, str(file)), **there)))
+    places: dict[str, dict[str, Any]] = {"detach": {"mechanism": PBR()}, "together": {"isolation": "process"}}
+    await system.start(bank(plain(recipe=hf.start(Slow, str(file)), **places.get(verb, {}))))
     alice = at(system, "alice")
     waiting = [asyncio.ensure_future(alice.ask(message, timeout=30)) for message in (Wait(), Add(0))]
 

@@ -93,3 +93,48 @@ async def test_it_hears_of_the_end_once(watcher: str, target: str, when: str, ve
                 await asyncio.sleep(0.005)
         for _ in range(3):
             assert await one.ask(Heard(), IN_TIME) == wanted
+
+
+class Who(hf.Message[str]): ...
+
+
+class AskBound(hf.Message[str]): ...
+
+
+class Named(hf.Actor):
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+    @hf.on(Who, readonly=True)
+    def who(self, message: Who) -> str:
+        return self.name
+
+
+class Client(hf.Actor):
+    other: hf.Binding[Named]
+
+    @hf.on(AskBound)
+    async def ask_it(self, message: AskBound) -> str:
+        return await self.other.ask(Who(), IN_TIME)
+
+
+@pytest.mark.parametrize("place", [*PLACES, "below", "replicas", "recorded replicas"])
+async def test_who_is_bound_to_it_reaches_it_also_when_somebody_else_has_its_address(place: str) -> None:
+    options: dict[str, Any] = PLACES.get(place, {})
+    if "replicas" in place:
+        options = {"mechanism": hf.PBR(), "recovery": hf.hybrid() if "recorded" in place else None}
+    client = hf.child("client", hf.start(Client), bindings={"other": "/app/here/named"}, **options)
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.supervisor("here", children=[hf.child("named", hf.start(Named, "first"))]))
+        await system.start(hf.supervisor("there"))
+        isolation: Any = "process" if place == "below" else "task"
+        await system.start(hf.supervisor("team", children=[client], intensity=100, isolation=isolation))
+        ref = system.ref("/app/team/client", Client)
+        assert await ref.ask(AskBound(), IN_TIME) == "first"
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move("/app/here/named", "/app/there")
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.add("/app/here", hf.child("named", hf.start(Named, "second")))
+        assert await ref.ask(AskBound(), IN_TIME) == "first"
+        ref._cell.kill()
+        assert await ref.ask(AskBound(), IN_TIME) == "first"
