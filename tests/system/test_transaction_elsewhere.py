@@ -150,12 +150,12 @@ async def test_a_recorded_sender_recovers_although_its_receiver_has_moved(system
     assert hf.Recovered in kinds
 
 
-async def test_processes_reach_a_moved_actor_by_the_address_they_know(system: hf.ActorSystem) -> None:
+async def test_a_process_is_told_where_the_actor_lives_now_that_it_is_bound_to(system: hf.ActorSystem) -> None:
     client = hf.child("client", hf.start(Client), isolation="process", bindings={"peer": "/app/near/plain"})
     await ref(system, "/app/other").ask(hf.StartChild(client))
     async with system.transaction() as change:
         change.move("/app/near/plain", "/app/other")
-    assert await ref(system, "/app/other/client").ask(Where()) == "/app/near/plain"
+    assert await ref(system, "/app/other/client").ask(Where()) == "/app/other/plain"
     ref(system, "/app/other/client").kill()
     assert await ref(system, "/app/other/client").ask(Life(), 30.0) == 2
 
