@@ -32,7 +32,7 @@ class FrameBuffer:
         left = self.end - self.begin
         need = left + 1
         if left >= LENGTH.size:
-            need = LENGTH.unpack_from(self.data, self.begin)[0] + LENGTH.size
+            need = max(need, LENGTH.unpack_from(self.data, self.begin)[0] + LENGTH.size)
         size = len(self.data)
         while size < need:
             size *= 2
