@@ -8,7 +8,7 @@ from typing import Any
 
 from hypothesis import settings
 from hypothesis import strategies as st
-from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from holdfast.actors.errors import ProcessUnavailable
 from holdfast.actors.process.fork.forked_process import ForkLedger, ForkRequest
@@ -52,17 +52,18 @@ class Forks(RuleBasedStateMachine):
         ]
         return found[draw % len(found)] if found else None
 
-    @precondition(lambda self: len(self.asked) < 6)
-    @rule()
-    def ask(self) -> None:
-        self.asked.append(Asked(self.ledger.begin(self.loop.create_future())))
+    @rule(count=st.integers(1, 3))
+    def ask(self, count: int) -> None:
+        for _ in range(count if sum(not one.has_resumed for one in self.asked) < 6 else 0):
+            self.asked.append(Asked(self.ledger.begin(self.loop.create_future())))
 
-    @rule(draw=st.integers(0, 9), fds=st.integers(0, 1), resumed=st.booleans())
+    @rule(draw=st.integers(0, 9), fds=st.sampled_from([1, 1, 1, 0]), resumed=st.sampled_from([False, False, True]))
     def answer(self, draw: int, fds: int, resumed: bool) -> None:
         one = self.some(draw, answered=False, resumed=resumed)
         if one is None:
             return
         one.is_answered, self.next_pid = True, self.next_pid + 1
+        one.request._close_child_fds()  # The server has them.
         pidfds = [os.dup(self.pidfd) for _ in range(fds)]
         is_wanted = not one.request.outcome.done()
         self.ledger.forked(one.request.number, self.next_pid, pidfds)
@@ -118,8 +119,10 @@ class Forks(RuleBasedStateMachine):
         child.close()
         self.strays.append(one.pidfd)
 
-    @rule()
-    def fail(self) -> None:
+    @rule(really=st.integers(0, 5))
+    def fail(self, really: int) -> None:
+        if really:
+            return
         self.ledger.fail("the server has ended")
         for one in self.asked:
             if not one.is_answered:
@@ -145,5 +148,5 @@ class Forks(RuleBasedStateMachine):
         self.loop.close()
 
 
-Forks.TestCase.settings = settings(max_examples=30, stateful_step_count=25, deadline=None)
+Forks.TestCase.settings = settings(max_examples=150, stateful_step_count=40, deadline=None)
 TestForks = Forks.TestCase
