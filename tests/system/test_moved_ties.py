@@ -95,6 +95,33 @@ async def test_it_hears_of_the_end_once(watcher: str, target: str, when: str, ve
             assert await one.ask(Heard(), IN_TIME) == wanted
 
 
+@pytest.mark.parametrize("verb", ["monitor", "watch", "link"])
+@pytest.mark.parametrize("target", list(PLACES))
+@pytest.mark.parametrize("recovery", [None, hf.hybrid()], ids=["plain", "recorded"])
+async def test_who_lives_with_its_supervisor_hears_of_the_end_once(
+    recovery: hf.Method | None, target: str, verb: str
+) -> None:
+    """It goes into a process of its own, and back, behind the move of the target."""
+    team = [hf.child("watcher", hf.start(Party), recovery=recovery)]
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.start(hf.supervisor("here", children=[hf.child("target", hf.start(Party), **PLACES[target])]))
+        await system.start(hf.supervisor("there"))
+        await system.start(hf.supervisor("team", children=team, isolation="process", intensity=100))
+        one, other = system.ref("/app/team/watcher", Party), system.ref("/app/here/target", Party)
+        assert await one.ask(Tie(verb, other.path), IN_TIME)
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.move(other, "/app/there")
+        for isolation in ("process", "task"):
+            await system.set_isolation(one, isolation, timeout=IN_TIME)  # type: ignore[arg-type]  # one of both
+        async with system.transaction(timeout=IN_TIME) as change:
+            change.remove(other)
+        wanted = ["exit" if verb == "link" else "down"]
+        async with asyncio.timeout(IN_TIME):
+            while await one.ask(Heard(), IN_TIME) != wanted:
+                await asyncio.sleep(0.005)
+        assert await one.ask(Heard(), IN_TIME) == wanted
+
+
 class Who(hf.Message[str]): ...
 
 
