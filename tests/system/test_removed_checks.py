@@ -11,6 +11,7 @@ from tests.removing import Check, as_tests
 COMMIT = "tests/system/test_transaction_commit.py"
 KEPT = "tests/system/test_specification.py"
 MOVED = "tests/system/test_readdressed.py"
+TIES = "tests/system/test_moved_ties.py"
 
 CHECKS = {
     "the states are in the store together": Check(
@@ -159,6 +160,34 @@ CHECKS = {
         "            pass\n",
         COMMIT,
         "test_who_was_stopped_by_a_message_and_came_back",
+    ),
+    "a signal names its source as the watcher knows it": Check(
+        "actors/process/wire/peer.py",
+        '            "source": item.watch.name,\n',
+        '            "source": item.watch.target.path,\n',
+        TIES,
+        "test_it_hears_of_the_end_once and monitor and before",
+    ),
+    "a link names the actor as the other side knows it": Check(
+        "actors/process/wire/peer.py",
+        '{"source": item.name, "reason"',
+        '{"source": item.source.path, "reason"',
+        TIES,
+        "test_it_hears_of_the_end_once and link and before",
+    ),
+    "processes are told where those are that they are bound to": Check(
+        "system/transaction/arrangement.py",
+        "            tell_bindings(system.node.root, {new: old for old, new in now.items()})\n",
+        "            pass\n",
+        TIES,
+        "test_who_is_bound_to_it",
+    ),
+    "nobody waits for a snapshot of who takes none": Check(
+        "system/transaction/reparenting.py",
+        "    if not (method.replays or method.snapshots):",
+        "    if False:",
+        TIES,
+        "test_who_is_bound_to_it and replicas",
     ),
     "two looks at threads are alike": Check(
         "testing/threads.py",
