@@ -38,7 +38,8 @@ def what_waits() -> str:
             lines.append(f"task {task.get_name()}:")
             coroutine = task.get_coro()
             lines.extend(stack_of(coroutine) if asyncio.iscoroutine(coroutine) else ())
-    roots = [one.root for one in found if isinstance(one, Node) and one.root is not None]
+    nodes = [one for one in found if isinstance(one, Node) and not one.loop.is_closed()]
+    roots = [node.root for node in nodes if node.root is not None and not node.root.is_dead]
     lines.extend(blocked_below(root) or f"no turn waits below {root.path}" for root in roots)
     return "\n".join(lines)
 

@@ -28,6 +28,12 @@ async def system():
         ref.tell(Wait())
         yield system
 
+ENDED = []
+
+async def test_another_one_before():
+    async with hf.ActorSystem("ended", log=False) as system:
+        ENDED.append(system)
+
 async def hang_in_task():
     await asyncio.Event().wait()
 
@@ -67,6 +73,7 @@ def test_what_hangs_is_told_and_ended(how: str, tmp_path: Path) -> None:
     assert f"test_hangs.py::test_it: {what} hangs" in run.stderr
     assert "/app/waits (running) has been in the turn of Wait" in run.stderr
     assert "in Waits.wait_in_turn" in run.stderr
+    assert "/ended" not in run.stderr
     assert ("task forgotten:" in run.stderr) is (how == "the test")
     assert "in hang_in_task" in run.stderr or how != "the test"
     assert f"Timeout (0:00:{seconds:02d})!" in run.stderr
