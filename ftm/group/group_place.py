@@ -226,7 +226,9 @@ class GroupPlace(Place):
         usual, method = Detection(), self.home.method.data()
         interval, watch_turns = usual.interval, usual.watch_turns or 0.0
         setting = Setting(cell.path, name, config, method, bindings, interval, watch_turns, more.claimed)
-        return self.replica(setting, self.parent.recipe(cell), tuple(layer.describe() for layer in layers))
+        return self.replica(
+            setting, self.parent.recipe(cell), tuple(layer.for_replicas().describe() for layer in layers)
+        )
 
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
