@@ -27,7 +27,7 @@ import sys
 import threading
 from collections.abc import Awaitable, Callable, Generator
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import Context, ContextVar
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple
@@ -39,8 +39,14 @@ import holdfast as hf
 PACKAGE = f"{Path(hf.__file__).parent}{os.sep}"
 BESIDE = tuple(PACKAGE + name + os.sep for name in ("tests", "benchmarks", "examples", ".venv"))
 WARM_UPS, RUNS = 3, 5
-IN_WALK: ContextVar[bool] = ContextVar("IN_WALK", default=False)
+IN_WALK: ContextVar[None] = ContextVar("IN_WALK")
 RUNS_HANDLE = asyncio.Handle._run.__code__
+
+
+def context_of(handle: Any) -> Context:
+    """What a handle is run in: that of whoever has made it, which asyncio keeps to itself."""
+    context: Context = handle._context
+    return context
 
 
 def is_of_walk(frame: FrameType) -> bool:
@@ -52,7 +58,7 @@ def is_of_walk(frame: FrameType) -> bool:
             return False
         if code is RUNS_HANDLE:
             handle = above.f_locals["self"]
-            return not isinstance(handle, asyncio.TimerHandle) or handle._context.get(IN_WALK, False)
+            return not isinstance(handle, asyncio.TimerHandle) or IN_WALK in context_of(handle)
         above = above.f_back
     return True
 
@@ -72,7 +78,7 @@ def traced() -> Generator[list[str]]:
     names: list[str] = []
     gc.collect()
     gc.disable()
-    token = IN_WALK.set(True)
+    token = IN_WALK.set(None)
     threading.setprofile(enter)
     sys.setprofile(enter)
     try:

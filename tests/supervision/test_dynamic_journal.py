@@ -13,6 +13,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.players import Doer, Note, Seen, until
+from tests.checkpoint.strikes import event
 from tests.checkpoint.trees import running
 
 
@@ -207,10 +208,8 @@ async def test_what_the_store_refuses_to_forget_is_an_error_and_can_be_forgotten
             with pytest.raises(hf.HoldfastError, match="the disk is gone"):
                 await top.ask(hf.StartChild(args=("Bob",), id="bob", fresh=True))
             await top.ask(hf.TerminateChild(made_up.path.rpartition("/")[2]))  # It is over, whatever the store says.
-            async for event in events:
-                if isinstance(event, hf.StoreRefused):
-                    break
-        assert (event.address, event.reason) == (made_up.path, "the disk is gone")
+            refused: hf.StoreRefused = await event(events, hf.StoreRefused)
+        assert (refused.address, refused.reason) == (made_up.path, "the disk is gone")
         assert set(system.homes.known("/app/school")) == {bob.path, made_up.path}
         await top.ask(hf.DeleteChild("bob"))
         await restarted(system)
