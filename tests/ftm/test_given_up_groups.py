@@ -49,7 +49,7 @@ async def test_the_end_of_a_system_waits_for_the_end_of_a_group(where: str, monk
 
     monkeypatch.setattr(GroupPlace, "lead", leads)
     monkeypatch.setattr(GroupPlace, "dismantle", slow)
-    kind = dict(zip(WHERE, (Hesitant, Failing, Counter), strict=True))[where]
+    kind = (Hesitant, Failing, Counter)[WHERE.index(where)]
     async with hf.ActorSystem("app", log=False) as system:
         spec = hf.child("c", hf.start(kind), mechanism=PBR())
         top = hf.supervisor("top", children=[spec], isolation="process", shutdown="brutal_kill")
