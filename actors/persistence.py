@@ -15,8 +15,11 @@ class Keeper(Protocol):
         """Whether anything was ever recorded at this address, and not erased since."""
         ...
 
-    def erase(self, path: str, *, below: bool) -> None:
+    def erase(self, path: str, *, below: bool) -> asyncio.Future[None] | None:
         """Forget what was recorded at an address where nobody lives; with `below`, also at all addresses below it.
+
+        Returns:
+            None: it is done. A future: it is asked of the root, and ends with what that answers.
 
         Raises:
             HoldfastError: the store refused. What is left is erased when it is opened again.

@@ -1,19 +1,25 @@
 """Through how many files does a call go?
 
-Traces one operation in the program's own process and prints, as one JSON line each, the files of the library that it
-enters, in order of their first call. Fewer files are fewer places to read for whoever follows a message.
+Traces one operation in the program's own process and prints, as one JSON line each, how many files of the library it
+enters. Fewer files are fewer places to read for whoever follows a message.
+
+Each operation is done several times before it is traced, so that nothing is imported or set up for the first time, and
+then traced several times, without garbage collection. What is entered each time counts: what belongs to a timer that
+was set before, or comes now and then (a process that is replaced in the reserve), is not part of it. Threads that run
+already are not traced, nor are other processes.
 
     walk                  what was done
-    files                 how many files of the library were entered
-    names                 which, in order
+    files                 how many files of the library were entered each time
+    now_and_then          how many more were entered at least once
 
-Command: python benchmarks/walks.py [--only TEXT]
+Command: python benchmarks/walks.py [-v] [--only TEXT]      -v prints which files, in order of their first call
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import gc
 import json
 import os
 import signal
@@ -21,16 +27,40 @@ import sys
 import threading
 from collections.abc import Awaitable, Callable, Generator
 from contextlib import contextmanager
+from contextvars import Context, ContextVar
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NamedTuple
 
-from workload import Counter, Ping, Responder, Tick
+from workload import Ping, Responder, Tick
 
 import holdfast as hf
 
 PACKAGE = f"{Path(hf.__file__).parent}{os.sep}"
 BESIDE = tuple(PACKAGE + name + os.sep for name in ("tests", "benchmarks", "examples", ".venv"))
+WARM_UPS, RUNS = 3, 5
+IN_WALK: ContextVar[None] = ContextVar("IN_WALK")
+RUNS_HANDLE = asyncio.Handle._run.__code__
+
+
+def context_of(handle: Any) -> Context:
+    """What a handle is run in: that of whoever has made it, which asyncio keeps to itself."""
+    context: Context = handle._context
+    return context
+
+
+def is_of_walk(frame: FrameType) -> bool:
+    """Whether a call is no part of an import, nor of a timer that was set before the walk began."""
+    above: FrameType | None = frame
+    while above is not None:
+        code = above.f_code
+        if code.co_filename.startswith("<frozen importlib"):
+            return False
+        if code is RUNS_HANDLE:
+            handle = above.f_locals["self"]
+            return not isinstance(handle, asyncio.TimerHandle) or IN_WALK in context_of(handle)
+        above = above.f_back
+    return True
 
 
 @contextmanager
@@ -41,9 +71,14 @@ def traced() -> Generator[list[str]]:
     def enter(frame: FrameType, event: str, _: Any) -> None:
         name = frame.f_code.co_filename
         if event == "call" and name.startswith(PACKAGE) and not name.startswith(BESIDE):
-            entered.setdefault(name.removeprefix(PACKAGE))
+            name = name.removeprefix(PACKAGE)
+            if name not in entered and is_of_walk(frame):
+                entered[name] = None
 
     names: list[str] = []
+    gc.collect()
+    gc.disable()
+    token = IN_WALK.set(None)
     threading.setprofile(enter)
     sys.setprofile(enter)
     try:
@@ -51,7 +86,21 @@ def traced() -> Generator[list[str]]:
     finally:
         sys.setprofile(None)
         threading.setprofile(None)  # None takes it back, as the documentation says.
+        IN_WALK.reset(token)
+        gc.enable()
         names += entered
+
+
+class Hearer(hf.Actor):
+    """Says that it has heard."""
+
+    def __init__(self, heard: Callable[[], None]) -> None:
+        self._heard = heard
+
+    @hf.on(Tick)
+    def hear(self, message: Tick) -> None:
+        """Say so."""
+        self._heard()
 
 
 class Fill(hf.Message[int]):
@@ -71,59 +120,78 @@ class Recorded(hf.Actor):
         return self.count
 
 
-async def local_tell(system: hf.ActorSystem) -> list[str]:
+Step = Callable[[], Awaitable[object]]
+
+
+async def nothing() -> None:
+    """There is nothing to be undone before the operation can be done again."""
+
+
+class Walk(NamedTuple):
+    """An operation, and what has to be done before it can be done again."""
+
+    go: Step
+    back: Step = nothing
+
+
+async def local_tell(system: hf.ActorSystem) -> Walk:
     """A tell to an actor of this loop, until it is handled."""
-    done = asyncio.get_running_loop().create_future()
-    ref = system.spawn(hf.start(Counter, lambda: done.set_result(None), 2))
-    ref.tell(Tick())
-    await asyncio.sleep(0)
-    with traced() as names:
+    done: list[asyncio.Future[None]] = []
+    ref = system.spawn(hf.start(Hearer, lambda: done[-1].set_result(None)))
+
+    async def tell() -> None:
+        done.append(asyncio.get_running_loop().create_future())
         ref.tell(Tick())
-        await done
-    return names
+        await done[-1]
+
+    return Walk(tell)
 
 
-async def ask_to_a_process(system: hf.ActorSystem) -> list[str]:
+async def ask_to_a_process(system: hf.ActorSystem) -> Walk:
     """An ask to an actor in a process, until its reply is here."""
     ref = await system.start(hf.child("far", hf.start(Responder), isolation="process"))
-    await ref.ask(Ping())
-    with traced() as names:
-        await ref.ask(Ping())
-    return names
+    return Walk(lambda: ref.ask(Ping()))
 
 
-async def recorded_message(system: hf.ActorSystem) -> list[str]:
+async def recorded_message(system: hf.ActorSystem) -> Walk:
     """An ask to a recorded actor, from its admission to its reply."""
     ref = await system.start(hf.child("kept", hf.start(Recorded), recovery=hf.hybrid()))
-    await ref.ask(Fill())
-    with traced() as names:
-        await ref.ask(Fill())
-    return names
+    return Walk(lambda: ref.ask(Fill()))
 
 
-async def kill_to_released(system: hf.ActorSystem) -> list[str]:
+async def kill_to_released(system: hf.ActorSystem) -> Walk:
     """SIGKILL to the process of a recorded actor, until it has answered again."""
     ref = await system.start(hf.child("killed", hf.start(Recorded), recovery=hf.hybrid(), isolation="process"))
-    await ref.ask(Fill())
-    pid = system.pid_of(ref)
-    assert pid is not None
-    with traced() as names:
-        os.kill(pid, signal.SIGKILL)
+    pids = [system.pid_of(ref)]
+
+    async def kill() -> None:
+        os.kill(pids[-1], signal.SIGKILL)
         await ref.ask(Fill(), timeout=60.0)
-    return names
+
+    async def rest() -> None:
+        """Let the reserve of processes be filled again."""
+        await asyncio.sleep(1.0)
+        pids.append(system.pid_of(ref))
+
+    return Walk(kill, rest)
 
 
-async def protect(system: hf.ActorSystem) -> list[str]:
+async def protect(system: hf.ActorSystem) -> Walk:
     """A mechanism is put before a recorded actor."""
     ref = await system.start(hf.child("guarded", hf.start(Recorded), recovery=hf.hybrid()))
     await ref.ask(Fill())
-    with traced() as names:
-        async with system.transaction(timeout=60.0) as change:
-            change.attach(ref, hf.PBR())
-    return names
+
+    def protected(mechanism: hf.PBR | None) -> Step:
+        async def change() -> None:
+            async with system.transaction(timeout=60.0) as changes:
+                changes.protect(ref, mechanism)
+
+        return change
+
+    return Walk(protected(hf.PBR()), protected(None))
 
 
-WALKS: dict[str, Callable[[hf.ActorSystem], Awaitable[list[str]]]] = {
+WALKS: dict[str, Callable[[hf.ActorSystem], Awaitable[Walk]]] = {
     "local tell": local_tell,
     "ask to a process": ask_to_a_process,
     "recorded message to its reply": recorded_message,
@@ -132,16 +200,35 @@ WALKS: dict[str, Callable[[hf.ActorSystem], Awaitable[list[str]]]] = {
 }
 
 
-async def walk(only: str) -> None:
+async def entered_by(walk: Walk) -> tuple[list[str], set[str]]:
+    """The files that are entered each time, in order, and those that are entered at least once."""
+    for _ in range(WARM_UPS):
+        await walk.go()
+        await walk.back()
+    runs: list[list[str]] = []
+    for _ in range(RUNS):
+        with traced() as names:
+            await walk.go()
+        runs.append(names)
+        await walk.back()
+    return [name for name in runs[0] if all(name in run for run in runs)], {name for run in runs for name in run}
+
+
+async def take_walks(only: str, *, is_verbose: bool) -> None:
     """Each walk in a system of its own."""
-    for name, steps in WALKS.items():
+    for name, prepare in WALKS.items():
         if only in name:
-            async with hf.ActorSystem("walk", log=False) as system:
-                names = await steps(system)
-            print(json.dumps({"walk": name, "files": len(names), "names": names}), flush=True)
+            async with hf.ActorSystem("walk", log=False, intensity=1000) as system:
+                each_time, once = await entered_by(await prepare(system))
+            print(json.dumps({"walk": name, "files": len(each_time), "now_and_then": len(once) - len(each_time)}))
+            if is_verbose:
+                print(*(f"    {one}" for one in each_time), sep="\n")
+                print(*(f"    now and then: {one}" for one in sorted(once - {*each_time})), sep="\n", flush=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-v", "--verbose", action="store_true", help="print which files")
     parser.add_argument("--only", default="", metavar="TEXT", help="only walks with TEXT in their name")
-    asyncio.run(walk(parser.parse_args().only))
+    arguments = parser.parse_args()
+    asyncio.run(take_walks(arguments.only, is_verbose=arguments.verbose))

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import socket
 import struct
+from types import NoneType
 from typing import Any, Literal
 
 import msgspec
 
 from ..actors.control.orders import pack_function, unpack_function
-from ..actors.errors import HoldfastError, RemoteCrash, error_text, rebuild_error, type_name
+from ..actors.errors import HoldfastError, RemoteCrash, SpecError, error_text, rebuild_error, type_name
 from ..actors.kernel.actor import Actor, Start
 from ..actors.process.wire.start_codec import pack_data, pack_recipe, unpack_data, unpack_recipe
 from ..actors.values import decode_value, encode_value
@@ -93,7 +94,11 @@ def pack_arg(value: Any, where: str) -> AnyArg:
         return Packed("mechanism", encode_value(pack_mechanism(value), where=where))
     if callable(value):
         return Packed("function", encode_value(pack_function(value, where, where)))
-    return Plain(list(value) if isinstance(value, (list, tuple)) else value)
+    plain: Any = list(value) if isinstance(value, (list, tuple)) else value
+    is_text = isinstance(plain, list) and all(isinstance(one, str) for one in plain)
+    if not is_text and not isinstance(plain, (str, int, float, NoneType)):
+        raise SpecError(where, f"{value!r} cannot be sent to the running system")
+    return Plain(plain)
 
 
 def open_arg(arg: AnyArg) -> Any:

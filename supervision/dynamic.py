@@ -61,7 +61,7 @@ class DynamicSupervisor(Supervisor):
             if "/" in name:
                 continue  # It is the child of a supervisor below us.
             if data == MADE_UP:
-                self._lose(name)
+                self._errand(self._lose(name))
                 continue
             if not self._flags.journal:
                 continue
@@ -77,14 +77,20 @@ class DynamicSupervisor(Supervisor):
             except HoldfastError as error:  # One that fails must not keep the others from coming back.
                 self._again(one, exit_reasons.crash(error))
 
-    def _lose(self, name: str) -> None:
+    async def _lose(self, name: str) -> None:
         """A child is over whose id nobody will use again: whoever waits for it is told, what was recorded is erased."""
-        path, keeper = f"{self.ctx.path}/{name}", self.ctx.cell.node.ports.keeper
+        path = f"{self.ctx.path}/{name}"
         try:
-            keeper.erase(path, below=True)
-            keeper.note(child_key(self.ctx.path, name), None)
+            await self._erase_below(path)
+            self.ctx.cell.node.ports.keeper.note(child_key(self.ctx.path, name), None)
         except HoldfastError as error:  # It is tried again at our next start.
             self.ctx.cell.node.emit(StoreRefused(path, str(error)))
+
+    async def _erase_below(self, path: str) -> None:
+        """Forget what was recorded at an address and below it. Raises HoldfastError if the store refuses."""
+        erased = self.ctx.cell.node.ports.keeper.erase(path, below=True)
+        if erased is not None:
+            await erased
 
     def _noted(self, name: str, data: bytes) -> ChildSpec:
         """A child as the journal has it. Raises HoldfastError if it can not be made any more."""
@@ -121,7 +127,7 @@ class DynamicSupervisor(Supervisor):
                 node.emit(StoreRefused(f"{self.ctx.path}/{one.spec.id}", str(error)))
                 return
         if is_lost:
-            self._lose(one.spec.id)
+            self._errand(self._lose(one.spec.id))
 
     def _take(self, plan: Plan) -> None:
         """New flags and template; those who live now stay as they are, even if there are more than there may be."""
@@ -206,11 +212,7 @@ class DynamicSupervisor(Supervisor):
         path, keeper = f"{self.ctx.path}/{message.id}", self.ctx.cell.node.ports.keeper
         is_there = message.id in self._children or message.id in (self.ctx.cell.children or ())
         if not is_there and "/" not in message.id and message.erase and keeper.knows(path):
-            try:
-                keeper.erase(path, below=True)
-            except HoldfastError as error:  # It can be deleted again.
-                return self._fail(error)
-            return None
+            return self._answered(self._erase_below(path))  # If the store refuses, it can be deleted again.
         self._child(message.id)
         raise NotSupported("a dynamic supervisor forgets stopped children by itself: use TerminateChild")
 

@@ -387,13 +387,16 @@ class Supervisor(Inquiries):
     def _path_of(self, one: Child) -> str:
         return f"{self.ctx.path}/{one.spec.id}"
 
-    def _erase(self, one: Child) -> None:
+    async def _erase(self, one: Child) -> None:
         """Forget what was recorded of a child that does not run. Raises HoldfastError if the store refuses."""
         if one.cell is not None:
             lifecycle.retire(one.cell, "it begins afresh")
         one.spec = complete(self.ctx.cell, one.spec)
         if one.spec.is_supervisor or one.spec.has_home:
-            self.ctx.cell.node.ports.keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
+            keeper = self.ctx.cell.node.ports.keeper
+            erased = keeper.erase(self._path_of(one), below=one.spec.is_supervisor)
+            if erased is not None:
+                await erased
 
     async def _restart_group(self, failed: Child, group: list[Child], reason: ExitReason) -> None:
         """Stop the others newest first, then start all of them in order; siblings wait for one that takes its time."""
@@ -506,10 +509,10 @@ class Supervisor(Inquiries):
         """Start a child that somebody waits for; its ref, or None if it did not want to be started."""
         row = Row((one,), STARTING)
         try:
-            if fresh:
-                self._erase(one)
             enlist(one)
-            is_up = await self._come_up_in(row, one)
+            if fresh:
+                await self._erase(one)
+            is_up = await self._come_up_in(row, one) if one.row is row else None
         except HoldfastError:
             undo(one)
             raise
@@ -571,7 +574,7 @@ class Supervisor(Inquiries):
         if one.cell is not None:
             lifecycle.retire(one.cell, reason)
         if message.erase:
-            self._erase(one)
+            await self._erase(one)
 
     @on(TerminateChild)
     def _terminate_child(self, message: TerminateChild) -> ReplyHandle[Any]:
@@ -629,18 +632,23 @@ class Supervisor(Inquiries):
     @on(DeleteChild)
     def _delete_child(self, message: DeleteChild) -> Any:
         """Forget a stopped child's spec, and what was recorded of it."""
+        return self._answered(self._delete(message))
+
+    async def _delete(self, message: DeleteChild) -> None:
         one = self._child(message.id)
         if one.state != STOPPED:
             raise ChildBusy(message.id, one.state)
         if one.cell is not None:
             lifecycle.retire(one.cell, "it was deleted")
         if message.erase:
+            row = Row((one,), STOPPING)  # Nobody starts or deletes it meanwhile.
             try:
-                self._erase(one)
-            except HoldfastError as error:  # It can be deleted again.
-                return self._fail(error)
+                await self._erase(one)
+            finally:  # If the store refuses, it can be deleted again.
+                row.leave()
+            if one.state != STOPPED:
+                raise ChildBusy(message.id, one.state)
         self._forget(one)
-        return None
 
     @on(ChangeSupervisor)
     def _change(self, message: ChangeSupervisor) -> Any:

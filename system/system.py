@@ -231,7 +231,7 @@ class ActorSystem(Recorded, Controls):
             self._patience.cancel()
             self._tell_unused()
         await self._moves.close()
-        if node.remains:
+        while node.remains:
             await asyncio.wait(set(node.remains))
         self._watch.close()
         await self._workers.close()

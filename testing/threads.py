@@ -45,9 +45,14 @@ class Onlooker(threading.Timer):
 
 
 class Threads:
-    """The threads that began after this was made, and those of pools; what else ran before is no business of ours."""
+    """The threads that began after this was made, and those of pools; what else ran before is no business of ours.
 
-    def __init__(self) -> None:
+    Args:
+        told: what the kernel tells of a thread, in its file of this name; `task_file`, unless a test says otherwise.
+    """
+
+    def __init__(self, told: Callable[[threading.Thread, str], str] | None = None) -> None:
+        self._told = told or task_file
         self._foreign = {thread for thread in threading.enumerate() if thread not in pools._threads_queues}
 
     def at_work(self) -> list[str]:
@@ -71,18 +76,17 @@ class Threads:
         """How often each of the others had run when it began to wait for a lock; None: it is at work."""
         own = threading.current_thread()
         others = [thread for thread in threading.enumerate() if thread is not own and thread not in self._foreign]
-        return {thread: _runs(thread) for thread in others if not isinstance(thread, Onlooker)}
+        return {thread: self._runs(thread) for thread in others if not isinstance(thread, Onlooker)}
 
-
-def _runs(thread: threading.Thread) -> str | None:
-    """How often a thread has run until it began to wait for a lock; None: it is at work."""
-    try:
-        # In this order: who has been woken is in its futex call until it runs, and only its status tells.
-        status, syscall = (_told(thread, file) for file in ("status", "syscall"))
-    except OSError:
-        return ""  # It has ended meanwhile, or this system has no such files.
-    is_limited = not _waits_for_a_future(thread)
-    return status.partition("ctxt_switches:")[2] if waits_for_a_lock(status, syscall, is_limited) else None
+    def _runs(self, thread: threading.Thread) -> str | None:
+        """How often a thread has run until it began to wait for a lock; None: it is at work."""
+        try:
+            # In this order: who has been woken is in its futex call until it runs, and only its status tells.
+            status, syscall = (self._told(thread, file) for file in ("status", "syscall"))
+        except OSError:
+            return ""  # It has ended meanwhile, or this system has no such files.
+        is_limited = not _waits_for_a_future(thread)
+        return status.partition("ctxt_switches:")[2] if waits_for_a_lock(status, syscall, is_limited) else None
 
 
 def _waits_for_a_future(thread: threading.Thread) -> bool:
@@ -99,7 +103,8 @@ def _waits_for_a_future(thread: threading.Thread) -> bool:
     return False
 
 
-def _told(thread: threading.Thread, file: str) -> str:
+def task_file(thread: threading.Thread, file: str) -> str:
+    """What the kernel tells of a thread in one of its files below /proc/self/task."""
     with open(f"/proc/self/task/{thread.native_id}/{file}", encoding="ascii", errors="replace") as told:
         return told.read()
 

@@ -18,6 +18,7 @@ import asyncio
 import os
 import random
 import sys
+import tempfile
 import time
 import zlib
 from collections import defaultdict
@@ -169,13 +170,28 @@ def no_orphan_left() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def temporary_folder(no_orphan_left: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Fail the run if it leaves something of ours where temporary files are; it has a folder of its own for these.
+
+    What belongs to this very process goes when that ends.
+    """
+    folder = tmp_path_factory.mktemp("temporary")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TMPDIR", str(folder))
+        patch.setattr(tempfile, "tempdir", None)
+        yield
+    left = [one.name for one in folder.glob("holdfast-*") if f"-{os.getpid()}-" not in one.name]
+    assert not left, f"the tests left temporary files: {left}"
+
+
+@pytest.fixture(scope="session", autouse=True)
 def pipe_of_libuv() -> None:
     """Have the one pipe opened that libuv keeps for the whole process, before any test is asked what it has opened."""
     uvloop.new_event_loop().close()
 
 
 @pytest.fixture(scope="session", autouse=True)
-def warm_servers(no_orphan_left: None) -> Iterator[WarmServers | None]:
+def warm_servers(temporary_folder: None) -> Iterator[WarmServers | None]:
     """Where fork servers come from, without the start of an interpreter for each (`tests/warm.py`)."""
     if "HOLDFAST_COLD" in os.environ or not sys.platform.startswith("linux"):
         yield None

@@ -155,6 +155,11 @@ class Node(RunLoop):
         """Give the node what it asks of those around it, before its first actor."""
         self.ports = ports
 
+    def end_after(self, work: asyncio.Future[Any], address: str) -> None:
+        """An address is given up, or its life is over, and this work for it is not: the system ends behind it."""
+        self.remains[work] = address
+        work.add_done_callback(lambda done: self.remains.pop(done, None))
+
     def begin_limit(self, what: str, seconds: float) -> Callable[[], None]:
         """Somebody keeps a time limit by a timer here; what is returned is called when it is void.
 

@@ -325,6 +325,11 @@ class Worker(Peer):
         if self.end.is_complete:
             self._bury()
 
+    def on_given_up(self) -> None:
+        """Its fork server was stopped, which kills it; nobody waits any longer to hear of its end."""
+        self.end.is_orphaned = True
+        self._bury()
+
     def _bury_soon(self) -> None:
         """At once if all is known. What it wrote before its end may still be in the socket, whose end comes behind."""
         if self.end.is_complete:
@@ -477,10 +482,15 @@ class Workers:
                 server = ForkServer(
                     self._entry, self._preload, on_exit=self._on_exit, on_lost=lambda: self._on_lost(server)
                 )
-                await server.start()
+                self._servers.append(server)  # Whoever is given up twice does not wait until it has ended.
+                try:
+                    await server.start()
+                except BaseException:
+                    if server.has_ended():
+                        self._servers.remove(server)
+                    raise
                 keep_large_memory()
                 self._server = server
-                self._servers.append(server)
             return self._server
 
     def _refill(self) -> None:
@@ -548,3 +558,5 @@ class Workers:
             servers, self._servers, self._server = self._servers, [], None
         for server in servers:
             await server.stop()
+        for worker in list(self._alive.values()):  # Its server could not tell of its end, or not in time.
+            worker.on_given_up()

@@ -120,15 +120,24 @@ class GuestKeeper:
         """Something is recorded there from now on."""
         self._known.add(path)
 
-    def erase(self, path: str, *, below: bool) -> None:
+    def erase(self, path: str, *, below: bool) -> asyncio.Future[None]:
         """Have the root forget what was recorded there."""
-        self._known.discard(path)
-        if below:
-            prefix = f"{path}/"
-            self._known = {one for one in self._known if not one.startswith(prefix)}
-            for key in self.notes(child_key(path, "")):
-                del self._notes[key]
-        self._say("erase", path, below=below)
+        prefix = f"{path}/"
+        known = {one for one in self._known if one == path or (below and one.startswith(prefix))}
+        notes = self.notes(child_key(path, "")) if below else {}
+        self._known -= known
+        for note in notes:
+            del self._notes[note]
+        key, done = self._guest.acceptance()
+        done.add_done_callback(lambda done: self._erased(done, known, notes))
+        self._say("erase", path, below=below, answer=key)
+        return done
+
+    def _erased(self, done: asyncio.Future[None], known: set[str], notes: dict[str, bytes]) -> None:
+        """The root has answered; what its store has refused to forget is known as before."""
+        if not done.cancelled() and done.exception() is not None:
+            self._known |= known
+            self._notes = notes | self._notes
 
     def roll_back(self, path: str, why: str) -> asyncio.Future[None]:
         """Have the root let its next life begin with an older snapshot."""

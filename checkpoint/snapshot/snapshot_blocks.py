@@ -57,8 +57,7 @@ class SnapshotImages:
             return
         saving = home.node.loop.create_task(self._save(meta, record, shared), name=f"snapshot of {home.path}")
         self._saving = saving
-        home.node.remains[saving] = home.path
-        saving.add_done_callback(lambda done: home.node.remains.pop(done, None))
+        home.node.end_after(saving, home.path)
 
     def _open(self, record: Snapshot, shared: Shared) -> Meta:
         """Have the new blocks here too.

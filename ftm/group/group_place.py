@@ -139,7 +139,10 @@ class GroupPlace(Place):
             if isinstance(error, asyncio.CancelledError):
                 error = StartFailed(cell.path, "it was stopped while it started")
             failed = error if isinstance(error, StartFailed) else StartFailed(cell.path, str(error))
-            await asyncio.shield(self._end(cell, cell.extra().reason if cell.state is not RUNNING else KILLED, failed))
+            reason = cell.extra().reason if cell.state is not RUNNING else KILLED
+            ending = lifecycle.outside_turn(cell, self._end(cell, reason, failed), "end")
+            cell.node.end_after(ending, cell.path)  # Whoever gives up the address meanwhile gives up this task alone.
+            await asyncio.shield(ending)
             if not isinstance(error, HoldfastError):
                 raise
             raise failed from error
@@ -223,7 +226,9 @@ class GroupPlace(Place):
         usual, method = Detection(), self.home.method.data()
         interval, watch_turns = usual.interval, usual.watch_turns or 0.0
         setting = Setting(cell.path, name, config, method, bindings, interval, watch_turns, more.claimed)
-        return self.replica(setting, self.parent.recipe(cell), tuple(layer.describe() for layer in layers))
+        return self.replica(
+            setting, self.parent.recipe(cell), tuple(layer.for_replicas().describe() for layer in layers)
+        )
 
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
@@ -612,6 +617,8 @@ class GroupPlace(Place):
             ftm.kill()
         if self.probation is not None:
             self.probation.end(is_kept=True)
+        for task in self.left(cell):
+            cell.node.end_after(task, cell.path)
 
     # -- what else a host does --------------------------------------------------------------------------------------
 

@@ -83,7 +83,7 @@ class Reconfiguration:
 
     def __init__(self, group: Group, config: int, layers: tuple[Mechanism, ...], rest_within: float) -> None:
         self.config, self.layers, self.rest_within = config, layers, rest_within
-        self.descriptions = [layer.describe() for layer in layers]
+        self.descriptions = [layer.for_replicas().describe() for layer in layers]
         self.names = names_for(group, layers)
         self.stage = PREPARING
         self.is_back = False  # to what has worked before

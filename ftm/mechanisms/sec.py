@@ -18,15 +18,18 @@ from __future__ import annotations
 import asyncio
 import atexit
 import contextlib
+import copy
 import dataclasses
 import functools
+import hashlib
 import importlib
 import os
 import re
 import stat
 import tempfile
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ...actors.errors import HoldfastError
 from ...actors.kernel.actor import Actor, on
@@ -150,25 +153,42 @@ SUITES = ("aes-256-gcm", "chacha20-poly1305")
 
 _MADE = re.compile(r"\.?[0-9a-f]{32}\.(key|root)(\..+)?")
 """Names of the files that a participant makes among the keys."""
+_FOLDER = re.compile(r"holdfast-sec-(\w+)-(\d+)-(\d+)-\w+")
+"""A directory of keys: where its pid means something, the pid of its process, and when that began."""
 
 
 @functools.cache
 def _folder_of(process: int) -> str:
-    """The directory for keys that end with this process."""
-    folder = tempfile.mkdtemp(prefix="holdfast-sec-")
+    """The directory for keys that end with this process; those of killed processes go."""
+    from ...checkpoint.sqlite.ownership import boot_id, living, start_of
+
+    boot, start = boot_id(), (start_of(process) or "").rpartition(":")[2]
+    where = hashlib.sha256(f"{boot} {os.readlink('/proc/self/ns/pid')}".encode()).hexdigest()[:12]
+    for beside in Path(tempfile.gettempdir()).glob("holdfast-sec-*"):
+        found = _FOLDER.fullmatch(beside.name)
+        if found is not None and found[1] == where:
+            with living(int(found[2]), f"{boot}:{found[3]}") as pidfd:
+                if pidfd is None:
+                    _remove(beside)
+    folder = tempfile.mkdtemp(prefix=f"holdfast-sec-{where}-{process}-{start}-")
     made = os.lstat(folder)
 
     def remove() -> None:
-        if os.getpid() != process:  # A forked process ends, too.
-            return
-        with contextlib.suppress(OSError):  # Somebody was there before us, or has put something there: it stays.
-            if os.path.samestat(os.lstat(folder), made):
-                for name in filter(_MADE.fullmatch, os.listdir(folder)):
-                    os.unlink(os.path.join(folder, name))
-                os.rmdir(folder)
+        if os.getpid() == process:  # A forked process ends, too.
+            _remove(folder, made)
 
     atexit.register(remove)
     return folder
+
+
+def _remove(folder: str | Path, made: os.stat_result | None = None) -> None:
+    """Remove a directory of keys of this user, if it is still that which was made, and has only keys in it."""
+    with contextlib.suppress(OSError):  # Somebody was there before us, or has put something there: it stays.
+        found = os.lstat(folder)
+        if stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid() and os.path.samestat(found, made or found):
+            for name in filter(_MADE.fullmatch, os.listdir(folder)):
+                os.unlink(os.path.join(folder, name))
+            os.rmdir(folder)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -214,7 +234,6 @@ class SEC(Mechanism):
         if unknown := [suite for suite in self.suites if suite not in SUITES]:
             raise ValueError(f"SEC: unknown suites {', '.join(unknown)}; there are {', '.join(SUITES)}")
         if not self.keys:
-            object.__setattr__(self, "keys", _folder_of(os.getpid()))
             object.__setattr__(self, "is_per_start", True)
         object.__setattr__(self, "suites", tuple(self.suites))
 
@@ -225,6 +244,8 @@ class SEC(Mechanism):
             importlib.import_module("..sec.link", __package__)
         except ImportError as error:
             raise MechanismRefused(self.name, str(error)) from error
+        if not self.keys:
+            return
         try:
             about = os.lstat(self.keys)
         except OSError as error:
@@ -233,6 +254,16 @@ class SEC(Mechanism):
             raise MechanismRefused(self.name, f"{self.keys} is no directory, and links are not followed")
         if about.st_uid != os.geteuid() or about.st_mode & 0o077:
             raise MechanismRefused(self.name, f"{self.keys} must belong to this user, with mode 0700")
+
+    @property
+    def folder(self) -> str:
+        """The directory of the keys; made where links are first opened, which is not where all such classes are."""
+        return self.keys or _folder_of(os.getpid())
+
+    def for_replicas(self) -> Self:
+        new = copy.copy(self)
+        object.__setattr__(new, "keys", self.folder)
+        return new
 
     def open_link(
         self,

@@ -153,6 +153,10 @@ class Mechanism:
         """One that secures the links (`layer` "link"): the end of them that is at `path`."""
         return None
 
+    def for_replicas(self) -> Self:
+        """The same, with what only this process can add before replicas in others begin with it."""
+        return self
+
     def with_brick(self, role: str, part: str, kind: type[Brick]) -> Self:
         """The same mechanism, with another brick as `before`, `proceed` or `after` of one role."""
         new = copy.copy(self)

@@ -103,13 +103,13 @@ class Identity(Secret):
         if self._enrols is not None:
             root = await self._authority(GetRoot())
             self._check_root(root)
-            write_root(root_file(settings.keys, settings.authority), root)
+            write_root(root_file(settings.folder, settings.authority), root)
             for path in (self.path, *self._enrols()):
                 await self._enrol(path)
         else:
-            root = read_root(root_file(settings.keys, settings.authority))
+            root = read_root(root_file(settings.folder, settings.authority))
             self._check_root(root)
-        key = SigningKey.from_file(key_file(settings.keys, self.path))
+        key = SigningKey.from_file(key_file(settings.folder, self.path))
         certificate = await self._authority(GetCertificate(certified(self.path)))
         limits = Limits(settings.rotate_messages, settings.rotate_seconds, lifetime=settings.lifetime)
         life = time.monotonic_ns() if old is None else old.incarnation
@@ -132,7 +132,7 @@ class Identity(Secret):
 
     async def _enrol(self, path: str) -> None:
         """Order a certificate; once, and when its time is nearly over: one that was revoked stays so."""
-        name, key = certified(path), SigningKey.from_file(key_file(self.mechanism.keys, path))
+        name, key = certified(path), SigningKey.from_file(key_file(self.mechanism.folder, path))
         try:
             certificate = await self._authority(GetCertificate(name))
             if public_of(certificate) == raw_public(key.public) and not self._is_due(certificate):

@@ -207,7 +207,7 @@ class Link(Identity):
         return name == self._proxy if stream in (TELLS, ORDERS) else name in self._replicas
 
     def _has_other_root(self, me: Participant) -> bool:
-        file = root_file(self.mechanism.keys, self.mechanism.authority)
+        file = root_file(self.mechanism.folder, self.mechanism.authority)
         return self._enrols is None and file.read_bytes() != me.trust.root
 
     async def agree(self, hello: bytes, finish: bytes) -> None:

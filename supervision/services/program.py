@@ -307,10 +307,7 @@ class _Leash:
         if kept.ended.done():
             return
         kept.kill()
-        gone = cell.node.loop.create_task(kept.wait_killed(), name=f"end of {cell.path}")
-        remains = cell.node.remains
-        remains[gone] = cell.path
-        gone.add_done_callback(lambda gone: remains.pop(gone, None))
+        cell.node.end_after(cell.node.loop.create_task(kept.wait_killed(), name=f"end of {cell.path}"), cell.path)
         cell.node.kept[cell] = kept  # If we may not end it, no second one is started beside it.
 
 

@@ -10,6 +10,7 @@ from typing import Any, cast
 import pytest
 
 import holdfast as hf
+from holdfast.supervision.admin import RemoveChild
 from holdfast.supervision.spec import Strategy
 from tests.checkpoint.players import Do, Doer, Late, Note, Seen, until
 from tests.checkpoint.strikes import NEVER, event, let_through, sink
@@ -138,6 +139,45 @@ async def test_who_is_deleted_is_erased_unless_that_is_not_wanted(
         await top(system).ask(hf.StartChild(spec), timeout=20.0)
         assert await seen(system) == ([] if erase else ["one"])
         assert await seen(system, "other") == ["else"]
+
+
+@pytest.mark.parametrize("how", ["delete", "restart fresh", "start fresh", "remove"])
+async def test_what_the_store_refuses_to_forget_is_an_error_and_can_be_forgotten_later(
+    store: str | None, isolation: str, how: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = doing(isolation)
+    order: hf.Message[Any] = {
+        "delete": hf.DeleteChild("doer"),
+        "restart fresh": hf.RestartChild("doer", fresh=True),
+        "start fresh": hf.StartChild(spec, fresh=True),
+        "remove": RemoveChild("doer", erase=True),
+    }[how]
+
+    def refuse(address: str) -> None:
+        raise hf.HoldfastError("the disk is gone")
+
+    async with running(store) as system:
+        await system.start(tree(isolation, spec))
+        await add(system, "one")
+        if how != "remove":
+            await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
+        if how == "start fresh":
+            await top(system).ask(hf.DeleteChild("doer", erase=False), timeout=20.0)
+        with monkeypatch.context() as broken:
+            broken.setattr(system.homes.journal, "erase", refuse)
+            with pytest.raises(hf.HoldfastError, match="the disk is gone"):
+                await top(system).ask(order, timeout=20.0)
+        there = await top(system).ask(hf.WhichChildren(), timeout=20.0)
+        assert [one.state for one in there] == ([] if how in ("start fresh", "remove") else ["stopped"])
+        if how in ("start fresh", "remove"):
+            await top(system).ask(hf.StartChild(spec), timeout=20.0)
+        else:
+            await top(system).ask(hf.RestartChild("doer"), timeout=20.0)
+        assert await seen(system) == ["one"]
+        await top(system).ask(hf.TerminateChild("doer"), timeout=20.0)
+        await top(system).ask(hf.DeleteChild("doer"), timeout=20.0)
+        await top(system).ask(hf.StartChild(spec), timeout=20.0)
+        assert await seen(system) == []
 
 
 async def test_what_was_erased_stays_erased_when_the_store_is_opened_again(tmp_path: Path, isolation: str) -> None:

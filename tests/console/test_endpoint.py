@@ -417,3 +417,61 @@ async def test_the_endpoint_ends_with_clients_connected(system: hf.ActorSystem, 
         await reader.read()
     writer.close()
     await writer.wait_closed()
+
+
+PROTECTIONS: list[tuple[Any, tuple[str, ...], str]] = [
+    (hf.PBR(), ("pbr",), "protect /app/left/a by PBR"),
+    ((hf.LFR(), hf.TR()), ("lfr", "tr"), "protect /app/left/a by LFR + TR"),
+    ([hf.PBR()], ("pbr",), "protect /app/left/a by PBR"),
+    ("lfr", ("lfr",), "protect /app/left/a by LFR"),
+    (None, (), "protect /app/left/a by no mechanism"),
+]
+
+
+@pytest.mark.asyncio(loop_factories=["uvloop"])
+async def test_an_actor_is_protected_by_just_what_is_asked_for_and_by_nothing_again(
+    system: hf.ActorSystem, path: Path
+) -> None:
+    """One stack after the other in the same session; its state and its address stay."""
+    actor = ref(system, "/app/left/a")
+
+    async def work(remote: RemoteSystem) -> list[Any]:
+        seen: list[Any] = []
+        for mechanism, _, _ in PROTECTIONS:
+            async with remote.transaction(dry_run=True) as change:
+                change.protect(RemoteRef("/app/left/a"), mechanism)
+            before = (await remote.protection("/app/left/a")).stack
+            async with remote.transaction(timeout=60.0) as change:
+                change.protect(RemoteRef("/app/left/a"), mechanism)
+            seen.append((before, (await remote.protection("/app/left/a")).stack, change.steps[0].text))
+        return seen
+
+    assert await actor.ask(Add(3)) == 3
+    before = [(), *(stack for _, stack, _ in PROTECTIONS)]
+    expected = [(was, stack, text) for was, (_, stack, text) in zip(before, PROTECTIONS, strict=False)]
+    assert await far(path, work) == expected
+    assert await actor.ask(Add(1)) == 4
+
+
+NO_MECHANISMS: list[tuple[Any, type[hf.HoldfastError], str]] = [
+    (Counter, hf.TransactionRefused, "it must be one such as PBR"),
+    (object(), hf.SpecError, "cannot be sent to the running system"),
+    ((hf.PBR(), None), hf.SpecError, "cannot be sent to the running system"),
+    ("no such one", hf.TransactionRefused, "there is no mechanism of that name"),
+    ((), hf.TransactionRefused, "takes at least one mechanism"),
+]
+
+
+@pytest.mark.parametrize(("mechanism", "error", "problem"), NO_MECHANISMS)
+async def test_what_is_no_mechanism_is_refused_over_the_socket_too(
+    system: hf.ActorSystem, path: Path, mechanism: Any, error: type[hf.HoldfastError], problem: str
+) -> None:
+    before = picture(system)
+
+    async def work(remote: RemoteSystem) -> None:
+        async with remote.transaction() as change:
+            change.protect("/app/left/a", mechanism)
+
+    with pytest.raises(error, match=problem):
+        await far(path, work)
+    assert picture(system) == before

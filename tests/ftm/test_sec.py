@@ -330,7 +330,7 @@ async def test_keys_are_files_of_ours_alone_and_in_no_recipe(secured: hf.ActorSy
     sec = SEC(CA)
     ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(sec, hf.PBR())))
     await joined(ref)
-    folder = Path(sec.keys)
+    folder = Path(sec.folder)
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert {stat.S_IMODE(file.stat().st_mode) for file in folder.iterdir()} == {0o600}
     said = repr(sec) + repr(sec.describe()) + repr(vars(group_of(ref))) + repr(ref._cell.extra().start)
@@ -366,7 +366,7 @@ import pathlib, sys
 import holdfast as hf
 from holdfast.ftm.sec.identity import key_file
 from holdfast.ftm.sec.keys import SigningKey
-folder = pathlib.Path(hf.SEC("/app/authority").keys)
+folder = pathlib.Path(hf.SEC("/app/authority").folder)
 SigningKey.from_file(key_file(str(folder), "/app/c"))
 assert len(list(folder.iterdir())) == 1
 if "foreign" in sys.argv:
@@ -380,6 +380,59 @@ print(folder)
         assert folder.parent == tmp_path
         assert folder.exists() is bool(left)
         assert [file.name for file in folder.glob("*")] == left
+
+
+def test_keys_of_killed_processes_are_removed_by_the_next_that_has_some(tmp_path: Path) -> None:
+    """Of none that lives, and nothing that a process of another machine, or somebody else, has put there."""
+    program = """
+import holdfast as hf
+from holdfast.ftm.sec.identity import key_file
+from holdfast.ftm.sec.keys import SigningKey
+sec = hf.SEC("/app/authority")
+input()
+SigningKey.from_file(key_file(sec.folder, "/app/c"))
+print(sec.folder, flush=True)
+input()
+"""
+    foreign = {tmp_path / name for name in ("holdfast-sec-abcdefgh", "holdfast-sec-0123456789ab-999999999-1-abcdefgh")}
+    for folder in foreign:
+        folder.mkdir(mode=0o700)
+
+    def there() -> set[Path]:
+        return set(tmp_path.iterdir()) - foreign
+
+    def begun() -> subprocess.Popen[str]:
+        environment = {**os.environ, "TMPDIR": str(tmp_path)}
+        return subprocess.Popen(
+            [sys.executable, "-c", program], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        )
+
+    def made(process: subprocess.Popen[str]) -> Path:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        process.stdin.write("\n")
+        process.stdin.flush()
+        return Path(process.stdout.readline().strip())
+
+    processes = [begun() for _ in range(3)]
+    try:
+        killed, living, later = processes
+        first = made(killed)
+        assert there() == {first}, "it is made when it is needed"
+        killed.kill()
+        killed.wait(30)
+        second = made(living)
+        assert there() == {second}
+        third = made(later)
+        assert there() == {second, third}
+        for process in (living, later):
+            process.communicate("\n", timeout=30)
+        assert there() == set()
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+    assert all(folder.exists() for folder in foreign)
 
 
 @pytest.mark.parametrize("mode", [0o755, 0o770])

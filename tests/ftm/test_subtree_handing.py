@@ -22,6 +22,7 @@ from holdfast.checkpoint.places.subtree_place import SubtreePlace
 from holdfast.ftm.group.group_place import GroupPlace
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
+from holdfast.ftm.migration.subtree_moves import FromSubtree
 from tests.ftm.accounts import Add, Boom, Counter, Later, Load, Tags
 from tests.ftm.test_failover import SEED, group_of, pid_of, two_again
 from tests.ftm.test_subtree import Heard, Watch, Watcher, at, bank, bank_pid
@@ -158,6 +159,84 @@ async def test_what_waits_goes_along_in_order_both_ways(system: hf.ActorSystem, 
     for first in (0, 4):
         assert tags.index(first) < tags.index(first + 3)
         assert tags.index(first + 1) < tags.index(first + 2)
+
+
+class Odd(hf.Message[int]):
+    """Goes to a sibling in the same process, and nowhere else."""
+
+    what: Any
+
+
+class Odder(Counter):
+    @hf.on(Odd)
+    def odd(self, message: Odd) -> int:
+        return 0
+
+
+class Say(hf.Message[None]): ...
+
+
+class Outcome(hf.Message[list[str]]): ...
+
+
+class Speaker(hf.Actor):
+    """A sibling that tells and asks what cannot leave the process."""
+
+    @hf.on(Say)
+    def say(self, message: Say) -> None:
+        alice = self.ctx.find("/app/bank/alice", Odder)
+        alice.tell(Add(0))
+        alice.tell(Odd(object()))
+        self.asked = [alice.ask(one, timeout=30.0) for one in (Odd(object()), Add(1))]
+
+    @hf.on(Outcome)
+    async def outcome(self, message: Outcome) -> list[str]:
+        return [type(one).__name__ for one in await asyncio.gather(*self.asked, return_exceptions=True)]
+
+
+async def test_a_message_that_cannot_leave_the_process_is_refused_and_all_others_go_along(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They come when it is at rest; of those that were there before, one would have kept it where it is."""
+    let_go = FromSubtree.let_go
+    await system.start(bank(plain(recipe=hf.start(Odder)), plain("sibling", hf.start(Speaker))))
+    alice, sibling = at(system, "alice"), at(system, "sibling")
+
+    async def lets_go(leaving: FromSubtree) -> None:
+        await sibling.ask(Say())
+        await let_go(leaving)
+
+    monkeypatch.setattr(FromSubtree, "let_go", lets_go)
+    with system.events() as events:
+        await attach(system, alice)
+        assert await sibling.ask(Outcome(), timeout=30.0) == ["BadMessage", "int"]
+        assert await alice.ask(Tags()) == [0, 1]
+        letters = [one for one in events.take() if isinstance(one, hf.DeadLetter)]
+    assert [one.address for one in letters] == [alice.path]
+    assert "a value of type object cannot be sent" in letters[0].why
+
+
+class Unheard(hf.Message[None]): ...
+
+
+async def test_what_is_sent_when_it_is_about_to_leave_is_held_or_refused_as_ever(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await system.start(bank(plain()))
+    alice, say, asked = at(system, "alice"), Move.say_now, list[asyncio.Future[int]]()
+
+    def said(move: Move, worker: Any, which: str, **told: Any) -> None:
+        if which == "leave":
+            with pytest.raises(hf.UnknownMessage):
+                alice.tell(Unheard())
+            alice.tell(Add(0))
+            asked.append(asyncio.ensure_future(alice.ask(Add(1), timeout=30.0)))
+        say(move, worker, which, **told)
+
+    monkeypatch.setattr(Move, "say_now", said)
+    await attach(system, alice)
+    assert await asyncio.gather(*asked) == [2]
+    assert await alice.ask(Tags()) == [0, 1]
 
 
 @BOTH_WAYS
@@ -315,6 +394,37 @@ async def test_what_is_put_aside_and_subscribed_to_goes_along(system: hf.ActorSy
     await alice.ask(Open())
     assert await asyncio.gather(*kept) == [0, 1, 2]
     assert await alice.ask(Read()) == ["0", "1", "2"]
+
+
+class Listing(Keeper):
+    @hf.on(News)
+    def news(self, message: News) -> None:
+        if not self.is_open:
+            self.ctx.stash()
+        self.read.append(f"{message.text} of {self.ctx.sender and self.ctx.sender.path}")
+
+
+class Reporter(hf.Actor):
+    @hf.on(Keep)
+    async def keep(self, message: Keep) -> int:
+        alice = self.ctx.find("/app/bank/alice", Listing)
+        for text in ("one", "two"):
+            alice.tell(News(text))
+        return await alice.ask(message, timeout=30.0)
+
+
+async def test_what_is_put_aside_keeps_its_order_and_its_sender(system: hf.ActorSystem) -> None:
+    await system.start(bank(plain(recipe=hf.start(Listing)), plain("sibling", hf.start(Reporter))))
+    alice = at(system, "alice")
+    kept = asyncio.ensure_future(at(system, "sibling").ask(Keep(3), timeout=30.0))
+    async with asyncio.timeout(20):
+        while len(await alice.ask(Read())) < 2:  # The ask behind them was sent in the same turn.
+            await asyncio.sleep(0.005)
+    await attach(system, alice)
+    assert len(await alice.ask(Read())) == 2, "it is not handed the same again"
+    await alice.ask(Open())
+    assert await kept == 3
+    assert await alice.ask(Read()) == ["one of /app/bank/sibling", "two of /app/bank/sibling", "3"]
 
 
 @pytest.mark.parametrize(

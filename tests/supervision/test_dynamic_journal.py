@@ -13,6 +13,7 @@ import pytest
 
 import holdfast as hf
 from tests.checkpoint.players import Doer, Note, Seen, until
+from tests.checkpoint.strikes import event
 from tests.checkpoint.trees import running
 
 
@@ -185,6 +186,34 @@ async def test_what_was_recorded_of_one_that_has_ended_can_be_erased(store: str 
         await restarted(system)
         again = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
         assert await again.ask(Seen()) == ["Bob of nowhere"]
+
+
+async def test_what_the_store_refuses_to_forget_is_an_error_and_can_be_forgotten_later(
+    store: str | None, isolation: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(address: str) -> None:
+        raise hf.HoldfastError("the disk is gone")
+
+    async with running(store) as system:
+        top = await system.start(school(PUPIL, isolation=isolation))
+        bob = await top.ask(hf.StartChild(args=("Bob",), id="bob"))
+        made_up = await top.ask(hf.StartChild(args=("Ann",)))
+        for pupil in (bob, made_up):
+            await pupil.ask(Note("secret"))
+        await top.ask(hf.TerminateChild("bob"))
+        with monkeypatch.context() as broken, system.events() as events:
+            broken.setattr(system.homes.journal, "erase", refuse)
+            with pytest.raises(hf.HoldfastError, match="the disk is gone"):
+                await top.ask(hf.DeleteChild("bob"))
+            with pytest.raises(hf.HoldfastError, match="the disk is gone"):
+                await top.ask(hf.StartChild(args=("Bob",), id="bob", fresh=True))
+            await top.ask(hf.TerminateChild(made_up.path.rpartition("/")[2]))  # It is over, whatever the store says.
+            refused: hf.StoreRefused = await event(events, hf.StoreRefused)
+        assert (refused.address, refused.reason) == (made_up.path, "the disk is gone")
+        assert set(system.homes.known("/app/school")) == {bob.path, made_up.path}
+        await top.ask(hf.DeleteChild("bob"))
+        await restarted(system)
+        await until(lambda: not system.homes.known("/app/school"))
 
 
 async def test_a_start_that_fails_or_is_refused_leaves_nothing_in_the_journal(

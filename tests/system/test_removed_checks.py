@@ -194,7 +194,7 @@ CHECKS = {
         "        if not at_work and before:\n",
         "        if False:\n",
         "tests/testing/test_clock.py",
-        "test_of_two_threads_that_wake_each_other",
+        "test_a_thread_that_was_woken_behind_the_first_look",
     ),
     "the children stand as the steps say": Check(
         "system/transaction/arrangement.py",

@@ -3,13 +3,14 @@
 import asyncio
 import threading
 import time
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 
 import pytest
 
 from holdfast.testing.clock import NothingToWaitFor, RealTimeNeeded, VirtualClockLoop
 from holdfast.testing.clock import virtual as virtual_loop
-from holdfast.testing.threads import Threads
+from holdfast.testing.threads import Threads, task_file, waits_for_a_lock
 
 virtual = pytest.mark.asyncio(loop_factories=["virtual"])
 
@@ -145,6 +146,54 @@ def test_of_two_threads_that_wake_each_other_one_is_always_at_work() -> None:
         ended.set()
         for thread in threads:
             thread.join()
+
+
+def test_a_thread_that_was_woken_behind_the_first_look_is_at_work() -> None:
+    gate, handed_over, ended, rest = threading.Lock(), threading.Event(), threading.Event(), threading.Lock()
+
+    def wait_and_work() -> None:
+        gate.acquire()
+        ended.wait(60.0)
+
+    def work_and_hand_over() -> None:
+        handed_over.wait(60.0)
+        gate.release()
+        rest.acquire()
+
+    first, second = threading.Thread(target=wait_and_work), threading.Thread(target=work_and_hand_over)
+
+    def is_at_rest(thread: threading.Thread) -> bool:
+        return waits_for_a_lock(task_file(thread, "status"), task_file(thread, "syscall"))
+
+    def told(thread: threading.Thread, file: str) -> str:
+        """The first thread has been looked at when the second one, on its way to rest, wakes it."""
+        if thread is second:
+            handed_over.set()
+            assert spins_until(lambda: is_at_rest(second))
+        return task_file(thread, file)
+
+    threads = Threads(told)
+    gate.acquire()
+    rest.acquire()
+    first.start()
+    second.start()
+    try:
+        assert spins_until(lambda: is_at_rest(first))
+        assert threads.at_work() == [first.name]
+    finally:
+        for event in (handed_over, ended):
+            event.set()
+        rest.release()
+        for thread in (first, second):
+            thread.join()
+
+
+def spins_until(holds: Callable[[], bool]) -> bool:
+    ends = time.monotonic() + 30.0
+    while not holds():
+        if time.monotonic() > ends:
+            return False
+    return True
 
 
 def test_the_clock_begins_where_it_is_told_to() -> None:

@@ -13,6 +13,7 @@ import psutil
 import pytest
 
 import holdfast as hf
+from holdfast.actors.process import worker_pool
 from holdfast.actors.process.fork import fork_server
 from tests.actors.process.players import Account, Add, Total, Where
 from tests.actors.process.waiting import until
@@ -83,6 +84,47 @@ async def test_a_fork_server_that_was_replaced_ends_with_the_system(monkeypatch:
         assert len(servers()) == 2
         assert await first.ask(Add(1)) == 1
     assert servers() == []
+
+
+async def test_a_process_of_whose_end_nobody_has_told_in_time_leaves_nothing_open(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Its fork server does not answer, and what waits for its word comes too late, as on a busy machine."""
+
+    def late(worker: worker_pool.Worker) -> None:
+        if worker.end.is_complete:
+            worker._bury()
+
+    monkeypatch.setattr(worker_pool, "REAPED_WITHIN", 0.05)
+    async with hf.ActorSystem("app", log=False) as system:
+        await system.stop(await system.start(account("first")))
+        await warmed_up(system)
+        (stopped,) = servers()
+        (reserve,) = system._workers._alive.values()
+        monkeypatch.setattr(worker_pool.Worker, "_bury_soon", late)
+        stopped.suspend()
+    assert servers() == []
+    assert reserve.forked.pidfd == -1
+
+
+async def test_a_fork_server_whose_start_is_given_up_twice_ends_with_the_system(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with hf.ActorSystem("app", log=False) as system:
+        starting = asyncio.ensure_future(system.start(account("first")))
+        await until(lambda: bool(servers()))
+        first = system.ref("/app/first", Account)
+        killed = asyncio.Event()
+        monkeypatch.setattr(fork_server, "signal_by", lambda *args: killed.set())  # It takes its time to die.
+        first.kill()
+        await killed.wait()
+        first.kill()
+        with pytest.raises(hf.StartFailed):
+            await starting
+        (server,) = servers()
+        monkeypatch.undo()
+    assert servers() == []
+    assert not psutil.pid_exists(server.pid)
 
 
 async def test_what_cannot_be_received_is_tried_again_in_a_moment(
