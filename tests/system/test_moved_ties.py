@@ -112,7 +112,7 @@ async def test_who_lives_with_its_supervisor_hears_of_the_end_once(
         async with system.transaction(timeout=IN_TIME) as change:
             change.move(other, "/app/there")
         for isolation in ("process", "task"):
-            await system.set_isolation(one, isolation, timeout=IN_TIME)  # type: ignore[arg-type]  # one of both
+            await system.set_isolation(one, isolation, timeout=IN_TIME)
         async with system.transaction(timeout=IN_TIME) as change:
             change.remove(other)
         wanted = ["exit" if verb == "link" else "down"]
