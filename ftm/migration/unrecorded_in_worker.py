@@ -182,7 +182,7 @@ class PlainChild:
         self._held.append(item)
 
     def _stay(self) -> None:
-        """The group goes on."""
+        """The life stays with the group, which goes on."""
         cell, arrival, held = self._cell, self._arrival, self._held or []
         self._arrival = self._held = None
         if arrival is not None:
