@@ -43,9 +43,10 @@ from holdfast.ftm.group.reconfiguration import (
     what_is_wrong,
 )
 
-NAMES = ("r1", "r2", "r3")
+NAMES: tuple[str, ...] = ("r1", "r2", "r3")
 HOPELESS = 10.0
 replicas = st.sampled_from(NAMES)
+roles = st.sampled_from((*NAMES, "primary", "leading", "joining"))
 
 
 class FailingOver(RuleBasedStateMachine):
@@ -56,17 +57,24 @@ class FailingOver(RuleBasedStateMachine):
 
     @initialize(keeps_members=st.booleans())
     def begin(self, keeps_members: bool) -> None:
-        self.lives = dict.fromkeys(NAMES, 1)
-        self.known = Membership(NAMES, 1, "r1", keeps_members=keeps_members, is_begun=True, members={"r1": 1})
+        self.lives: dict[str, int] = dict.fromkeys(NAMES, 1)
+        self.known = Membership(NAMES, 1, "r1", keeps_members=keeps_members, is_begun=True)
+        self.known.members, self.known.up = {"r1": 1, "r2": 1}, dict(self.lives)
         self.now = 0.0
         self.led = [(1, "r1", 1)]  # the model: epoch, name and life of all that were ever told to lead
-        self.holders = {("r1", 1)}  # and who has all that was acknowledged
+        self.holders = {("r1", 1), ("r2", 1)}  # and who has all that was acknowledged
 
     # -- what happens to them -----------------------------------------------------------------------------------------
 
-    @rule(name=replicas)
-    def die(self, name: str) -> None:
-        self.lives[name] = 0
+    def _name_of(self, role: str) -> str:
+        joining = next(iter(self.known.joining), None)
+        return {"primary": self.known.primary, "leading": self.known.leading, "joining": joining}.get(
+            role, role
+        ) or "r1"
+
+    @rule(role=roles)
+    def die(self, role: str) -> None:
+        self.lives[self._name_of(role)] = 0
 
     @rule(name=replicas, life=st.integers(2, 9))
     def start(self, name: str, life: int) -> None:
@@ -83,8 +91,9 @@ class FailingOver(RuleBasedStateMachine):
             assert (heard == "cleared") == (is_suspect and before is not None and before.is_silence)
             assert self.known.is_suspect(name, life) == (heard == "known")
 
-    @rule(name=replicas, is_silence=st.booleans())
-    def suspect(self, name: str, is_silence: bool) -> None:
+    @rule(role=roles, is_silence=st.booleans())
+    def suspect(self, role: str, is_silence: bool) -> None:
+        name = self._name_of(role)
         if (name, self.lives[name]) in self.known.watched(self.lives):
             self.known.suspect(name, Suspicion(self.lives[name], "it is", self.now, is_silence), self.now)
             assert not self.known.is_well(name, self.lives)
@@ -141,10 +150,12 @@ class FailingOver(RuleBasedStateMachine):
             case "wait":
                 life = self.lives[name]
                 assert known.suspected[name].life == life == known.members[name]
+                assert known.leading is None or known.suspected[name].is_silence
                 assert not any(known.is_well(one, self.lives) for one in NAMES)
             case "depose" | "condemn":
                 assert not known.is_well(name, self.lives)
                 assert name == (known.primary if step.kind == "depose" else known.leading)
+                self._check_that_nobody_would_wait(name, silent=step.kind == "condemn")
                 known.condemn(name)
                 self._lose(name)
             case "renew" | "elect":
@@ -154,7 +165,7 @@ class FailingOver(RuleBasedStateMachine):
                 assert (known.epoch, known.leading, known.primary) == (before + 1, name, None)
             case "fall":
                 assert not any(known.is_well(one, self.lives) for one in NAMES)
-                known.is_over = True
+                self.begin(known.keeps_members)  # The home begins another group.
             case "bury":
                 self._bury(name, known.condemned.pop(name))
             case "lead":
@@ -176,8 +187,17 @@ class FailingOver(RuleBasedStateMachine):
                 assert all(known.is_well(one, self.lives) for one in known.members)
                 assert not known.dropped
                 assert not known.condemned
+                assert all(self.lives[one] == life for one, life in known.joining.items())
                 suspects = {one for one in NAMES if self.lives[one] and known.is_suspect(one, self.lives[one])}
                 assert not [one for one in suspects if known.up.get(one) == self.lives[one]]
+
+    def _check_that_nobody_would_wait(self, name: str, *, silent: bool) -> None:
+        """What only this one has may not be given up, as long as it may yet be heard of."""
+        suspicion = self.known.suspected.get(name)
+        is_alive = self.lives[name] > 0 and self.known.members.get(name) == self.lives[name]
+        if is_alive and not any(self.known.is_well(one, self.lives) for one in NAMES):
+            assert suspicion is not None
+            assert self.now - suspicion.since >= HOPELESS or (silent and not suspicion.is_silence)
 
     def _lead(self, name: str) -> None:
         known, life = self.known, self.lives[name]
@@ -196,27 +216,44 @@ class FailingOver(RuleBasedStateMachine):
     def _next(self) -> FailoverStep:
         return next_step(self.known, self.lives, self.now, HOPELESS)
 
-    @precondition(lambda self: not self.known.is_over)
     @rule()
     def step(self) -> None:
         self._apply(self._next())
 
-    @precondition(lambda self: not self.known.is_over)
     @rule()
     def settle(self) -> None:
+        self._settle()
+
+    def _settle(self) -> str:
         """If nothing else happens it comes to rest, or waits, or gives up."""
         for _ in range(30):
             step = self._next()
             self._apply(step)
             if step.kind in ("rest", "wait", "fall"):
-                return
+                return step.kind
         raise AssertionError(f"it does not come to rest: {self.known}")
+
+    @rule()
+    def have_quiet_time(self) -> None:
+        """All that is not there starts, is heard of, and joins."""
+        if self.known.joining:
+            self.join()
+        while self._settle() == "wait":
+            self.pass_time(HOPELESS)
+        for name in NAMES:
+            self.start(name, 2)
+            self.beat(name)
+            self.ask_to_join(name)
+            if self.known.joining:
+                self.join()
+        assert self._settle() == "rest"
+        assert self.known.is_whole(self.lives)
 
     @invariant()
     def one_leads(self) -> None:
         known = self.known
         assert known.primary is None or known.leading is None
-        assert known.is_over or known.primary is None or known.primary in known.members
+        assert known.primary is None or known.primary in known.members
         assert {(one, life) for one, life in known.members.items()} <= self.holders
         peer = known.peer_of("r1", self.lives)
         assert peer is None or (known.keeps_members and known.is_well(peer, self.lives) and peer != "r1")
@@ -227,7 +264,21 @@ class FailingOver(RuleBasedStateMachine):
 
 
 TestFailingOver = FailingOver.TestCase
-TestFailingOver.settings = settings(max_examples=100, stateful_step_count=50, deadline=None)
+TestFailingOver.settings = settings(max_examples=200, stateful_step_count=50, deadline=None)
+
+
+def test_who_has_died_while_it_joined_is_forgotten_before_its_next_life_joins() -> None:
+    known = Membership(NAMES, 1, "r1", members={"r1": 1}, joining={"r2": 1}, up={"r2": 1})
+    lives = {"r1": 1, "r2": 2}
+    assert next_step(known, lives, 0.0, HOPELESS) == ("forget", "r2")
+    del known.joining["r2"]
+    known.dropped.add("r2")
+    assert known.hear("r2", 2) == "new"
+    assert not known.may_join("r2", lives)
+    assert next_step(known, lives, 0.0, HOPELESS).kind == "tell"
+    known.dropped.clear()
+    assert known.may_join("r2", lives)
+    assert next_step(known, lives, 0.0, HOPELESS).kind == "rest"
 
 
 def feed(number: int) -> Feed:
@@ -311,15 +362,16 @@ class Delivering(RuleBasedStateMachine):
         if not any(one.feed.id in self.open for one in out.requests):
             assert delivery.end_batch(out.number) is out
             self.had -= {one.feed.id for one in out.requests}
+            assert delivery.careful.isdisjoint(one.feed.id for one in out.requests)
             assert delivery.out is None
 
-    @rule(careful=st.booleans(), has_begun=st.booleans())
-    def another_leads(self, careful: bool, has_begun: bool) -> None:
+    @rule(careful=st.booleans(), data=st.data())
+    def another_leads(self, careful: bool, data: st.DataObject) -> None:
         delivery, out = self.delivery, self.delivery.out
         sent = [] if out is None else [one.feed.id for one in out.requests if one.feed.id in self.open]
         suspect = delivery.only_suspect_input()
         assert suspect == (sent[0] if out is not None and len(out.requests) == 1 and sent else -1)
-        begun = sent[0] if has_begun and sent else -1
+        begun = data.draw(st.sampled_from([-1, *sent]), label="begun")
         delivery.send_again(self.open, begun, careful=careful)
         self.had |= set(sent)
         self.had &= self.open.keys()
@@ -343,7 +395,10 @@ class Delivering(RuleBasedStateMachine):
     @invariant()
     def what_is_inside_is_known(self) -> None:
         delivery = self.delivery
-        assert delivery.inside & self.open.keys() == self.had
+        assert delivery.inside & self.open.keys() == self.had & self.open.keys()
+        sent = set[int]() if delivery.out is None else {one.feed.id for one in delivery.out.requests}
+        waiting = {one.id for one in delivery.waiting if isinstance(one, Feed)}
+        assert delivery.inside <= self.open.keys() | sent | waiting
         assert delivery.is_idle == (delivery.out is None and not delivery.waiting)
         assert self.open.keys() <= delivery.fed.keys()
 
