@@ -82,7 +82,7 @@ def _pid(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> int:
     """The process of the replica that leads."""
     group = engine.group_of(ref)
     assert group is not None
-    return system._workers.processes()[f"{ref.path}/ftm/{group.primary}"]
+    return system._workers.processes()[f"{ref.path}/ftm/{group.membership.primary}"]
 
 
 # -- latency and throughput -------------------------------------------------------------------------------------------
@@ -189,11 +189,11 @@ async def _stopped(run: Run) -> None:
                 await asyncio.sleep(0.2)
                 group = engine.group_of(ref)
                 assert group is not None
-                assert group.primary is not None
-                stopped = group.primary
+                assert group.membership.primary is not None
+                stopped = group.membership.primary
                 os.kill(_pid(system, ref), signal.SIGSTOP)
                 await ref.ask(Bump(), timeout=30.0)
-                waits.append((asyncio.get_running_loop().time() - group.suspected_at[stopped]) * 1e3)
+                waits.append((asyncio.get_running_loop().time() - group.membership.suspected[stopped].since) * 1e3)
     job = "SIGSTOP to the next reply beyond the detector's time-out"
     run.bound(f"{job}, median", statistics.median(waits), unit="ms", target=20.0)
     run.bound(f"{job}, slowest", max(waits), unit="ms", target=20.0)

@@ -2,26 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from ..events import BackgroundWorkLost
-
 if TYPE_CHECKING:
+    from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import Out, PipeDone
-    from ..group.group import Group
 
 
 class Background:
-    """What is out of it, as far as the home knows."""
+    """What is out of it, as far as the home knows; `on_lost` is told how much of it will not come back."""
 
-    def __init__(self, group: Group) -> None:
-        self._group = group
+    def __init__(self, switch: Switch, on_lost: Callable[[int], None]) -> None:
+        self._switch, self._on_lost = switch, on_lost
         self._out: set[tuple[int, int]] = set()  # by turn and output
         self._told: set[tuple[int, int]] = set()  # said to be lost; a follower may have begun it too
 
     def note(self, turn: int, outs: list[Out]) -> None:
         """A turn has begun some."""
-        done = self._group.switch.ledger.pipes_done.get(turn, ())
+        done = self._switch.ledger.pipes_done.get(turn, ())
         self._out.update((turn, out.k) for out in outs if out.verb == "pipe" and out.k not in done)
 
     def back(self, record: PipeDone) -> bool:
@@ -37,8 +36,8 @@ class Background:
         """
         lost = {one for one in self._out if turn is None or one[0] <= turn}
         self._out -= lost
-        if not lost or self._group.switch.method.replays:
-            return bool(lost)
-        self._told |= lost
-        self._group.node.emit(BackgroundWorkLost(self._group.path, self._group.epoch, len(lost)))
-        return False
+        if lost and not self._switch.method.replays:
+            self._told |= lost
+            self._on_lost(len(lost))
+            return False
+        return bool(lost)

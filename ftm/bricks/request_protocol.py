@@ -21,7 +21,7 @@ from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, message_name
 from ...checkpoint.protocol import DROPPED, Answer, TurnEnd
 from ..alarms import RequestsDropped
-from ..group.behind import is_still_due
+from .behind import is_still_due
 from .brick_messages import (
     MOST_REQUESTS,
     CannotLead,

@@ -7,6 +7,7 @@ it is protected: nothing is kept of what it has handled, and when no replica is 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable
@@ -36,30 +37,23 @@ from ..bricks.replica_orders import Finish, Install, Setting
 from ..events import ReplicaLost
 from ..model.detection import Detection
 from ..model.mechanism import NOTHING, compose, detection_in, has_state_access
+from .adaptation_engine import AdaptationEngine
 from .detector import Detector
-from .failover import FailoverManager, why_ended
-from .group import Group, Look
+from .failover import FailoverManager
+from .group import Group
 from .join import Joiner
-from .membership import fault_of
+from .membership import LookAgain, Membership
 from .probation import Probation
-from .proxy import Proxy, Settle
-from .reconfiguration import (
-    OVER,
-    PREPARING,
-    REST_WITHIN,
-    TIDYING,
-    AdaptationEngine,
-    CannotAdapt,
-    Reconfiguration,
-    names_for,
-)
-from .steering import bind, bind_again, give_order
+from .proxy import Proxy, TakeAll
+from .reconfiguration import CannotAdapt, Reconfiguration, names_for
+from .replicas import fault_of
+from .steering import bind, give_order
 from .transient_homes import UNKEPT, TransientHome, is_unkept
 
 if TYPE_CHECKING:
     from ...actors.control.orders_lane import Call
     from ...checkpoint.home.switch import Switch
-    from ...checkpoint.protocol import TurnEnd
+    from ...checkpoint.protocol import Live, TurnEnd
     from ..model.mechanism import Mechanism
 
 LED_WITHIN = 60.0
@@ -70,11 +64,11 @@ FINISHED_WITHIN = 3600.0
 """Seconds that `on_stop` may take; whoever has ordered the end keeps the time."""
 REPLICA_SHUTDOWN = 20.0
 """Seconds that a replica may take to end its bricks, before its process is killed."""
+REPLICA_BACKOFF = Backoff(initial=0.01, maximum=2.0, reset_after=5.0)
 BUILT_WITHIN = 60.0
 """Seconds that the processes of a group may take to come up."""
-BRICKS_INTENSITY = 100
-"""Ends of parts and replicas within `BRICKS_PERIOD` seconds after which the whole group is given up."""
-BRICKS_PERIOD = 5.0
+BRICKS_FLAGS = Flags(intensity=100, period=5.0)
+"""How many ends of parts and replicas, within how many seconds, do not give up the whole group."""
 
 
 class GroupPlace(Place):
@@ -98,7 +92,6 @@ class GroupPlace(Place):
         self._ending: asyncio.Task[None] | None = None
         self._stop_wanted: ExitReason | None = None
         self._careful: set[int] = set()
-        self._joined: asyncio.Future[None] | None = None
 
     @property
     def detection(self) -> Detection:
@@ -158,27 +151,24 @@ class GroupPlace(Place):
         """
         names = tuple(f"r{number}" for number in range(1, max(layer.replicas for layer in self.layers) + 1))
         self.epoch += 1
-        group = self.group = Group(
-            cell, switch, names, epoch=self.epoch, config=self.config, detection=self.detection
-        )  # fmt: skip
-        group.careful = {key for key in self._careful if key in switch.open}
-        self.take_over(cell, group)
-        group.is_held = len(names) > 1
-        group.keeps_members = any(layer.keeps_members for layer in self.layers)
-        group.secure(self.layers[0])
-        if group.link is not None:
-            await group.link.ready()
+        group = self.group = Group(cell, switch, self, Membership(names, self.epoch))
+        group.delivery.careful = {key for key in self._careful if key in switch.open}
+        if self.probation is not None:
+            self.probation.moved(group)
+        group.delivery.is_held = len(names) > 1
+        group.membership.keeps_members = any(layer.keeps_members for layer in self.layers)
+        group.replicas.secure(self.layers[0])
+        if group.replicas.link is not None:
+            await group.replicas.link.ready()
         ftm = cell.node.cell_below(cell, "ftm")
         ftm.extra()
-        recipe = Start(
-            Supervisor, (Flags(intensity=BRICKS_INTENSITY, period=BRICKS_PERIOD), self._children(cell, group))
-        )
+        recipe = Start(Supervisor, (BRICKS_FLAGS, self._children(cell, group)))
         try:
             up = lifecycle.begin(ftm, recipe)
         except BaseException:
             lifecycle.retire(ftm, "it could not be started")
             raise
-        ftm.ended().add_done_callback(lambda done: self._parts_ended(cell, group))
+        ftm.ended().add_done_callback(lambda done: self._parts_ended(group))
         if up is not None:
             done, _ = await asyncio.wait((up,), timeout=BUILT_WITHIN)
             if not done:
@@ -186,39 +176,20 @@ class GroupPlace(Place):
             up.result()
         return group
 
-    def take_over(self, cell: Cell, group: Group) -> None:
-        """What happens to the group happens to the life at the address."""
-        group.on_live = group.switch.from_life
-        group.on_over = lambda why: self._fell(cell, group)
-        group.on_start_failed = lambda end: self._start_failed(cell, end)
-        group.on_ended = lambda reason: self._ended_itself(cell, unpack_exit(reason))
-        group.on_joined = self._has_joined
-        group.on_fault = lambda name, why: self._at_fault(group, name, why)
-        group.drops = lambda end: self.probation is not None and self.probation.drops(end)
-        group.back_to = lambda: self._back_to(group)
-        group.went_back = lambda back: self._went_back(cell, group, back)
-        if self.probation is not None:
-            self.probation.moved(group)
-        group.on_joining = lambda name: bind_again(cell, group, name)
-
     def _children(self, cell: Cell, group: Group) -> tuple[ChildSpec, ...]:
         parts = (
             child("proxy", Start(Proxy, (group,))),
-            child("detector", Start(Detector, (group,))),
+            child("detector", Start(Detector, (group.replicas,))),
             child("failover", Start(FailoverManager, (group, self._step))),
             child("join", Start(Joiner, (group,))),
-            child("adapt", Start(AdaptationEngine, (group, *self._adapting(cell, group), self._step))),
+            child("adapt", Start(AdaptationEngine, (group, self._step))),
         )
-        return parts + tuple(self._replica_spec(cell, name, self.config, self.layers) for name in group.names)
+        return parts + tuple(self.replica_spec(cell, name, self.config, self.layers) for name in group.membership.names)
 
-    def _replica_spec(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> ChildSpec:
-        return child(
-            name,
-            self._replica_start(cell, name, config, layers),
-            isolation="process",
-            shutdown=REPLICA_SHUTDOWN,
-            backoff=Backoff(initial=0.01, maximum=2.0, reset_after=5.0),
-        )
+    def replica_spec(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> ChildSpec:
+        """How a replica is started that has the stack with this number."""
+        start = self._replica_start(cell, name, config, layers)
+        return child(name, start, isolation="process", shutdown=REPLICA_SHUTDOWN, backoff=REPLICA_BACKOFF)
 
     def _replica_start(self, cell: Cell, name: str, config: int, layers: tuple[Mechanism, ...]) -> Start[Any]:
         more = cell.extra()
@@ -233,12 +204,7 @@ class GroupPlace(Place):
     # -- other mechanisms -------------------------------------------------------------------------------------------
 
     async def adapt(
-        self,
-        cell: Cell,
-        mechanism: Any,
-        switched: Callable[[], None],
-        rest_within: float = REST_WITHIN,
-        gate: Gate | None = None,
+        self, cell: Cell, mechanism: Any, switched: Callable[[], None], gate: Gate | None = None
     ) -> Reconfiguration:
         """Go on with another stack of mechanisms.
 
@@ -246,59 +212,60 @@ class GroupPlace(Place):
             cell: the address.
             mechanism: the whole new stack.
             switched: called at the instant from which on it is the one.
-            rest_within: seconds within which what is inside has to come to its end.
             gate: where it waits when all is ready.
 
         Raises:
             CannotAdapt: why it stays as it was.
         """
         group = self.group
-        if group is None or group.is_over or self._ending is not None:
+        if group is None or group.membership.is_over or self._ending is not None:
             raise CannotAdapt(cell.path, "it is being recovered; try again")
-        for back in (group.change, group.gone_back):
+        for back in (group.adaptation.change, group.adaptation.gone_back):
             if back is not None and back.is_back and not back.outcome.done():  # It is told as settled, and ends soon.
                 await asyncio.wait((back.outcome,))
-                return await self.adapt(cell, mechanism, switched, rest_within, gate)
-        if group.change is not None:
+                return await self.adapt(cell, mechanism, switched, gate)
+        if group.adaptation.change is not None:
             raise CannotAdapt(cell.path, "it is being changed already")
-        self.last_config += 1
-        change = group.change = Reconfiguration(group, self.last_config, compose(mechanism), rest_within)
-        change.gate = gate
-        self.on_switched = switched
-        group.tell("adapt", Look())
+        change = self._change(group, compose(mechanism))
+        change.gate, group.adaptation.change, self.on_switched = gate, change, switched
+        group.replicas.tell("adapt", LookAgain())
         await asyncio.shield(change.outcome)
         return change
 
+    def _change(self, group: Group, layers: tuple[Mechanism, ...], *, is_back: bool = False) -> Reconfiguration:
+        self.last_config += 1
+        path, names, loop = group.replicas.path, names_for(group.membership, layers), group.replicas.node.loop
+        return Reconfiguration(path, self.last_config, layers, names, loop, group.stir_engine, is_back)
+
     # -- probation --------------------------------------------------------------------------------------------------
 
-    def _put_on_probation(
-        self, cell: Cell, group: Group, before: tuple[Mechanism, ...], change: Reconfiguration
-    ) -> None:
-        earlier = self.probation
-        if earlier is not None and earlier.is_over:
-            earlier = None
-        self.probation = Probation(
-            group, before, change, earlier, lambda: self._begin_going_back(cell), self._probation_over
-        )  # fmt: skip
+    def _put_on_probation(self, group: Group, before: tuple[Mechanism, ...]) -> None:
+        earlier = None if self.probation is None or self.probation.is_over else self.probation
+        self.probation = Probation(group, before, earlier)
 
-    def attached(self, cell: Cell, group: Group) -> None:
+    def attached(self, group: Group) -> None:
         """There was no mechanism before."""
-        change = Reconfiguration(group, self.config, self.layers, REST_WITHIN)
-        self._put_on_probation(cell, group, NOTHING, change)
-        group.copy = group.switch.ledger.newest
+        self._put_on_probation(group, NOTHING)
+        group.copies.begin()
 
-    def _probation_over(self, probation: Probation) -> None:
+    def probation_over(self, probation: Probation) -> None:
+        """It is known whether a stack stays; the one before may not be trusted either."""
         if self.probation is probation:
             earlier = probation.earlier
             is_wanted = not probation.settled.result().is_kept and earlier is not None and not earlier.is_over
             self.probation = earlier if is_wanted else None
 
-    def _at_fault(self, group: Group, name: str, why: str) -> None:
+    def at_fault(self, group: Group, name: str, why: str) -> None:
         """A replica fails by its own doing: what it prepares is given up; a stack that is new gives way."""
-        if group.change is not None and group.change.is_preparing and not group.change.is_back:
-            group.change.give_up(f"{name} has failed when it prepared it: {why}")
+        change = group.adaptation.change
+        if change is not None and change.preparation.is_under_way and not change.is_back:
+            change.give_up(f"{name} has failed when it prepared it: {why}")
         if self.probation is not None and group is self.group:
             self.probation.failed(f"{name}: {why}")
+
+    def drops(self, end: TurnEnd) -> bool:
+        """Whether a request that bricks have let fall is asked again, of the stack before."""
+        return self.probation is not None and self.probation.drops(end)
 
     def _judge(self, cell: Cell, fault: str, why: str) -> None:
         """No replica is left: if that is the fault of a stack that is new, the next life begins with the one before."""
@@ -317,7 +284,7 @@ class GroupPlace(Place):
         self.parent.respecified(cell, self.spec_data(cell))
 
     def described(self) -> list[Any]:
-        """The mechanisms as data."""
+        """Describe the stack of mechanisms as data."""
         return [msgspec.to_builtins(layer.describe()) for layer in self.layers]
 
     def spec_data(self, cell: Cell) -> dict[str, Any]:
@@ -327,66 +294,54 @@ class GroupPlace(Place):
             said |= {"isolation": cell.spec.isolation, "limits": limits_data(cell.spec.limits)}
         return said
 
-    def _back_to(self, group: Group) -> Reconfiguration | None:
-        """What whoever leads next has to be brought to first."""
+    def back_to(self, group: Group) -> Reconfiguration | None:
+        """Find the stack that whoever leads next has to be brought to first."""
         probation = self.probation
         if probation is None or probation.is_over or not probation.why or group is not self.group:
             return None
         if probation.back is None or probation.back.outcome.done():
-            self.last_config += 1
-            probation.back = Reconfiguration(group, self.last_config, probation.before, REST_WITHIN)
-            probation.back.is_back = True
+            probation.back = self._change(group, probation.before, is_back=True)
         return probation.back
 
-    def _begin_going_back(self, cell: Cell) -> None:
+    def begin_going_back(self) -> None:
         """Go back while the group is led; if nobody leads now, whoever leads next is brought back."""
         group = self.group
-        if group is None or group.is_over or self._ending is not None:
+        if group is None or group.membership.is_over or self._ending is not None:
             return
-        other = group.change
+        other = group.adaptation.change
         if other is not None:
             other.give_up("the mechanism before comes back")  # Tried again soon.
             return
-        back = self._back_to(group)
-        if back is not None and back.stage == PREPARING:
-            group.change = back
-            group.tell("adapt", Look())
+        back = self.back_to(group)
+        if back is not None and back.stage == "preparing":
+            group.adaptation.change = back
+            group.replicas.tell("adapt", LookAgain())
 
-    def _went_back(self, cell: Cell, group: Group, back: Reconfiguration) -> None:
+    def went_back(self, group: Group, back: Reconfiguration) -> None:
         """Whoever is to lead has the stack before, and so have all that are started from now on."""
-        if back.stage == OVER or back is not self._back_to(group):
+        if back.stage == "over" or back is not self.back_to(group):
             return
-        back.stage = TIDYING
-        back.names = names_for(group, back.layers)
-        self._switch_to(cell, group, back)
-        if group.change is not back:
-            group.gone_back = back
-        group.tell("adapt", Look())
+        back.stage = "tidying"
+        back.names = names_for(group.membership, back.layers)
+        self.switch_to(group, back)
+        if group.adaptation.change is not back:
+            group.adaptation.gone_back = back
+        group.replicas.tell("adapt", LookAgain())
 
-    def _adapting(self, cell: Cell, group: Group) -> tuple[Any, Any]:
-        """What the engine needs of us: the spec of a replica, and how a change is made to last."""
-
-        def spec(name: str, config: int, layers: tuple[Mechanism, ...]) -> ChildSpec:
-            return self._replica_spec(cell, name, config, layers)
-
-        def switched(change: Reconfiguration) -> None:
-            self._switch_to(cell, group, change)
-
-        return spec, switched
-
-    def _switch_to(self, cell: Cell, group: Group, change: Reconfiguration) -> None:
-        """This stack is the one from now on."""
-        before, probation = self.layers, self.probation
+    def switch_to(self, group: Group, change: Reconfiguration) -> None:
+        """This stack is in force from now on."""
+        before, probation, cell, replicas = self.layers, self.probation, group.replicas.cell, group.replicas
         self.layers, self.config = change.layers, change.config
-        group.config, group.detection = change.config, self.detection
-        group.keeps_members = any(layer.keeps_members for layer in change.layers)
-        group.secure(change.layers[0], change.link)
-        for name in group.names:
-            one = group.cell_of(name)
+        group.adaptation.config = change.config
+        group.membership.keeps_members = any(layer.keeps_members for layer in change.layers)
+        replicas.watch_as(self.detection)
+        replicas.secure(change.layers[0], change.link)
+        for name in group.membership.names:
+            one = replicas.cell_of(name)
             if one is not None:
                 respec(one, self._replica_start(cell, name, change.config, change.layers))
         if not change.is_back:
-            self._put_on_probation(cell, group, before, change)
+            self._put_on_probation(group, before)
             self.on_switched()
             self.parent.respecified(cell, self.spec_data(cell))
         elif probation is not None:
@@ -404,11 +359,11 @@ class GroupPlace(Place):
         Raises:
             StartFailed: it could not.
         """
-        first = group.names[0]
-        life = group.life_of(first)
+        known, replicas = group.membership, group.replicas
+        first = known.names[0]
+        life = replicas.life_of(first)
         if not life:
-            raise StartFailed(group.path, f"{first} has ended")
-        protocol = group.protocol(first)
+            raise StartFailed(replicas.path, f"{first} has ended")
         try:
             pieces = switch.restore_records()
             if not pieces and switch.ledger.state_turn >= 0:
@@ -416,118 +371,107 @@ class GroupPlace(Place):
             traps = traps or any(piece.traps for piece in pieces)
             for index, piece in enumerate(pieces, 1):
                 is_last = index == len(pieces)
-                await protocol.ask(
-                    Install(group.epoch, switch.ledger.state_turn, piece.data, switch.ledger.stash, is_last, [], traps),
-                    LED_WITHIN,
-                )
-            await protocol.ask(Lead(group.epoch, group.config), LED_WITHIN)
+                turn, stash = switch.ledger.state_turn, switch.ledger.stash
+                order = Install(known.epoch, turn, piece.data, stash, is_last, [], traps)
+                await replicas.ask(first, order, LED_WITHIN)
+            await replicas.ask(first, Lead(known.epoch, self.config), LED_WITHIN)
         except HoldfastError as error:
-            raise StartFailed(
-                group.path, f"{first} cannot lead: {await why_ended(group, first, life, error)}"
-            ) from error
-        group.members[first] = life
-        group.primary, group.is_begun = first, True
-        group.bind_proxy()
-        group.watch(first)
-        group.wake()
+            why = await replicas.why_ended(first, life, error)
+            raise StartFailed(replicas.path, f"{first} cannot lead: {why}") from error
+        known.members[first] = life
+        known.primary, known.is_begun = first, True
+        replicas.bind_proxy()
+        replicas.watch(first)
+        replicas.wake()
 
     async def protected(self, group: Group) -> None:
         """Wait until somebody could take over, but not for ever: then it goes on alone, and says so."""
-        if len(group.names) == 1 or len(group.members) > 1 or group.is_over:
-            group.go_on()
-            return
-        joined = self._joined = group.node.loop.create_future()
-        group.wake()
-        done, _ = await asyncio.wait((joined,), timeout=JOINED_WITHIN)
-        self._joined = None
-        if not done:
-            group.node.emit(ReplicaLost(group.path, group.names[1], group.epoch, "it has not caught up yet"))
-        if group.is_over:
-            raise StartFailed(group.path, group.why)
+        known, replicas = group.membership, group.replicas
+        if len(known.names) > 1 and len(known.members) < 2 and not known.is_over:
+            replicas.wake()
+            try:
+                async with asyncio.timeout(JOINED_WITHIN):
+                    await replicas.have_backup()
+            except TimeoutError:
+                replicas.node.emit(ReplicaLost(replicas.path, known.names[1], known.epoch, "it has not caught up yet"))
+            if known.is_over:
+                raise StartFailed(replicas.path, known.why)
         group.go_on()
 
-    def _has_joined(self) -> None:
-        if self._joined is not None and not self._joined.done():
-            self._joined.set_result(None)
+    def life_is_up(self, group: Group, live: Live) -> None:
+        """The life has caught up."""
+        group.switch.from_life(live)
 
-    def _start_failed(self, cell: Cell, end: TurnEnd) -> None:
-        error = (
-            cell.node.codec.decode_error(end.answer.kind, end.answer.name, end.answer.body) if end.answer.kind else ""
-        )
-        switch = self.home.switch
-        if switch is not None:
-            switch.life.fail(StartFailed(cell.path, f"on_start raised {error}" if error else "on_start raised"))
+    def start_failed(self, group: Group, end: TurnEnd) -> None:
+        """The actor could not be started."""
+        kind, name, body = end.answer.kind, end.answer.name, end.answer.body
+        error = group.replicas.node.codec.decode_error(kind, name, body) if kind else ""
+        self._fail(group, f"on_start raised {error}" if error else "on_start raised")
+
+    def _fail(self, group: Group, why: str) -> None:
+        if self.home.switch is not None:
+            self.home.switch.life.fail(StartFailed(group.replicas.path, why))
 
     # -- ending -----------------------------------------------------------------------------------------------------
 
-    def _fell(self, cell: Cell, group: Group) -> None:
+    def has_fallen(self, group: Group, why: str) -> None:
         """No replica is left that could lead: the life is over, and whose fault it was may be known."""
+        cell, replicas, delivery = group.replicas.cell, group.replicas, group.delivery
         if cell.host.place is not self:
             return  # It has never been its life: another one goes on.
-        self._has_joined()
-        suspect = group.only_suspect_input()
-        self._careful = {one.feed.id for one in group.out.requests} if group.out is not None else set()
-        first = group.cell_of(group.names[0])
-        reason: ExitReason = KILLED if first is None or first.more is None else first.more.reason
-        for name in group.names:
-            one = group.cell_of(name)
-            if one is not None and one.more is not None and not one.more.reason.is_clean:
-                reason = one.more.reason
-        if self._starting is not None and not self._starting.done() and not group.is_live:
-            switch = self.home.switch
-            if switch is not None:
-                switch.life.fail(StartFailed(cell.path, group.why))
+        self._careful = set() if delivery.out is None else {one.feed.id for one in delivery.out.requests}
+        if self._starting is not None and not self._starting.done() and not delivery.is_live:
+            self._fail(group, why)
             return
-        self._begin_end(cell, reason, suspect)
+        cells = [replicas.cell_of(name) for name in group.membership.names]
+        ends = [None if one is None or one.more is None else one.more.reason for one in cells]
+        faults = [reason for reason in ends if reason is not None and not reason.is_clean]
+        self._begin_end(cell, faults[-1] if faults else ends[0] or KILLED, delivery.only_suspect_input())
 
-    def _parts_ended(self, cell: Cell, group: Group) -> None:
+    def _parts_ended(self, group: Group) -> None:
         """The mechanism's supervisor has given up."""
-        if group is self.group and not group.is_over:
-            group.is_over, group.why = True, "the supervisor of its mechanism has given up"
-            group.on_over(group.why)
+        if group is self.group and not group.membership.is_over:
+            group.fall("the supervisor of its mechanism has given up")
 
-    def _ended_itself(self, cell: Cell, reason: ExitReason) -> None:
+    def has_ended_itself(self, group: Group, reason: dict[str, Any]) -> None:
+        """The actor has stopped, and with it its life."""
+        cell = group.replicas.cell
         if cell.state is RUNNING and self._ending is None:
-            self._begin_end(cell, reason, -1)
+            self._begin_end(cell, unpack_exit(reason), -1)
 
     def stop(self, cell: Cell, reason: ExitReason) -> None:
         group = self.group
         if cell.state is not RUNNING or self._ending is not None:
             return
-        if group is None or not group.is_live or (self._starting is not None and not self._starting.done()):
+        if group is None or not group.delivery.is_live or (self._starting is not None and not self._starting.done()):
             self._stop_wanted = reason
             return
-        group.is_stopping = True
+        group.delivery.is_stopping = True
         context = cell.node.base_context.copy()  # Not in the name of whoever happens to tell us.
         self._ending = lifecycle.outside_turn(cell, self._finish(cell, group, reason), "stop", context)
 
     async def _finish(self, cell: Cell, group: Group, reason: ExitReason) -> None:
         """A last snapshot, then `on_stop`, by whoever leads; if that one dies of it, so be it."""
         ended: ExitReason = KILLED
-        while group.primary is not None or group.leading is not None:
-            primary, epoch = group.primary, group.epoch
-            if primary is None or group.inside:
+        known, replicas = group.membership, group.replicas
+        while known.primary is not None or known.leading is not None:
+            primary, epoch = known.primary, known.epoch
+            if primary is None or group.delivery.inside:
                 await asyncio.sleep(0.005)  # Another one is being told to lead, or knows more than the home.
                 continue
             try:
-                await group.protocol(primary).ask(Finish(epoch, dict(pack_exit(reason))), FINISHED_WITHIN)
-                await self._settled(group)
+                await replicas.ask(primary, Finish(epoch, dict(pack_exit(reason))), FINISHED_WITHIN)
+                proxy = replicas.cell_of("proxy")
+                if proxy is not None:
+                    with contextlib.suppress(HoldfastError):  # It is being restarted; its queue is kept.
+                        await proxy.ref.ask(TakeAll(), 5.0)  # All that it was told has been taken.
                 ended = reason
                 break
             except HoldfastError:
-                if group.is_over or group.is_well(primary):
+                if known.is_over or replicas.is_well(primary):
                     break
                 await asyncio.sleep(0.005)
         await self._end(cell, ended, None)
-
-    async def _settled(self, group: Group) -> None:
-        """All that has been told to the proxy has been taken."""
-        proxy = group.cell_of("proxy")
-        if proxy is not None:
-            try:
-                await proxy.ref.ask(Settle(), 5.0)
-            except HoldfastError:
-                return  # It is being restarted; its queue is kept.
 
     def kill(self, cell: Cell) -> None:
         if cell.state is DOWN and self._starting is not None:
@@ -542,8 +486,8 @@ class GroupPlace(Place):
                 self._begin_end(cell, KILLED, -1, ordered=True)
 
     def give_up(self, why: str) -> None:
-        if self.group is not None and self.group.change is not None:
-            self.group.change.give_up(why)
+        if self.group is not None and self.group.adaptation.change is not None:
+            self.group.adaptation.change.give_up(why)
 
     def end(self, cell: Cell, reason: ExitReason) -> None:
         if self._starting is not None and not self._starting.done():
@@ -564,7 +508,7 @@ class GroupPlace(Place):
         self, cell: Cell, reason: ExitReason, failed: StartFailed | None, running: int = -1, *, ordered: bool = True
     ) -> None:
         """End all replicas, then the life at the address."""
-        noticed, copy = time.monotonic(), None if self.group is None else self.group.copy
+        noticed, copy = time.monotonic(), None if self.group is None else self.group.copies.newest
         await self.dismantle(cell)
         self._ending = None
         if cell.state is not RUNNING:
@@ -589,12 +533,9 @@ class GroupPlace(Place):
         group, self.group = self.group, None
         self.ended_at = time.time()
         if group is not None:
-            group.is_over = True
-            group.hold.give_back()
-            if group.link is not None:
-                group.link.close()
-            if group.change is not None:
-                group.change.close("its life has ended")
+            group.close("its life has ended")
+            if group.replicas.link is not None:
+                group.replicas.link.close()
         ftm = (cell.children or {}).get("ftm")
         if ftm is None:
             return
@@ -610,10 +551,7 @@ class GroupPlace(Place):
         ftm = (cell.children or {}).get("ftm")
         if ftm is not None and ftm.state is not GONE:
             if self.group is not None:
-                self.group.is_over = True
-                self.group.hold.give_back()
-                if self.group.change is not None:
-                    self.group.change.close("it has stopped")
+                self.group.close("it has stopped")
             ftm.kill()
         if self.probation is not None:
             self.probation.end(is_kept=True)
@@ -628,14 +566,14 @@ class GroupPlace(Place):
     def told(self, cell: Cell, verb: str, data: dict[str, Any]) -> None:
         """Links and monitors are the home's; a binding is that of the actor in each replica."""
         if verb == "bind" and self.group is not None:
-            for name in self.group.names:
-                bind(self.group, name, data)
+            for name in self.group.membership.names:
+                bind(self.group.replicas, name, data)
 
     def is_up(self, cell: Cell) -> bool:
-        return self.group is not None and not self.group.is_over
+        return self.group is not None and not self.group.membership.is_over
 
     def running(self, cell: Cell) -> int:
-        return -1 if self.group is None else self.group.only_suspect_input()
+        return -1 if self.group is None else self.group.delivery.only_suspect_input()
 
 
 def as_spec(layers: tuple[Mechanism, ...]) -> Any:

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from ...actors.kernel.node import Node
 
 
-class Hold:
+class FailoverHold:
     """Of one group. It is had at once, or not at all: a repair that is at it loses the actor, and is not waited for.
 
     It outlives the failover manager, as all does that is known of a group: its next life goes on with what it holds.
@@ -30,7 +30,7 @@ class Hold:
         return self._grant is not None
 
     def give_back(self) -> None:
-        """The failover is over."""
+        """The failover is over: others may have the actor."""
         grant, self._grant = self._grant, None
         if grant is not None:
             arbiter_of(self._node).release(grant)

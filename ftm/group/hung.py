@@ -18,8 +18,9 @@ from ..events import TurnHung
 if TYPE_CHECKING:
     import asyncio
 
+    from ...checkpoint.home.switch import Switch
     from ...checkpoint.protocol import TurnEnd
-    from .group import Group
+    from .replicas import Replicas
 
 MOST = 2
 """Attempts after which it is the message, and not who handles it."""
@@ -34,52 +35,49 @@ ASKED_WITHIN: Final = 2.0
 class Stuck:
     """Which inputs have held up a replica, and which are to be put aside."""
 
-    def __init__(self, group: Group) -> None:
-        self._group = group
+    def __init__(self, replicas: Replicas, switch: Switch) -> None:
+        self._replicas, self._switch = replicas, switch
         self._counted: set[tuple[int, int]] = set()  # epoch and input
         self._given_up: set[int] = set()
         self._telling: asyncio.Future[Any] | None = None
 
     def told(self, stalled: Stalled) -> None:
         """A replica says that the turn of an input has taken it too long."""
-        group, name, number = self._group, stalled.name, stalled.number
-        life = group.life_of(name)
-        if stalled.epoch != group.epoch or group.members.get(name) != life:
+        replicas, known, waiting = self._replicas, self._replicas.membership, self._switch.open
+        name, number = stalled.name, stalled.number
+        life, why = replicas.life_of(name), f"it does not end the turn of input {number}"
+        if stalled.epoch != known.epoch or known.members.get(name) != life:
             return
-        if name != group.primary:
+        source = waiting.get(number)
+        if name != known.primary:
             # A follower may wait for what the one that leads has not got either: that one is looked at then.
-            if group.primary is not None and number not in group.switch.open:
-                self._suspect(name, life, number)
+            if known.primary is not None and source is None:
+                replicas.suspect(name, life, why)
             return
-        source = group.switch.open.get(number)
         if source is None:
             return  # Its end is known: the turn is over by now.
-        self._counted = {one for one in self._counted if one[1] in group.switch.open}
-        if (group.epoch, number) not in self._counted:
-            self._counted.add((group.epoch, number))
+        self._counted = {one for one in self._counted if one[1] in waiting}
+        if (known.epoch, number) not in self._counted:
+            self._counted.add((known.epoch, number))
             source.deliveries += 1
-            group.node.emit(TurnHung(group.path, name, group.epoch, source.name, source.deliveries))
-        if source.deliveries >= min(MOST, group.switch.method.max_deliveries):
+            replicas.node.emit(TurnHung(replicas.path, name, known.epoch, source.name, source.deliveries))
+        if source.deliveries >= min(MOST, self._switch.method.max_deliveries):
             self._given_up.add(number)
             self._tell(name, number, again=False)
-        elif group.backups():
-            self._suspect(name, life, number)
+        elif replicas.backups():
+            replicas.suspect(name, life, why)
         else:
             self._tell(name, number, again=True)
-
-    def _suspect(self, name: str, life: int, number: int) -> None:
-        self._group.suspect(name, life, f"it does not end the turn of input {number}")
 
     def _tell(self, name: str, number: int, *, again: bool) -> None:
         """Have it end the turn; if that gets lost, it will be heard of again."""
         if self._telling is not None and not self._telling.done():
             return
-        group = self._group
+        attempt = self._replicas.membership.epoch, number
         try:
-            self._telling = group.protocol(name).ask(EndTurn(group.epoch, number, again), ANSWERED_WITHIN)
+            self._telling = self._replicas.ask(name, EndTurn(*attempt, again), ANSWERED_WITHIN)
         except HoldfastError:
             return  # It has died.
-        attempt = group.epoch, number
 
         def told(done: asyncio.Future[Any]) -> None:
             if not done.cancelled() and done.exception() is None and again:
@@ -92,28 +90,29 @@ class Stuck:
         if end.id not in self._given_up:
             return False
         self._given_up.discard(end.id)
-        source = self._group.switch.open.get(end.id)
+        source = self._switch.open.get(end.id)
         if source is None or end.status != FAILED:
             return False
-        put_into_quarantine(self._group.switch, source)
+        put_into_quarantine(self._switch, source)
         return True
 
 
-async def end_stuck(group: Group) -> str | None:
+async def end_stuck(replicas: Replicas, turn: int) -> str | None:
     """Have a follower replaced whose bricks have let nothing pass, though its actor does nothing; its name.
+
+    `turn`: the last one that home knows of.
 
     Raises:
         HoldfastError: one has not answered. If it has died, that is seen elsewhere; else it is asked once more.
     """
-    for name in group.backups():
-        seconds, starved = STUCK_AFTER + group.at_work(name), group.starved(name)
-        life, order = group.members.get(name, 0), Computes(group.switch.turn, seconds)
-        doing: Doing = await group.protocol(name).ask(order, seconds + ASKED_WITHIN)
-        if doing.passes or doing.computes or name not in group.backups() or group.members.get(name) != life:
+    for name in replicas.backups():
+        seconds, starved = STUCK_AFTER + replicas.at_work(name), replicas.starved(name)
+        life = replicas.membership.members.get(name, 0)
+        doing: Doing = await replicas.ask(name, Computes(turn, seconds), seconds + ASKED_WITHIN)
+        is_same = name in replicas.backups() and replicas.membership.members.get(name) == life
+        if doing.passes or doing.computes or not is_same:
             continue
-        if group.starved(name) - starved < seconds / 2:  # Else it was no fault of theirs.
-            why = f"its bricks have let nothing pass for {STUCK_AFTER:g} s"
-            group.at_fault(name, why)
-            group.suspect(name, life, why)
+        if replicas.starved(name) - starved < seconds / 2:  # Else it was no fault of theirs.
+            replicas.blame(name, life, f"its bricks have let nothing pass for {STUCK_AFTER:g} s")
             return name
     return None

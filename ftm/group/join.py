@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from ...actors.errors import AskTimeout, HoldfastError
-from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.actor import on
 from ..bricks.brick_messages import ConfigMismatch, Follow
 from ..bricks.replica_orders import Join
 from ..bricks.sealed_frames import Refused
 from ..events import ReplicaJoined
-from .failover import bury
-from .group import Look
+from .membership import LookAgain
+from .replicas import GroupPart
+from .steering import bind_again
 
 if TYPE_CHECKING:
-    import asyncio
-
     from .group import Group
 
 FOLLOWED_WITHIN = 2.0
@@ -44,109 +43,89 @@ class Deaf(NamedTuple):
     starved: float
 
 
-class Joiner(Actor):
+class Joiner(GroupPart):
     """Has replicas that are up, and do not count, catch up with the primary."""
 
-    _is_part: ClassVar[bool] = True
-
-    deterministic = False
-
     def __init__(self, group: Group) -> None:
-        self._group = group
-        self._timer: asyncio.TimerHandle | None = None
+        self._group, self._known, self._replicas = group, group.membership, group.replicas
         self._delay = FIRST_RETRY
         self._deaf: dict[str, Deaf] = {}  # by name
 
     def on_start(self, restored: bool) -> None:
         """Whoever was about to join begins anew."""
-        self._group.is_joining = False
-        self._group.tell("join", Look())
+        self._known.is_joining = False
+        self._replicas.tell("join", LookAgain())
 
-    def on_stop(self, reason: object) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
-
-    @on(Look)
-    async def look(self, message: Look) -> None:
+    @on(LookAgain)
+    async def look(self, message: LookAgain) -> None:
         """Take in who is up."""
-        group = self._group
-        for name in group.names:
-            primary = group.primary
-            if group.is_changing or group.is_resting or (group.change is not None and group.change.is_back):
+        group, known, replicas = self._group, self._known, self._replicas
+        for name in known.names:
+            if group.is_being_changed():
                 return  # Whoever does that wakes us; until then it would come with the bricks that have failed.
-            if (
-                group.is_over
-                or not (group.is_live or group.joins_early)
-                or primary is None
-                or name == primary
-                or name in group.members
-            ):
+            primary, lives = known.primary, replicas.lives()
+            if known.is_over or primary is None or not (group.delivery.is_live or group.joins_early):
+                return  # The failover manager wakes us when one leads.
+            if not known.may_join(name, lives):
                 continue
-            life = group.life_of(name)
-            if not life or group.up.get(name) != life or group.suspects.get(name) == life or group.dropped:
-                continue
-            if name in group.strays.faulty:
-                continue  # It ends, which wakes us.
-            if (pause := group.strays.pause(name, life)) > 0:
+            life = lives[name]
+            if (pause := group.strays.pause(name, life, group.switch.turn, replicas.node.loop.time())) > 0:
                 self._later(pause)
                 continue
-            group.is_joining = True
+            known.is_joining = True
             try:
                 await self._join(primary, name, life)
             except ConfigMismatch:  # It was started before the mechanism was changed; its next life knows better.
-                await bury(group, name, life)
+                await replicas.bury(name, life)
             except HoldfastError:
                 self._later()  # If one of them has died, that is seen elsewhere.
             else:
                 self._delay = FIRST_RETRY
             finally:
-                group.joining.pop(name, None)
-                group.is_joining = False
-                group.stir()
+                known.joining.pop(name, None)
+                known.is_joining = False
+                replicas.stir()
 
     async def _join(self, primary: str, name: str, life: int) -> None:
-        group, epoch, begin = self._group, self._group.epoch, time.monotonic()
+        group, known, replicas = self._group, self._known, self._replicas
+        epoch, begin = known.epoch, time.monotonic()
         await self._tell_to_follow(name, life, epoch)
-        group.on_joining(name)
-        group.joining[name] = life
-        group.watch(name)
+        bind_again(replicas, name)
+        known.joining[name] = life
+        replicas.watch(name)
         strayed = group.strays.count
-        turn = await group.protocol(primary).ask(Join(epoch, group.place(name)), JOINED_WITHIN)
+        turn = await replicas.ask(primary, Join(epoch, replicas.place(name)), JOINED_WITHIN)
         if group.strays.count != strayed:
             return  # What it had joined with is lost already; whoever has heard of that wakes us.
-        if group.epoch != epoch or group.primary != primary or group.life_of(name) != life or group.is_over:
-            if group.epoch == epoch and group.primary == primary and group.life_of(name) != life:
-                group.dropped.add(name)  # The primary may wait for the life that has ended.
-                group.wake()
+        if known.epoch != epoch or known.primary != primary or known.is_over:
             return  # It has caught up with one that does not lead any more.
-        group.joined(name, life)
-        group.node.emit(ReplicaJoined(group.path, name, epoch, turn, time.monotonic() - begin))
-        group.wake()
+        if replicas.life_of(name) != life:
+            known.dropped.add(name)  # The primary may wait for the life that has ended.
+        else:
+            group.joined(name, life)
+            replicas.node.emit(ReplicaJoined(replicas.path, name, epoch, turn, time.monotonic() - begin))
+        replicas.wake()
 
     async def _tell_to_follow(self, name: str, life: int, epoch: int) -> None:
         """One that was started with links that are secured otherwise does not even understand that it is a mismatch."""
-        group, begin, starved = self._group, time.monotonic(), self._group.starved(name)
+        replicas, begin, starved = self._replicas, time.monotonic(), self._replicas.starved(name)
         try:
-            await group.protocol(name).ask(Follow(epoch, group.config), FOLLOWED_WITHIN)
+            await replicas.ask(name, Follow(epoch, self._group.adaptation.config), FOLLOWED_WITHIN)
         except (AskTimeout, Refused) as error:
             first = self._deaf.get(name)
             if first is None or first.life != life:
                 first = Deaf(life, 0, begin, starved)
             deaf = self._deaf[name] = first._replace(times=first.times + 1)
-            silent = time.monotonic() - first.since - group.excused(name, first.starved)
+            silent = time.monotonic() - first.since - replicas.excused(name, first.starved)
             if isinstance(error, AskTimeout) and silent < DEAF_AFTER * FOLLOWED_WITHIN:
                 raise  # It got no processor, or goes through a large state.
-            if deaf.times < DEAF_AFTER:
-                raise
-            await bury(group, name, life)  # Its next life has the present stack of mechanisms.
+            if deaf.times >= DEAF_AFTER:
+                await replicas.bury(name, life)  # Its next life has the present stack of mechanisms.
             raise
         self._deaf.pop(name, None)
 
     def _later(self, seconds: float | None = None) -> None:
         """Look again then; None: what has failed is tried again, after longer each time."""
-        loop = self.ctx.cell.node.loop
-        if self._timer is not None:
-            self._timer.cancel()
-        self._timer = loop.call_later(seconds or self._delay, self._group.tell, "join", Look())
+        self.call_later(seconds or self._delay, lambda: self._replicas.tell("join", LookAgain()))
         if seconds is None:
             self._delay = min(self._delay * 2, LONGEST_RETRY)

@@ -1,79 +1,251 @@
-"""Who of a group of replicas is up, is suspected, counts, and leads."""
+"""Who of a group of replicas is up, is suspected, counts, and leads; and what failover does next: data and decisions.
+
+Nothing here waits, tells, or reads a clock. `replicas.py` has what else belongs to a change of the membership, and
+`failover.py` carries the steps out. They are told which life each replica lives now: a name to a number, 0 for none.
+"""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import math
-import os
-import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
-from ...actors.errors import HoldfastError
-from ...actors.exit_reasons import Crash, Exited, ExitReason, Hung, OutOfMemory, Shutdown, Signal
-from ...actors.kernel.cell import RUNNING, Cell
 from ...actors.kernel.message import Message
-from ...actors.process.process_watchdog import waited_for_processor
-from ..events import ReplicaLost, WrongSuspicion
-from .securing import Securing
 
 if TYPE_CHECKING:
     from ...actors.kernel.ref import ActorRef
-    from ...actors.process.worker_pool import Worker
-    from ..model.detection import Detection
+
+Lives = Mapping[str, int]
+Kind = Literal["wait", "renew", "depose", "condemn", "elect", "fall", "bury", "lead", "forget", "drop", "tell", "rest"]
 
 
-FROM_OUTSIDE: Final = frozenset({1, 2, 3, 9, 15, 19, 20})
-"""Signals (HUP, INT, QUIT, KILL, TERM, STOP, TSTP) by which others end a process, or stop it."""
-BARE: Final = 50_000_000
-"""Bytes that a replica has in memory without a state."""
-SLOWEST: Final = 20_000_000
-"""Bytes of what else it has in memory that it goes through in a second, on a busy machine."""
-OUTVOTED: Final = "OutvotedHere"
-"""The error of a replica that was outvoted, which is no fault of its bricks."""
+MOST_STRAYED = 3
+"""Times in a row that a follower may stray."""
+STEADY = 1000
+"""Turns after which it has not strayed again: the next time is the first one."""
+FIRST_PAUSE, LONGEST_PAUSE = 0.02, 2.0
+"""Seconds until it joins again; doubled each time in a row."""
 
 
-def fault_of(reason: ExitReason) -> str:
-    """Why the end of a replica may be the fault of its own code; "" if somebody else has ended it."""
-    match reason:
-        case Crash() | Hung() | OutOfMemory() | Exited():
-            why = str(reason)
-        case Signal() if reason.number not in FROM_OUTSIDE:
-            why = str(reason)
-        case Shutdown() if reason.detail:  # A replica ends so when a brick of it has crashed.
-            why = reason.detail
-        case _:
-            why = ""
-    return "" if OUTVOTED in why else why
+class LookAgain(Message):
+    """Something has happened to the group: see what is to be done."""
 
 
-def is_blocked(pid: int) -> bool:
-    """Whether the silence of a process can be the doing of its own code.
+class Suspicion(NamedTuple):
+    """Why a replica may have to be replaced."""
 
-    One that sleeps though it has something to do is blocked, by a call that does not return. One that computes may be
-    in a loop without end, or may have got no processor: where more want one than there are, that cannot be told apart.
-    One that was stopped by a signal, or waits for a disk, is silent for another reason.
+    life: int
+    why: str
+    since: float  # on the loop's clock
+    is_silence: bool = False  # nothing else is wrong with it: a sign of life clears it
+
+
+class FailoverStep(NamedTuple):
+    """What failover does next, with which replica."""
+
+    kind: Kind
+    name: str = ""
+
+
+@dataclasses.dataclass(slots=True)
+class Membership:
+    """The replicas of one group, and who of them leads.
+
+    Attributes:
+        names: the replicas that there are to be.
+        epoch: it rises with each change of who leads.
+        primary: the one that leads.
+        leading: the one that is to lead in this epoch: `Lead` may or may not have reached it.
+        renewing: the primary, if it is to lead anew, with other bricks.
+        why: the last one does not lead any more.
+        noticed: since when that is known, on the monotonic clock; 0.0 if nothing is the matter.
+        keeps_members: the next leader brings the others to its state before anything leaves, so that they stay members.
+        is_begun: somebody has led.
+        is_over: no replica leads, or will.
+        is_joining: a replica is catching up.
+        members: name to life, of those that hold all state: the primary and its backups.
+        condemned: name to life, of those that must be dead before the next one leads, or before their next life joins.
+        dropped: backups that the primary still has to forget.
+        up: name to life, of those heard of.
+        joining: name to life, of those that the primary is bringing to its state.
+        suspected: by name; it may be about an earlier life.
     """
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-    except OSError:
-        return False
-    return state == "S" or (state == "R" and os.getloadavg()[0] <= (os.cpu_count() or 1))
+
+    names: tuple[str, ...]
+    epoch: int
+    primary: str | None = None
+    leading: str | None = None
+    renewing: str | None = None
+    why: str = ""
+    noticed: float = 0.0
+    keeps_members: bool = False
+    is_begun: bool = False
+    is_over: bool = False
+    is_joining: bool = False
+    members: dict[str, int] = dataclasses.field(default_factory=dict)
+    condemned: dict[str, int] = dataclasses.field(default_factory=dict)
+    dropped: set[str] = dataclasses.field(default_factory=set)
+    up: dict[str, int] = dataclasses.field(default_factory=dict)
+    joining: dict[str, int] = dataclasses.field(default_factory=dict)
+    suspected: dict[str, Suspicion] = dataclasses.field(default_factory=dict)
+
+    # -- what there is ----------------------------------------------------------------------------------------------
+
+    def is_suspect(self, name: str, life: int) -> bool:
+        """Whether this life of a replica is suspected."""
+        suspicion = self.suspected.get(name)
+        return suspicion is not None and suspicion.life == life
+
+    def is_well(self, name: str, lives: Lives) -> bool:
+        """Whether a member is the one that was taken in, and nobody suspects it."""
+        life = self.members.get(name, 0)
+        return life > 0 and lives.get(name, 0) == life and not self.is_suspect(name, life)
+
+    def well(self, lives: Lives) -> dict[str, int]:
+        """The members that are well: name to life."""
+        return {name: life for name, life in self.members.items() if self.is_well(name, lives)}
+
+    def backups(self, lives: Lives) -> list[str]:
+        """Those that could lead instead of the primary, in order."""
+        return [name for name in self.names if name not in (self.primary, self.leading) and self.is_well(name, lives)]
+
+    def is_awaited(self, name: str, lives: Lives, now: float, hopeless: float) -> bool:
+        """Whether a member that is suspected, and may yet be heard of again, is all there is."""
+        life = self.members.get(name, 0)
+        is_alive = life > 0 and lives.get(name, 0) == life
+        is_hopeless = not self.is_suspect(name, life) or now - self.suspected[name].since >= hopeless
+        return is_alive and not self.backups(lives) and not is_hopeless
+
+    def is_whole(self, lives: Lives) -> bool:
+        """Whether one replica leads, and all others could."""
+        return self.primary is not None and all(self.is_well(name, lives) for name in self.names)
+
+    def is_led(self, lives: Lives) -> bool:
+        """Whether one replica leads, and nobody has to be told so, or of a death, or catches up."""
+        is_well = self.primary is not None and self.leading is None and self.is_well(self.primary, lives)
+        return is_well and not self.condemned and not self.dropped and not self.is_joining
+
+    def peer_of(self, leading: str, lives: Lives) -> str | None:
+        """A member that goes on under the next leader, if its mechanism keeps its members."""
+        left = (name for name in self.names if name != leading and self.is_well(name, lives))
+        return next(left, None) if self.keeps_members else None
+
+    def watched(self, lives: Lives) -> Iterator[tuple[str, int]]:
+        """Who is expected to be heard of, and is not suspected already: name and life."""
+        for name, life in self.up.items():
+            if lives.get(name, 0) == life and not self.is_suspect(name, life):
+                yield name, life
+
+    def may_join(self, name: str, lives: Lives) -> bool:
+        """Whether a replica that does not count could catch up with the primary now."""
+        life, is_wanted = lives.get(name, 0), name != self.primary and name not in self.members
+        is_heard = life > 0 and self.up.get(name) == life and not self.is_suspect(name, life)
+        return is_wanted and is_heard and not self.dropped and name not in self.condemned
+
+    def state_of(self, name: str, life: int) -> str:
+        """How a replica does, which lives this life, in a word."""
+        if not life:
+            return "down"
+        if self.is_suspect(name, life):
+            return "silent"
+        if self.members.get(name) != life:
+            return "joining"
+        return "leads" if name == self.primary else "follows"
+
+    # -- what is heard of them --------------------------------------------------------------------------------------
+
+    def hear(self, name: str, life: int) -> Literal["new", "again", "cleared", "known"]:
+        """Take down a sign of life: of a new life, or of one that was suspected for its silence, or for something else.
+
+        Only a suspicion for silence is cleared; of a "known" suspect nothing else is taken down.
+        """
+        is_suspect = self.is_suspect(name, life)
+        if is_suspect and not self.suspected[name].is_silence:
+            return "known"
+        if is_suspect:
+            del self.suspected[name]
+        is_new, self.up[name] = self.up.get(name) != life, life
+        return "new" if is_new else "cleared" if is_suspect else "again"
+
+    def expect(self, name: str) -> None:
+        """A replica is about to be started, and none of its name is there: what is known is of an earlier one.
+
+        The lives of each are counted from one.
+        """
+        for known in (self.up, self.suspected, self.joining):
+            known.pop(name, None)
+
+    def suspect(self, name: str, suspicion: Suspicion, clock: float) -> None:
+        """A replica must be replaced, unless it is suspected for its silence and a sign of life comes in time.
+
+        Args:
+            name: of the replica.
+            suspicion: why it is suspected, and since when.
+            clock: the same moment on the monotonic clock.
+        """
+        self.suspected[name] = suspicion
+        if name in (self.primary, self.leading):
+            self.why, self.noticed = suspicion.why, clock
+
+    # -- steps of a failover ----------------------------------------------------------------------------------------
+
+    def condemn(self, name: str) -> None:
+        """It leads no longer, or will not, and must be dead before another one does."""
+        self.condemned[name] = self.members.get(name, 0)
+        self.primary, self.leading = None, None
+
+    def elect(self, name: str) -> None:
+        """Begin an epoch in which this one is to lead."""
+        self.epoch += 1
+        self.primary, self.leading, self.renewing = None, name, None
+
+    def bind(self, name: str) -> list[str]:
+        """It leads from here on; returns the members that have to catch up with it first."""
+        self.primary, self.leading, self.noticed = name, None, 0.0
+        return [] if self.keeps_members else [one for one in self.members if one != name]
 
 
-def work_on_state(pid: int) -> float:
-    """Seconds for which a process may hold its event loop to go through all that it has, if it computes; else 0.0.
+def next_step(known: Membership, lives: Lives, now: float, hopeless: float) -> FailoverStep:
+    """Decide what failover does next; one that is all there is, and silent, is given up after `hopeless` seconds.
 
-    Encoding, comparing and restoring a state do that. What it is at nobody can tell from here, only how much there is.
+    The order keeps two replicas from leading at once: the epoch rises when one is elected; those before it are buried;
+    only then it is told to lead.
     """
-    try:
-        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
-        resident = int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
-    except (OSError, IndexError):
-        return 0.0
-    return max(0, resident - BARE) / SLOWEST if state in "RD" else 0.0
+    primary, leading = known.primary, known.leading
+    if primary is not None:
+        if known.is_well(primary, lives):
+            return FailoverStep("renew", primary) if known.renewing == primary else next_tidying(known, lives)
+        is_awaited = known.is_awaited(primary, lives, now, hopeless)
+        return FailoverStep("wait" if is_awaited else "depose", primary)  # To end it would lose what only it has.
+    if leading is None:
+        left = known.backups(lives)
+        return FailoverStep("elect", left[0]) if left else FailoverStep("fall")
+    if not known.is_well(leading, lives):
+        # It may be building the actor from a large state, which nobody else has.
+        is_awaited = known.is_awaited(leading, lives, now, hopeless) and known.suspected[leading].is_silence
+        return FailoverStep("wait" if is_awaited else "condemn", leading)
+    return FailoverStep("bury", next(iter(known.condemned))) if known.condemned else FailoverStep("lead", leading)
+
+
+def next_tidying(known: Membership, lives: Lives) -> FailoverStep:
+    """Decide what follows while one leads: those that have ended, or are suspected, do not count, and nobody waits."""
+    for name, life in known.joining.items():
+        if lives.get(name, 0) != life:  # Its next life has to be told first that it follows.
+            return FailoverStep("forget", name)
+    if known.condemned:
+        return FailoverStep("bury", next(iter(known.condemned)))
+    for name in known.names:
+        if name == known.primary:
+            continue
+        if is_to_end(known, name, lives) or (name in known.members and not known.is_well(name, lives)):
+            return FailoverStep("drop", name)
+    return FailoverStep("tell" if known.dropped else "rest")
+
+
+def is_to_end(known: Membership, name: str, lives: Lives) -> bool:
+    """Whether a replica that does not lead is to be killed: the life that is known of it lives, and is suspected."""
+    life = known.members.get(name, 0) or known.up.get(name, 0)
+    return life > 0 and lives.get(name, 0) == life and known.is_suspect(name, life)
 
 
 def is_within(place: str, sender: ActorRef[Any] | None) -> bool:
@@ -81,215 +253,46 @@ def is_within(place: str, sender: ActorRef[Any] | None) -> bool:
     return sender is not None and f"{sender.path}/".startswith(f"{place}/")
 
 
-class Look(Message):
-    """Something has happened to the group: see what is to be done."""
+@dataclasses.dataclass(slots=True)
+class StrayRecord:
+    """What is known of one life of a follower."""
+
+    life: int
+    turn: int  # at which it joined last
+    times: int = 0  # in a row
+    until: float = 0.0  # it does not join before that, on the loop's clock
 
 
-class Members(Securing):
-    """The part of a group that knows its replicas."""
+@dataclasses.dataclass(slots=True)
+class Strays:
+    """Followers that have lost the leader's state: they join again, and are ended if that does not help.
 
-    def __init__(self, cell: Cell, names: tuple[str, ...], epoch: int, detection: Detection) -> None:
-        self.node, self.cell, self.path = cell.node, cell, cell.path
-        self.names, self.detection = names, detection
-        self.epoch = epoch
-        self.primary: str | None = None
-        self.leading: str | None = None  # who is to lead in this epoch: `Lead` may or may not have reached it
-        self.why = ""  # why the last one does not any more
-        self.noticed = 0.0  # and since when that is known, on the monotonic clock
-        self.keeps_members = (
-            False  # through a failover: the next leader brings them to its state before anything leaves
-        )
-        self.members: dict[str, int] = {}  # name to life, of those that hold all state: the primary and its backups
-        self.condemned: dict[str, int] = {}  # name to life, of those that must be dead before the next one leads
-        self.dropped: set[str] = set()  # backups that the primary still has to forget
-        self.up: dict[str, int] = {}  # name to life, of those heard of
-        self.joining: dict[str, int] = {}  # name to life, of those that the primary is bringing to its state
-        self.suspects: dict[str, int] = {}  # name to life
-        self.doubts: dict[str, str] = {}  # name to why it was suspected last
-        self.silences: dict[str, int] = {}  # name to life, of those suspected for their silence alone
-        self.renewing: str | None = None  # the primary, if it is to lead anew, with other bricks
-        self.suspected_at: dict[str, float] = {}  # on the loop's clock
-        self.wrong = 0  # suspicions
-        self.is_over = False
-        self._stirred: list[asyncio.Future[None]] = []
-        self._was_whole, self._whole_since = False, time.time()
-        self.on_fault: Callable[[str, str], None] = lambda name, why: None
+    A transient fault is over when the state was taken once more. Who diverges again and again is faulty: its process
+    ends, and what is started in its place joins, each time later than the time before. `turn` is the last one that
+    home knows of, each time.
+    """
 
-    def cell_of(self, name: str) -> Cell | None:
-        """The cell of an actor of the mechanism, if there is one now."""
-        return self.node.find(self.place(name))
+    records: dict[str, StrayRecord] = dataclasses.field(default_factory=dict)
+    count: int = 0
 
-    def worker_of(self, name: str) -> Worker | None:
-        """The process of a replica, if it has one now."""
-        cell = self.cell_of(name)
-        return None if cell is None else cell.host.place.process(cell)
+    def joined(self, name: str, life: int, turn: int) -> None:
+        """It has the leader's state."""
+        self._of(name, life, turn).turn = turn
 
-    def bind_proxy(self) -> None:
-        """Show who leads: the proxy is bound to its RequestProtocol."""
-        proxy = self.cell_of("proxy")
-        if proxy is not None and self.primary is not None:
-            self.node.bind(proxy, "protocol", self.node.cell_at(self.place(f"{self.primary}/protocol")))
+    def count_again(self, name: str, life: int, turn: int, now: float) -> tuple[int, bool]:
+        """It has lost the state: how often in a row, and whether it is faulty."""
+        self.count += 1
+        record = self._of(name, life, turn)
+        record.times = 1 if turn - record.turn > STEADY else record.times + 1
+        record.until = now + min(FIRST_PAUSE * 2 ** (record.times - 1), LONGEST_PAUSE)
+        return record.times, record.times >= MOST_STRAYED
 
-    def life_of(self, name: str) -> int:
-        """The number of the life that a replica lives now; 0 if none."""
-        cell = self.cell_of(name)
-        return cell.life if cell is not None and cell.state is RUNNING else 0
+    def pause(self, name: str, life: int, turn: int, now: float) -> float:
+        """Seconds until it may join again."""
+        return self._of(name, life, turn).until - now
 
-    def is_from_leader(self, sender: ActorRef[Any] | None) -> bool:
-        """Whether whoever leads, or is told to, has said this."""
-        names = self.primary, self.leading
-        return any(name is not None and is_within(self.place(name), sender) for name in names)
-
-    def is_well(self, name: str) -> bool:
-        """Whether a member is the one that was taken in, and nobody suspects it."""
-        life = self.members.get(name, 0)
-        return life > 0 and self.life_of(name) == life and self.suspects.get(name) != life
-
-    def is_awaited(self, name: str) -> bool:
-        """Whether a member that is suspected, and may yet be heard of again, is all there is."""
-        life = self.members.get(name, 0)
-        is_alive = life > 0 and self.life_of(name) == life
-        waited = self.node.loop.time() - self.suspected_at.get(name, -math.inf)
-        return is_alive and not self.backups() and waited < self.detection.hopeless
-
-    def backups(self) -> list[str]:
-        """Those that could lead instead of the primary, in order."""
-        return [name for name in self.names if name not in (self.primary, self.leading) and self.is_well(name)]
-
-    def peer_of(self, leading: str) -> str | None:
-        """The path of a member that goes on under the next leader, if its mechanism keeps its members."""
-        left = [name for name in self.names if name != leading and self.is_well(name)] if self.keeps_members else []
-        return self.place(left[0]) if left else None
-
-    def watched(self) -> Iterator[tuple[str, int]]:
-        """Who is expected to be heard of, and is not suspected already: name and life."""
-        for name, life in list(self.up.items()):
-            if self.life_of(name) == life and self.suspects.get(name) != life:
-                yield name, life
-
-    def heard(self, name: str, life: int) -> None:
-        """A replica has given a sign of life."""
-        if self.suspects.get(name) == life:
-            if self.silences.get(name) != life:
-                return  # Something else is wrong with it.
-            self.wrong += 1
-            del self.suspects[name]
-            self.node.emit(WrongSuspicion(self.path, name, self.wrong))
-        if self.up.get(name) != life:
-            self.up[name] = life
-            self.watch(name)
-            self.wake()
-
-    def watch(self, name: str) -> None:
-        """Hear of the end of a replica's present life."""
-        cell = self.cell_of(name)
-        if cell is not None and cell.state is RUNNING:
-            cell.ended().add_done_callback(lambda done: self._died(name, done))
-
-    def _died(self, name: str, done: asyncio.Future[ExitReason]) -> None:
-        if not self.noticed:
-            self.noticed = time.monotonic()
-        if not done.cancelled() and (why := fault_of(done.result())):
-            self.at_fault(name, f"its process has ended: {why}")
-        self.wake()
-
-    def expect(self, name: str) -> None:
-        """A replica is about to be started, and none of its name is there: what is known is of an earlier one.
-
-        The lives of each are counted from one.
-        """
-        for known in (self.up, self.suspects, self.silences, self.joining):
-            known.pop(name, None)
-
-    def suspect(self, name: str, life: int, why: str) -> None:
-        """A replica must be replaced; no sign of life changes that."""
-        self.silences.pop(name, None)
-        self._suspect(name, life, why)
-
-    def _suspect(self, name: str, life: int, why: str) -> None:
-        self.suspects[name], self.doubts[name] = life, why
-        self.suspected_at[name] = self.node.loop.time()
-        if name in (self.primary, self.leading):
-            self.why, self.noticed = why, time.monotonic()
-        self.wake()
-
-    def at_fault(self, name: str, why: str) -> None:
-        """A replica has ended by what its own code has done, or looks as if it had."""
-        if name in self.names and not self.is_over:
-            self.on_fault(name, why)
-
-    def silent(self, name: str, life: int, why: str) -> None:
-        """No sign of life has come from a replica for too long: unless one comes in time, it is replaced."""
-        self.silences[name] = life
-        self._suspect(name, life, why)
-        pid = self._pid_of(name)
-        if pid is not None and is_blocked(pid):
-            self.at_fault(name, why)
-
-    def starved(self, name: str) -> float:
-        """Seconds for which a replica was ready to go on and got no processor, so far."""
-        pid = self._pid_of(name)
-        return 0.0 if pid is None else waited_for_processor(pid)
-
-    def at_work(self, name: str) -> float:
-        """Seconds of silence for which its state may be the reason; never more than until it is hopeless."""
-        pid = self._pid_of(name)
-        return 0.0 if pid is None else min(work_on_state(pid), self.detection.hopeless)
-
-    def excused(self, name: str, starved: float) -> float:
-        """Seconds of a silence that need not be a replica's fault: it got no processor, or goes through its state.
-
-        `starved`: for how long it had got none when the silence began. Never more than until it is hopeless, of each.
-        """
-        return min(max(0.0, self.starved(name) - starved), self.detection.hopeless) + self.at_work(name)
-
-    def _pid_of(self, name: str) -> int | None:
-        worker = self.worker_of(name)
-        return None if worker is None else worker.pid
-
-    def broken(self, name: str, life: int, why: str) -> None:
-        """A replica ends by itself, and nobody needs to wait for that."""
-        self.suspect(name, life, why)
-        if OUTVOTED not in why:
-            self.at_fault(name, why)
-
-    def lost(self, name: str, why: str) -> None:
-        """A replica does not count any more."""
-        self.stir()
-        if self.members.pop(name, None) is not None:
-            self.node.emit(ReplicaLost(self.path, name, self.epoch, why))
-
-    def whole_since(self) -> tuple[bool, float]:
-        """Whether one replica leads and all others could, and since when that is so (by the system's clock)."""
-        is_whole = self.primary is not None and all(map(self.is_well, self.names))
-        if is_whole != self._was_whole:
-            self._was_whole, self._whole_since = is_whole, time.time()
-        return is_whole, self._whole_since
-
-    def stirred(self) -> asyncio.Future[None]:
-        """A future that ends when a replica begins or ceases to count."""
-        future: asyncio.Future[None] = self.node.loop.create_future()
-        self._stirred.append(future)
-        return future
-
-    def stir(self) -> None:
-        """One has, or whoever waits for that should look again."""
-        self.whole_since()
-        waiting, self._stirred = self._stirred, []
-        for future in waiting:
-            if not future.done():
-                future.set_result(None)
-
-    def wake(self) -> None:
-        """Something has happened: have the manager look."""
-        if not self.is_over:
-            self.tell("failover", Look())
-
-    def tell(self, name: str, message: Message[Any]) -> None:
-        """Tell an actor of the mechanism, if it is there."""
-        cell = self.cell_of(name)
-        if cell is None or cell.is_dead:
-            return  # Whoever comes there looks by itself.
-        # Not by its ref: this may be called in the turn, or by a timer, of whatever actor, whose words it is not.
-        with contextlib.suppress(HoldfastError):  # The same.
-            cell.admit(cell, message)
+    def _of(self, name: str, life: int, turn: int) -> StrayRecord:
+        record = self.records.get(name)
+        if record is None or record.life != life:
+            record = self.records[name] = StrayRecord(life, turn)
+        return record

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ...actors.kernel.cell import Cell
-    from .group import Group
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -49,24 +48,14 @@ def protection_of(cell: Cell) -> ProtectionStatus:
         return ProtectionStatus(cell.path, (), {}, None, 0, 0, False, 0.0, False, False)
     stack, group, probation = tuple(layer.name for layer in place.layers), place.group, place.probation
     is_new = probation is not None and not probation.is_over
-    if group is None or group.is_over:  # It is being recovered.
+    if group is None or group.membership.is_over:  # It is being recovered.
         return ProtectionStatus(
             cell.path, stack, {}, None, place.epoch, place.config, False, place.ended_at, False, is_new
         )
-    replicas = {name: _state_of(group, name) for name in group.names}
-    is_whole, since = group.whole_since()
-    is_changing = group.change is not None
+    known, adaptation = group.membership, group.adaptation
+    replicas = {name: known.state_of(name, group.replicas.life_of(name)) for name in known.names}
+    is_whole, since = group.replicas.whole_since()
+    is_changing = adaptation.change is not None
     return ProtectionStatus(
-        cell.path, stack, replicas, group.primary, group.epoch, group.config, is_whole, since, is_changing, is_new
-    )  # fmt: skip
-
-
-def _state_of(group: Group, name: str) -> str:
-    life = group.life_of(name)
-    if not life:
-        return "down"
-    if group.suspects.get(name) == life:
-        return "silent"
-    if group.members.get(name) != life:
-        return "joining"
-    return "leads" if name == group.primary else "follows"
+        cell.path, stack, replicas, known.primary, known.epoch, adaptation.config, is_whole, since, is_changing, is_new
+    )

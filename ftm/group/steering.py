@@ -13,6 +13,7 @@ from ...actors.process.wire import frames
 
 if TYPE_CHECKING:
     from .group import Group
+    from .replicas import Replicas
 
 AGAIN_AFTER = 0.01
 """Seconds after which an order is given again that nobody could take."""
@@ -28,39 +29,40 @@ def give_order(group: Group | None, cell: Cell, call: Call) -> None:
         why = "it is protected, and all replicas have to be alike: detach its mechanism, and attach it again after"
         ask.fail(ControlFailed(cell.path, call.order.verb, why))
         return
-    if group is None or group.primary is None:
+    primary = None if group is None else group.membership.primary
+    if group is None or primary is None:
         cell.node.loop.call_later(AGAIN_AFTER, give_again, cell, call)
         return
     if isinstance(call.order, Ready):
         call.give(None)
         return
     if isinstance(call.order, (Suspend, Resume)):
-        group.is_suspended = isinstance(call.order, Suspend)
-        cell.extra().suspended = mailbox.BY_USER if group.is_suspended else 0
+        is_suspended = group.delivery.is_suspended = isinstance(call.order, Suspend)
+        cell.extra().suspended = mailbox.BY_USER if is_suspended else 0
         group.poke()
         call.give(None)
         return
-    worker = group.worker_of(group.primary)
+    worker = group.replicas.worker_of(primary)
     if worker is None:
         ask.fail(ControlFailed(cell.path, call.order.verb, "the replica that leads has just ended; try again"))
         return
-    send_call(worker, group.place(f"{group.primary}/server"), call)
+    send_call(worker, group.replicas.place(f"{primary}/server"), call)
 
 
-def bind(group: Group, name: str, data: dict[str, Any]) -> None:
+def bind(replicas: Replicas, name: str, data: dict[str, Any]) -> None:
     """Tell a replica of a binding."""
-    worker = group.worker_of(name)
-    if worker is not None and group.life_of(name):
-        to = worker.connection.names.to_wire(group.place(f"{name}/server"))
+    worker = replicas.worker_of(name)
+    if worker is not None and replicas.life_of(name):
+        to = worker.connection.names.to_wire(replicas.place(f"{name}/server"))
         worker.connection.send(frames.Command(to, "bind", data))
 
 
-def bind_again(cell: Cell, group: Group, name: str) -> None:
+def bind_again(replicas: Replicas, name: str) -> None:
     """Tell a replica that was started again what was bound since the first start."""
-    more = cell.extra()
+    more = replicas.cell.extra()
     for port, target in more.bindings.items():
         data = {"port": port, "target": target.path, "is_claimed": port in more.claimed}
-        bind(group, name, data)
+        bind(replicas, name, data)
 
 
 def give_again(cell: Cell, call: Call) -> None:

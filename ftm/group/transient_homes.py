@@ -1,20 +1,29 @@
-"""Homes of actors without recovery: they stand only as long as a mechanism protects them, and keep nothing."""
+"""Homes of actors without recovery: they stand only as long as a mechanism protects them, and keep nothing.
+
+Only as long as that mechanism is not trusted there is a copy of the state.
+"""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import msgspec
+
 from ...actors.errors import AskFailed
 from ...checkpoint.home.journal_home import Entered, JournalHome
 from ...checkpoint.method import Method
 from ...checkpoint.snapshot.snapshot_record import meta_now, put
+from .replicas import finish
 
 if TYPE_CHECKING:
+    import asyncio
+
     from ...actors.exit_reasons import ExitReason
     from ...actors.kernel.address_host import Parent
     from ...actors.kernel.cell import Cell
     from ...checkpoint.home.homes import Homes
     from ...checkpoint.home.switch import Switch
+    from ...checkpoint.protocol import Snapshot
     from ...checkpoint.snapshot.snapshot_record import Meta
 
 UNKEPT = Method("protected", durability="memory")
@@ -35,13 +44,14 @@ class TransientHome(JournalHome):
 
     def open(self, cell: Cell) -> Entered:
         entered = super().open(cell)
-        if not (self.copy is not None and begin_again(entered.switch, self.copy)):
-            begin_afresh(entered.switch)
+        switch, copy = entered.switch, self.copy
+        if copy is None or switch.ledger.newest is not copy or copy.turn != switch.turn:
+            begin_afresh(switch)
         self.copy = None
         return entered
 
     def life_ended(self, switch: Switch, reason: ExitReason) -> None:
-        forget_later(switch, str(reason))
+        switch.calls.renounce(AskFailed(switch.path, str(reason)))  # Replies that it owed will not come.
 
 
 def forget_ended(switch: Switch) -> None:
@@ -63,11 +73,48 @@ def begin_afresh(switch: Switch) -> None:
     switch.topics.clear()
 
 
-def begin_again(switch: Switch, copy: Meta) -> bool:
-    """Between two lives of an actor whose mechanism was not trusted: whether it begins with the copy of its state."""
-    return switch.ledger.newest is copy and copy.turn == switch.turn
+class StateCopies:
+    """Copies of the state of such an actor: the newest, for whose sake it is kept, and who waits for the next one."""
 
+    def __init__(self, switch: Switch) -> None:
+        self._switch = switch
+        self.newest: Meta | None = None
+        self.untrusted: set[object] = set()
+        self._waiting: list[asyncio.Future[None]] = []
+        self._pieces: list[bytes] = []
 
-def forget_later(switch: Switch, why: str) -> None:
-    """Replies that the ended life owed will not come."""
-    switch.calls.renounce(AskFailed(switch.path, why))
+    def keep(self, sake: object) -> asyncio.Future[None]:
+        """Keep a copy for the sake of something that is not trusted, of a state that home would not keep otherwise.
+
+        Returns:
+            What ends when the next copy has come; at once if it is kept anyway.
+        """
+        future: asyncio.Future[None] = self._switch.node.loop.create_future()
+        if is_unkept(self._switch.method):
+            self.untrusted.add(sake)
+            self._waiting.append(future)
+        else:
+            future.set_result(None)
+        return future
+
+    def begin(self) -> None:
+        """The state that home has is the first copy."""
+        self.newest = self._switch.ledger.newest
+
+    def take(self, record: Snapshot) -> None:
+        """Take a piece of a copy, with what has led to it."""
+        self._pieces.append(record.data)
+        if record.is_last:
+            state, self._pieces = b"".join(self._pieces), []
+            meta = meta_now(self._switch, record.turn, record.stash, state)
+            self.newest = msgspec.structs.replace(meta, traps=record.traps)
+            put(self._switch, self.newest, 1)
+
+    def restart(self) -> None:
+        """The rest of a copy does not come any more."""
+        self._pieces.clear()
+
+    def have_come(self) -> None:
+        """All that a batch has brought is here."""
+        waiting, self._waiting = self._waiting, []
+        finish(waiting)

@@ -7,6 +7,7 @@ that is killed in any case. Whatever it does there (raise, hang, block its proce
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import dataclasses
 from collections.abc import Awaitable
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -15,11 +16,10 @@ from ...actors.errors import AskTimeout, HoldfastError
 from ...actors.kernel.cell import Cell
 from ...supervision.admin import RemoveChild, StartChild
 from ..bricks.replica_orders import Rehearse
-from .failover import killed, why_ended
 
 if TYPE_CHECKING:
     from ...supervision.spec import ChildSpec
-    from .group import Group
+    from .replicas import Replicas
 
 T = TypeVar("T")
 
@@ -27,6 +27,8 @@ TRIAL: Final = "trial"
 """How the replica is called that only tries."""
 STARTED_WITHIN: Final = 30.0
 """Seconds that its process and its bricks may take to come up."""
+REMOVED_WITHIN: Final = 60.0
+"""Seconds that a replica may take to end."""
 PASSED_WITHIN: Final = 15.0
 """Seconds that it may take to play one of its parts."""
 PARTS: Final = ((True, False), (True, True), (False, False), (False, True))
@@ -40,60 +42,63 @@ class TrialFailed(HoldfastError, text="{why}"):
     why: str
 
 
-async def tried(group: Group, above: Cell, spec: ChildSpec) -> None:
+async def tried(replicas: Replicas, above: Cell, spec: ChildSpec) -> None:
     """Start a replica as `spec` says, have it play all roles, and end it.
 
     Args:
-        group: whose stack it is to be.
+        replicas: those whose stack it is to be.
         above: the supervisor of its replicas.
         spec: that of a replica called `TRIAL`.
 
     Raises:
         TrialFailed: it does not start, does not let a batch pass, or not in time.
     """
-    await ended(group, above)  # Whoever has tried before may have died of it.
-    group.expect(TRIAL)
+    await ended(replicas, above)  # Whoever has tried before may have died of it.
+    replicas.membership.expect(TRIAL)
     ref: Any = above.ref
     try:
         try:
             await ref.ask(StartChild(dataclasses.replace(spec, restart="temporary")), STARTED_WITHIN)
         except AskTimeout:
-            raise TrialFailed(group.path, f"its bricks were not up within {STARTED_WITHIN:g} s") from None
+            raise TrialFailed(replicas.path, f"its bricks were not up within {STARTED_WITHIN:g} s") from None
         except HoldfastError as error:
-            raise TrialFailed(group.path, str(error)) from error
-        await rehearsed(group, TRIAL)
+            raise TrialFailed(replicas.path, str(error)) from error
+        await rehearsed(replicas, TRIAL)
     finally:
-        await ended(group, above)
+        await ended(replicas, above)
 
 
-async def rehearsed(group: Group, name: str) -> None:
+async def rehearsed(replicas: Replicas, name: str) -> None:
     """Have a replica that has no part yet play all parts, each with a batch without requests.
 
     Raises:
         TrialFailed: a brick has not started, has ended its replica, or has kept the batch.
     """
-    life = group.life_of(name)
+    life = replicas.life_of(name)
     try:
         for part in PARTS:
-            await group.entry(name).ask(Rehearse(*part), PASSED_WITHIN)
+            await replicas.entry(name).ask(Rehearse(*part), PASSED_WITHIN)
     except AskTimeout:
         why = f"one of its bricks did not start, or pass on an empty batch, within {PASSED_WITHIN:g} s"
-        raise TrialFailed(group.path, why) from None
+        raise TrialFailed(replicas.path, why) from None
     except HoldfastError as error:
-        raise TrialFailed(group.path, await why_ended(group, name, life, error)) from error
+        raise TrialFailed(replicas.path, await replicas.why_ended(name, life, error)) from error
 
 
-async def ended(group: Group, above: Cell) -> None:
+async def ended(replicas: Replicas, above: Cell) -> None:
     """End the replica that tries: its process is killed, whatever it does."""
+    cell = replicas.cell_of(TRIAL)
+    if cell is not None:
+        await replicas.kill(TRIAL, cell.life)  # It is in nobody's hands: the change itself is made by leave.
+        await removed(replicas, above, TRIAL)
+
+
+async def removed(replicas: Replicas, above: Cell, name: str) -> None:
+    """End a replica for good, if it is there."""
     ref: Any = above.ref
-    cell = group.cell_of(TRIAL)
-    if cell is None:
-        return
-    await killed(group, TRIAL, cell.life)  # It is in nobody's hands: the change itself is made by leave.
-    try:
-        await ref.ask(RemoveChild(TRIAL, erase=True), STARTED_WITHIN)
-    except HoldfastError:
-        return  # It is gone already.
+    if replicas.cell_of(name) is not None:
+        with contextlib.suppress(HoldfastError):  # It is gone already.
+            await ref.ask(RemoveChild(name, erase=True), REMOVED_WITHIN)
 
 
 async def until_given_up(work: Awaitable[T], given_up: asyncio.Future[str]) -> T:

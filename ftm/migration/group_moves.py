@@ -28,8 +28,9 @@ from ...checkpoint.places.recorded_moves import Detached, refuse_unsaved
 from ...checkpoint.protocol import DOWN, EXIT, MESSAGE, PIPE, START, TICK, Live
 from ...checkpoint.snapshot.snapshot_record import meta_now
 from ..bricks.replica_orders import EXPORTED_WITHIN, Export
-from ..group.group import Group, Look
+from ..group.group import Group
 from ..group.group_place import GroupPlace
+from ..group.membership import LookAgain
 from ..group.steering import AGAIN_AFTER
 from ..group.trial import rehearsed
 from .unrecorded_luggage import refuse, restore_owing, save_owing
@@ -63,24 +64,23 @@ class ToGroup(Entering):
             names = ", ".join(cell.children)
             raise CannotMove(cell.path, f"it has children of its own ({names}): have a supervisor start them beside it")
         self._live: asyncio.Future[Live] = move.node.loop.create_future()
-        self._joined: asyncio.Future[None] = move.node.loop.create_future()
         switch = home.switch = self._switch = self._recorded or home.homes.made(cell, home.method)
         group = self._group = await move.within(
             place.build(cell, switch), MADE_WITHIN, lambda: "its replicas were not up"
         )
-        group.on_live, group.on_joined = self._is_live, self._has_joined
-        group.on_over = move.give_up
+        group.hand_to(self)
         # Its replicas have no part yet: one of them tries what all of them are to do.
-        rehearsal = rehearsed(group, group.names[-1])
+        rehearsal = rehearsed(group.replicas, group.membership.names[-1])
         await move.within(rehearsal, MADE_WITHIN, lambda: "its replicas could not try their parts")
 
-    def _is_live(self, live: Live) -> None:
+    def life_is_up(self, group: Group, live: Live) -> None:
+        """The life has caught up."""
         if not self._live.done():
             self._live.set_result(live)
 
-    def _has_joined(self) -> None:
-        if not self._joined.done():
-            self._joined.set_result(None)
+    def has_fallen(self, group: Group, why: str) -> None:
+        """No replica is left: the old life goes on."""
+        self.move.give_up(why)
 
     def owe(self, ask: Ask) -> int:
         return 0 if self._recorded is None else super().owe(ask)  # It is numbered when it is packed.
@@ -100,10 +100,10 @@ class ToGroup(Entering):
         await move.within(leads, move.timeout, lambda: "its first replica did not lead")
         switch.attach(group)
         await move.within(self._live, move.timeout, lambda: "its new life was not up")
-        group.wake()
-        if len(group.names) > 1:
-            group.tell("join", Look())
-            await move.within(self._joined, move.timeout, lambda: "no second replica caught up")
+        group.replicas.wake()
+        if len(group.membership.names) > 1:
+            group.replicas.tell("join", LookAgain())
+            await move.within(group.replicas.have_backup(), move.timeout, lambda: "no second replica caught up")
 
     def _plant(self) -> None:
         """The home of an actor that had none begins with its state, and with what it has put aside."""
@@ -128,7 +128,7 @@ class ToGroup(Entering):
         assert group is not None
         if self._recorded is None:
             self._move_in()
-        self._place.take_over(self.cell, group)
+        group.hand_to(self._place)
         return []
 
     def _move_in(self) -> None:
@@ -167,8 +167,8 @@ class ToGroup(Entering):
         cell, group, luggage = self.cell, self._group, self.move.luggage
         assert group is not None
         if luggage.suspended:
-            group.is_suspended, cell.extra().suspended = True, mailbox.BY_USER
-        self._place.attached(cell, group)
+            group.delivery.is_suspended, cell.extra().suspended = True, mailbox.BY_USER
+        self._place.attached(group)
         self._switch.from_life(self._live.result())  # What waits is fed.
         group.go_on()
         self.move.gone_on_at = now()
@@ -176,8 +176,8 @@ class ToGroup(Entering):
     def settled(self) -> None:
         group = self._group
         assert group is not None
-        if group.is_over:  # No replica is left meanwhile.
-            group.on_over(group.why)
+        if group.membership.is_over:  # No replica is left meanwhile.
+            group.owner.has_fallen(group, group.membership.why)
 
     def discard(self) -> None:
         self.move.ending = asyncio.ensure_future(self._place.dismantle(self.cell))
@@ -202,19 +202,20 @@ class FromRecordedGroup(Leaving):
         self._host, self._place, self._home, self._group, self._switch = cell.host, old, home, old.group, home.switch
         self._is_below = is_below
         self._detached: Detached | None = None
-        self._over = self._group.on_over
+        self._owner = self._group.owner
         self._has_fallen = False
 
     async def quiesce(self) -> None:
         group, move = self._group, self.move
-        group.is_stopping = True
+        known, delivery = group.membership, group.delivery
+        delivery.is_stopping = True
         move.rest_at = now()
         end = move.rest_at + move.timeout
         while True:
             await move.within(group.quiet(), end - now(), lambda: "a turn of it has not ended")
             if move.given_up.done():
                 raise CannotMove(self.cell.path, move.given_up.result())
-            epoch = group.epoch
+            epoch = known.epoch
             try:
                 await self.collect(epoch, end)
             except CannotMove:
@@ -225,28 +226,31 @@ class FromRecordedGroup(Leaving):
                 if await self._has_died(epoch):
                     continue
                 raise
-            if group.epoch == epoch and group.primary is not None and group.out is None and not group.inside:
+            if known.epoch == epoch and known.primary is not None and delivery.is_quiet:
                 break
-        move.luggage.suspended = group.is_suspended
+        move.luggage.suspended = delivery.is_suspended
         move.at_rest()
-        group.on_over = self._fell
+        group.hand_to(self)
         self.detach()
 
     async def _has_died(self, epoch: int) -> bool:
         """Whether it was for a failover that no state came: it shows within a second."""
-        group = self._group
+        known = self._group.membership
         for _ in range(round(FAILED_OVER_WITHIN / AGAIN_AFTER)):
-            if group.epoch != epoch or group.is_over:
+            if known.epoch != epoch or known.is_over:
                 break
             await asyncio.sleep(AGAIN_AFTER)
-        return group.epoch != epoch and not group.is_over
+        return known.epoch != epoch and not known.is_over
 
     async def collect(self, epoch: int, end: float) -> None:
         """Get the state as it is now from whoever leads; after a failover it is done again."""
         if self._switch.method.snapshots:
             await self.move.within(self._switch.due.wish(), end - now(), lambda: "its state was not saved")
 
-    def _fell(self, why: str) -> None:
+    def life_is_up(self, group: Group, live: Live) -> None:
+        """The life has caught up; it had before."""
+
+    def has_fallen(self, group: Group, why: str) -> None:
         """No replica is left meanwhile: the life ends when it is known where it is."""
         self._has_fallen = True
         self.move.give_up(why)
@@ -261,14 +265,14 @@ class FromRecordedGroup(Leaving):
         refuse_unsaved(self.cell, self._switch)
 
     def part(self) -> list[Item]:
-        self.move.luggage.suspended = self._group.is_suspended
+        self.move.luggage.suspended = self._group.delivery.is_suspended
         return []
 
     def retire(self) -> None:
         """The replicas are not needed any more."""
         place, group = self._place, self._place.group
         if group is not None:
-            group.is_over = True
+            group.membership.is_over = True
         if place.probation is not None:
             place.probation.left()
         self.move.ending = asyncio.ensure_future(place.dismantle(self.cell))
@@ -278,13 +282,13 @@ class FromRecordedGroup(Leaving):
             settle_in(self)
             return
         group, transit = self._group, self.move.transit
-        group.is_stopping = False
+        group.delivery.is_stopping = False
         if transit is not None:
             self.take_back(transit)
             transit.over(self.cell, self._host)
-            group.on_over = self._over
+            group.hand_to(self._owner)
             if self._has_fallen:
-                self._over(group.why)
+                self._owner.has_fallen(group, group.membership.why)
         group.poke()
 
     def take_back(self, transit: Transit) -> None:
@@ -301,10 +305,10 @@ class FromGroup(FromRecordedGroup):
         self._stash: list[int] = []
 
     async def collect(self, epoch: int, end: float) -> None:
-        group, luggage, owed = self._group, self.move.luggage, self._switch.calls.later
-        primary = group.primary
+        luggage, owed = self.move.luggage, self._switch.calls.later
+        primary = self._group.membership.primary
         if primary is not None:
-            ask = group.protocol(primary).ask(Export(epoch, EXPORTED_WITHIN), EXPORTED_WITHIN)
+            ask = self._group.replicas.ask(primary, Export(epoch, EXPORTED_WITHIN), EXPORTED_WITHIN)
             exported = await self.move.within(ask, end - now(), lambda: "its state did not come")
             data = luggage.data = exported.data
             luggage.restore = lambda actor: restore_owing(actor, data, owed)
@@ -333,7 +337,7 @@ class FromGroup(FromRecordedGroup):
         homed, switch.intake.bound = switch.intake.bound, None
         if homed is not None and homed.capacity:
             luggage.bound = Bound(homed.capacity, cast("Overflow", homed.overflow))
-        luggage.waiting = [ask for ask, _, _, _ in getattr(homed, "waiting", ())]
+        luggage.waiting = [ask for ask, _, _, _ in homed.waiting] if isinstance(homed, HomeBound) else []
         luggage.timers = [list(timer) for timer in switch.timers.saved().values()]
         luggage.owed = dict(switch.calls.later)
         switch.open.clear()

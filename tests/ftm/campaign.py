@@ -23,7 +23,8 @@ from holdfast.ftm.alarms import Diverged, Masked, Objected, Outvoted, Protection
 from holdfast.ftm.bricks.sealed_frames import FrameRefused
 from holdfast.ftm.events import FailedOver, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group import group_place
-from holdfast.ftm.group.group import Group, Look
+from holdfast.ftm.group.group import Group
+from holdfast.ftm.group.membership import LookAgain
 from holdfast.ftm.model.detection import Detection
 from holdfast.ftm.model.mechanism import Mechanism
 from tests.ftm.faults import FRAMES, KINDS, LATE, VALUES, claims
@@ -172,7 +173,7 @@ async def whole(ref: hf.ActorRef[Any]) -> None:
     end = loop.time() + STUCK
     while loop.time() < end:
         group = group_of(ref)
-        if group is not None and group.primary is not None and all(map(group.is_well, group.names)):
+        if group is not None and group.replicas.whole_since()[0]:
             return
         await asyncio.sleep(0.002)
     raise Stuck(f"the group is not complete again: {described(group_of(ref))}")
@@ -182,10 +183,9 @@ def described(group: Group | None) -> str:
     """What is known of a group, for whoever wants to find out why it stands still."""
     if group is None:
         return "there is none"
-    names = ("epoch", "primary", "leading", "members", "condemned", "dropped", "up", "joining", "suspects", "is_over")
-    told = {name: getattr(group, name) for name in names}
-    out = group.out and (group.out.number, [one.feed.id for one in group.out.requests][:8])
-    return f"{told} out={out} waiting={len(group.waiting)} ledger={list(group.ledger)[:8]} why={group.why!r}"
+    delivery = group.delivery
+    out = delivery.out and (delivery.out.number, [one.feed.id for one in delivery.out.requests][:8])
+    return f"{group.membership} out={out} waiting={len(delivery.waiting)} fed={list(delivery.fed)[:8]}"
 
 
 class Campaign:
@@ -252,7 +252,7 @@ class Campaign:
             group = group_of(self.ref)
             assert group is not None
             for _ in range(fault.nth):
-                group.tell(fault.slot, Look())
+                group.replicas.tell(fault.slot, LookAgain())
                 await load.reached(1)
         loop = asyncio.get_running_loop()
         end = loop.time() + GIVE_UP
@@ -311,7 +311,7 @@ class Campaign:
     async def _kill_backup(self) -> None:
         group = group_of(self.ref)
         assert group is not None
-        name = self.rng.choice([one for one in group.names if one != group.primary])
+        name = self.rng.choice([one for one in group.membership.names if one != group.membership.primary])
         pid = self.system._workers.processes().get(f"{self.ref.path}/ftm/{name}")
         if pid is not None:
             os.kill(pid, signal.SIGKILL)

@@ -105,7 +105,13 @@ def of_joining(action: str, layers: Layers) -> list[Fault]:
 def of_root(layers: Layers) -> list[Fault]:
     """What stands in the root: its own death, at what it does."""
     heard = "Sealed" if names_of(layers)[0] == "sec" else "Done"
-    parts = [("proxy", "Flush"), ("proxy", heard), ("detector", "Beat"), ("failover", "Look"), ("join", "Look")]
+    parts = [
+        ("proxy", "SendNext"),
+        ("proxy", heard),
+        ("detector", "Beat"),
+        ("failover", "LookAgain"),
+        ("join", "LookAgain"),
+    ]
     return [Fault("raise", *part, when) for part in parts for when in ("before", "after")]
 
 

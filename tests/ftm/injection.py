@@ -355,7 +355,7 @@ def forge(actor: Any) -> None:
         group = actor._group
         wrong = Answer(REPLY, "", msgspec.msgpack.encode(-7))
         ends = [TurnEnd(group.switch.turn + 1, key, OK, [], wrong) for key in list(group.switch.open)[:1]]
-        ref.tell(Done(group.epoch, group.config, group.number, ends, True))
+        ref.tell(Done(group.membership.epoch, group.adaptation.config, group.delivery.number, ends, True))
     elif actor.slot == "protocol":
         standing = actor._standing
         epoch, config = standing.epoch, standing.config

@@ -121,10 +121,10 @@ async def run(seconds: float, rng: random.Random, *, least: int = 0) -> Found:
             while not over.is_set():
                 await asyncio.sleep(rng.uniform(0.1, 0.8))
                 group = group_of(ref)
-                if group is None or group.primary is None or not all(map(group.is_well, group.names)):
+                if group is None or not group.replicas.whole_since()[0]:
                     continue  # One at a time: two are more than these mechanisms mask.
-                pid = system._workers.processes().get(f"{ref.path}/ftm/{rng.choice(group.names)}")
-                if pid is not None and len(group.names) > 1:
+                pid = system._workers.processes().get(f"{ref.path}/ftm/{rng.choice(group.membership.names)}")
+                if pid is not None and len(group.membership.names) > 1:
                     kills += 1
                     os.kill(pid, signal.SIGKILL)
 

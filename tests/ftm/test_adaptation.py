@@ -104,7 +104,7 @@ async def test_failover_works_in_every_stack_that_was_changed_to(system: hf.Acto
     load = Load(ref)
     for wanted in (LFR(), (PBR(), TR()), (LFR(), TR()), PBR()):
         await transition(system, ref, wanted)
-        for name in (group_of(ref).primary, other(group_of(ref))):
+        for name in (group_of(ref).membership.primary, other(group_of(ref))):
             assert name is not None
             await load.reached(10)
             os.kill(pid_of(system, ref, name), signal.SIGKILL)
@@ -112,7 +112,7 @@ async def test_failover_works_in_every_stack_that_was_changed_to(system: hf.Acto
             await two_again(ref)
     await load.stop()
     load.check(await ref.ask(Tags()))
-    assert group_of(ref).config == 5
+    assert group_of(ref).adaptation.config == 5
 
 
 async def test_money_is_moved_once_while_mechanisms_change(system: hf.ActorSystem) -> None:
@@ -140,7 +140,7 @@ async def test_compose_and_detach_a_layer(system: hf.ActorSystem) -> None:
     async with system.transaction(timeout=30) as change:
         change.detach(ref, "pbr")
     assert stack(ref) == ("tr",)
-    assert len(group_of(ref).names) == 1
+    assert len(group_of(ref).membership.names) == 1
     await load.reached(20)
     async with system.transaction(timeout=30) as change:
         change.compose(ref, LFR(), outside=True)
@@ -178,7 +178,7 @@ async def test_one_brick_gets_new_code(system: hf.ActorSystem, tmp_path: Path) -
     (brick,) = ref._cell.spec.mechanism.exchanged.values()
     assert brick.__name__ == "Counting"
     await two_again(ref)
-    primary = group_of(ref).primary
+    primary = group_of(ref).membership.primary
     assert primary is not None
     os.kill(pid_of(system, ref, primary), signal.SIGKILL)
     await load.reached(20)
@@ -207,12 +207,12 @@ async def test_what_cannot_be_is_refused_with_its_reason(system: hf.ActorSystem)
         ("there is no mechanism of that name", lambda change: change.transition(ref, "nothing")),
         ("cannot be read", lambda change: change.transition(ref, "/nowhere/m.py")),
     ]
-    before = group_of(ref).config
+    before = group_of(ref).adaptation.config
     for reason, wanted in cases:
         with pytest.raises(hf.TransactionRefused, match=reason):
             async with system.transaction() as change:
                 wanted(change)
-    assert (stack(ref), group_of(ref).config, stack(closed)) == (("pbr",), before, ("lfr",))
+    assert (stack(ref), group_of(ref).adaptation.config, stack(closed)) == (("pbr",), before, ("lfr",))
     assert await ref.ask(Add(0)) == 1
 
 

@@ -51,7 +51,7 @@ async def test_random_changes_and_kills_under_load(system: hf.ActorSystem) -> No
         wanted = rng.choice([LFR(), PBR(), (PBR(), TR()), (LFR(), TR())])
         change = asyncio.ensure_future(transition(system, ref, wanted))
         await asyncio.sleep(delay)
-        if killed in group_of(ref).names:
+        if killed in group_of(ref).membership.names:
             try:
                 os.kill(pid_of(system, ref, killed), signal.SIGKILL)
             except (KeyError, ProcessLookupError):

@@ -70,7 +70,7 @@ async def change_to(system: hf.ActorSystem, ref: hf.ActorRef[Any], load: Load, w
     try:
         await transition(system, ref, made(wanted))
         assert stack(ref) == wanted
-        assert len(group_of(ref).names) == max(one.replicas for one in made(wanted))
+        assert len(group_of(ref).membership.names) == max(one.replicas for one in made(wanted))
         await load.reached(3)
     except BaseException as error:
         error.add_note(f"from {before} to {wanted}")
@@ -218,9 +218,9 @@ async def all_again(ref: hf.ActorRef[Any]) -> Stack:
     """The stack, when all replicas are there and have the same."""
     await two_again(ref)
     group, host = group_of(ref), ref._cell.host.place
-    assert (group.config, group.change) == (host.config, None)  # type: ignore[attr-defined]
-    assert not group.is_resting
-    assert not group.is_changing
+    assert (group.adaptation.config, group.adaptation.change) == (host.config, None)  # type: ignore[attr-defined]
+    assert not group.delivery.is_resting
+    assert not group.adaptation.is_changing
     return stack(ref)
 
 

@@ -13,9 +13,9 @@ from typing import Any
 import pytest
 
 import holdfast as hf
-from holdfast.ftm.group import reconfiguration
-from holdfast.ftm.group.membership import Members
+from holdfast.ftm.group import adaptation_engine
 from holdfast.ftm.group.reconfiguration import STEPS, CannotAdapt
+from holdfast.ftm.group.replicas import Replicas
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
@@ -54,10 +54,10 @@ async def consistent(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> tuple[str
     found = stack(ref)
     await two_again(ref)
     host: Any = ref._cell.host.place
-    assert group_of(ref).config == host.config
-    assert group_of(ref).change is None
-    assert not group_of(ref).is_resting
-    assert not group_of(ref).is_changing
+    assert group_of(ref).adaptation.config == host.config
+    assert group_of(ref).adaptation.change is None
+    assert not group_of(ref).delivery.is_resting
+    assert not group_of(ref).adaptation.is_changing
     return found
 
 
@@ -86,7 +86,9 @@ async def test_a_replica_dies_at_each_step(system: hf.ActorSystem, step: str, ro
         group = group_of(ref)
 
         def kill(group: Any = group) -> None:
-            names = [name for name in group.names if (name == group.primary) is (role == "primary")]
+            names = [
+                name for name in group.membership.names if (name == group.membership.primary) is (role == "primary")
+            ]
             os.kill(pid_of(system, ref, names[0]), signal.SIGKILL)
 
         seen = struck(ref, step, kill)
@@ -142,7 +144,7 @@ async def test_a_stopped_replica_is_replaced_and_the_change_is_made(system: hf.A
     ref = await protected(system)
     load = Load(ref)
     await load.reached(10)
-    primary = group_of(ref).primary
+    primary = group_of(ref).membership.primary
     assert primary is not None
     struck(ref, "quiesce", lambda: os.kill(pid_of(system, ref, primary), signal.SIGSTOP))
     await transition(system, ref, LFR())
@@ -159,10 +161,10 @@ async def test_a_replica_that_goes_through_its_state_has_more_time_to_change_ove
     """It holds still as one that goes through a large state does; that it does, and how long it may, is told here."""
     ref = await protected(system)
     group, still = group_of(ref), 1.5
-    (name,) = group.backups()
+    (name,) = group.replicas.backups()
     pid = pid_of(system, ref, name)
-    monkeypatch.setattr(reconfiguration, "COMMITTED_WITHIN", 0.3)
-    monkeypatch.setattr(Members, "at_work", lambda group, of: 30.0 if works and of == name else 0.0)
+    monkeypatch.setattr(adaptation_engine, "COMMITTED_WITHIN", 0.3)
+    monkeypatch.setattr(Replicas, "at_work", lambda replicas, of: 30.0 if works and of == name else 0.0)
 
     def hold_still() -> None:
         os.kill(pid, signal.SIGSTOP)

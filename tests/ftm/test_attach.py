@@ -96,7 +96,7 @@ async def test_an_attached_actor_survives_the_death_of_its_primary(system: hf.Ac
     load = Load(ref)
     await load.reached(30)
     await attach(system, ref)
-    primary = group_of(ref).primary
+    primary = group_of(ref).membership.primary
     assert primary is not None
     os.kill(pid_of(system, ref, primary), signal.SIGKILL)
     await load.reached(30)
@@ -130,9 +130,9 @@ async def test_detached_while_nobody_leads_and_nothing_is_inside(system: hf.Acto
         await ref.ask(Add(number))
     group = group_of(ref)
     await two_again(ref)
-    os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
     async with asyncio.timeout(10):
-        while group.primary is not None:
+        while group.membership.primary is not None:
             await asyncio.sleep(0)
     await detach(system, ref)
     assert await ref.ask(Tags()) == list(range(5))
@@ -147,13 +147,13 @@ async def test_detached_while_whoever_leads_is_deposed_when_nothing_is_inside(
         await ref.ask(Add(number))
     group = group_of(ref)
     await two_again(ref)
-    epoch, quiet = group.epoch, group.quiet
+    epoch, quiet = group.membership.epoch, group.quiet
 
     def suspected(done: asyncio.Future[None]) -> None:
-        primary, manager = group.primary, system.node.cell_at(f"{ref.path}/ftm/failover").actor
+        primary, manager = group.membership.primary, system.node.cell_at(f"{ref.path}/ftm/failover").actor
         assert primary is not None
         assert isinstance(manager, FailoverManager)
-        group.suspect(primary, group.members[primary], "a test wants it")
+        group.replicas.suspect(primary, group.membership.members[primary], "a test wants it")
         manager._depose(primary)
 
     def quiet_until_suspected() -> asyncio.Future[None]:
@@ -164,7 +164,7 @@ async def test_detached_while_whoever_leads_is_deposed_when_nothing_is_inside(
 
     monkeypatch.setattr(group, "quiet", quiet_until_suspected)
     await detach(system, ref)
-    assert group.epoch > epoch
+    assert group.membership.epoch > epoch
     assert await ref.ask(Tags()) == list(range(5))
 
 
@@ -174,11 +174,11 @@ async def test_detached_while_whoever_leads_dies_with_the_question(system: hf.Ac
         await ref.ask(Add(number))
     group = group_of(ref)
     await two_again(ref)
-    pid = pid_of(system, ref, group.primary or "")
+    pid = pid_of(system, ref, group.membership.primary or "")
     os.kill(pid, signal.SIGSTOP)  # It gets the question, and will not answer it.
     detaching = asyncio.ensure_future(detach(system, ref))
     async with asyncio.timeout(10):
-        while not group.is_stopping:
+        while not group.delivery.is_stopping:
             await asyncio.sleep(0)
     os.kill(pid, signal.SIGKILL)
     await detaching
@@ -193,11 +193,11 @@ async def test_a_last_snapshot_that_died_with_whoever_led_is_asked_for_again(sys
         await ref.ask(Add(number))
     group = group_of(ref)
     await two_again(ref)
-    pid = pid_of(system, ref, group.primary or "")
+    pid = pid_of(system, ref, group.membership.primary or "")
     os.kill(pid, signal.SIGSTOP)
     detaching = asyncio.ensure_future(detach(system, ref))
     async with asyncio.timeout(10):
-        while group.switch.due.asked_at < 0 or group.inward:
+        while group.switch.due.asked_at < 0 or group.delivery.inward:
             await asyncio.sleep(0)
     os.kill(pid, signal.SIGKILL)
     await detaching
@@ -244,7 +244,7 @@ async def test_a_last_snapshot_that_a_new_leader_keeps_back_needs_no_request_to_
     group = group_of(ref)
     await two_again(ref)
     held.touch()
-    os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
     await detach(system, ref)
     assert not held.exists()
     assert await ref.ask(Tags()) == list(range(5))
@@ -268,13 +268,13 @@ async def test_a_detach_that_is_not_wanted_any_more_is_undone_at_once(system: hf
     waiting = ref.ask(Gate(str(tmp_path / "gate")), timeout=60)
     group = group_of(ref)
     async with asyncio.timeout(10):
-        while group.out is None:
+        while group.delivery.out is None:
             await asyncio.sleep(0)
     with pytest.raises(hf.TransactionFailed, match="not within") as failed:
         async with system.transaction(timeout=0.5) as change:
             change.detach(ref)
     assert failed.value.kept == ()
-    assert not group.is_stopping
+    assert not group.delivery.is_stopping
     (tmp_path / "gate").touch()
     assert await waiting == 0
     assert await ref.ask(Add(1)) == 1
@@ -444,7 +444,7 @@ async def test_a_binding_is_that_of_every_replica_from_now_on(system: hf.ActorSy
     system.bind(ref, "account", two)
     assert await ref.ask(Pay(1)) == 1001
     for total in (1002, 1003):
-        primary = group_of(ref).primary
+        primary = group_of(ref).membership.primary
         assert primary is not None
         os.kill(pid_of(system, ref, primary), signal.SIGKILL)
         assert await ref.ask(Pay(1), timeout=30) == total
@@ -473,7 +473,7 @@ async def test_whether_it_traps_exits_comes_along(system: hf.ActorSystem, method
     assert await ref.ask(Hold(0.0)) is False
     await attach(system, ref)
     assert await ref.ask(Hold(0.0)) is True
-    primary = group_of(ref).primary
+    primary = group_of(ref).membership.primary
     assert primary is not None
     os.kill(pid_of(system, ref, primary), signal.SIGKILL)
     assert await ref.ask(Hold(0.0), timeout=30) is True

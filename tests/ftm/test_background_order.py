@@ -97,7 +97,7 @@ def watched(switch: Switch) -> list[str]:
 
 def deafen(group: Group) -> None:
     """What whoever leads says from now on is lost when it dies: home has not heard of any of it."""
-    epoch, take = group.epoch, group.take_done
+    epoch, take = group.membership.epoch, group.take_done
 
     def heard(done: Done) -> None:
         if done.epoch > epoch:
@@ -127,8 +127,8 @@ async def test_it_comes_home_behind_the_turns_before_it(
     await two_again(ref)
     group, host = group_of(ref), ref._cell.host.place
     assert isinstance(host, GroupPlace)
-    assert group.primary is not None
-    pid = pid_of(system, ref, group.primary)
+    assert group.membership.primary is not None
+    pid = pid_of(system, ref, group.membership.primary)
     early = watched(group.switch)
     deafen(group)
     folder = str(tmp_path)
@@ -174,8 +174,8 @@ async def test_work_of_a_turn_that_only_the_backup_has_is_begun_again_or_said_to
     ref = await system.start(hf.child("alice", hf.start(Worker), mechanism=PBR(), recovery=recovery))
     await two_again(ref)
     events, group = system.events(), group_of(ref)
-    assert group.primary is not None
-    pid, take = pid_of(system, ref, group.primary), group.take_done
+    assert group.membership.primary is not None
+    pid, take = pid_of(system, ref, group.membership.primary), group.take_done
 
     def dies(done: Done) -> None:
         if done.epoch > 1 or not done.ends:
@@ -183,7 +183,7 @@ async def test_work_of_a_turn_that_only_the_backup_has_is_begun_again_or_said_to
         else:
             os.kill(pid, signal.SIGKILL)
 
-    assert group.epoch == 1
+    assert group.membership.epoch == 1
     group.take_done = dies  # type: ignore[method-assign]
     asked = [ref.ask(one, timeout=60.0) for one in (Add(0), Begin(str(tmp_path)), Add(1))]
     assert await asyncio.gather(*asked) == [1, 1, 2]
@@ -213,8 +213,8 @@ async def test_what_was_said_to_be_lost_does_not_come(system: hf.ActorSystem, tm
 
     group.take_done = taken  # type: ignore[method-assign]
     assert [await ref.ask(one) for one in (Begin(str(tmp_path)), Add(0))] == [0, 1]
-    assert group.primary is not None
-    os.kill(pid_of(system, ref, group.primary), signal.SIGKILL)
+    assert group.membership.primary is not None
+    os.kill(pid_of(system, ref, group.membership.primary), signal.SIGKILL)
     assert await ref.ask(Add(1), timeout=60.0) == 2
     assert [one.count for one in events.take() if isinstance(one, hf.BackgroundWorkLost)] == [1]
     events.close()

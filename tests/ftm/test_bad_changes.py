@@ -94,7 +94,7 @@ async def judged(system: hf.ActorSystem, name: str, bad: Wrong, rng: random.Rand
     await load.reached(20)
     assert stack(ref) == (below.name,), bad
     await two_again(ref)
-    os.kill(pid_of(system, ref, group_of(ref).primary or ""), signal.SIGKILL)  # Failover works as before.
+    os.kill(pid_of(system, ref, group_of(ref).membership.primary or ""), signal.SIGKILL)  # Failover works as before.
     await load.reached(20)
     await two_again(ref)
     await load.stop()
@@ -114,13 +114,13 @@ async def kill_now_and_then(
         await two_again(ref)
         await asyncio.sleep(rng.random() * 2.0)
         group = group_of(ref)
-        name = rng.choice(group.names)
-        if not is_complete(ref) or group.life_of(name) != group.members.get(name):
+        name = rng.choice(group.membership.names)
+        if not is_complete(ref) or group.replicas.life_of(name) != group.membership.members.get(name):
             continue
-        life, kills = group.life_of(name), kills + 1
+        life, kills = group.replicas.life_of(name), kills + 1
         os.kill(pid_of(system, ref, name), signal.SIGKILL)
         async with asyncio.timeout(60):
-            while group.life_of(name) == life:
+            while group.replicas.life_of(name) == life:
                 await asyncio.sleep(0.001)
 
 
@@ -164,7 +164,7 @@ async def test_failover_does_not_wait_for_a_change_that_hangs(system: hf.ActorSy
 
     changing = asyncio.ensure_future(changed())
     await prepares.wait()
-    os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
     async with asyncio.timeout(60):
         while not group.failovers:
             await asyncio.sleep(0.001)
@@ -183,7 +183,7 @@ async def test_a_kill_while_a_change_blocks_the_other_replica_loses_nothing(syst
     assert [await ref.ask(Add(tag)) for tag in range(5)] == [1, 2, 3, 4, 5]
     await two_again(ref)
     host: Any = ref._cell.host.place
-    pid = pid_of(system, ref, group_of(ref).primary or "")
+    pid = pid_of(system, ref, group_of(ref).membership.primary or "")
     host.on_step = lambda step: os.kill(pid, signal.SIGKILL) if step == "prepare" and ref._cell.life == 1 else None
     with pytest.raises(hf.TransactionFailed, match=r"has failed when it prepared it|has ended"):
         async with system.transaction(timeout=60) as change:
@@ -202,9 +202,9 @@ async def test_the_stack_before_comes_back_to_one_that_leads_while_bricks_keep_w
         change.compose(ref, Wrong("hang", "peer", "before", "other"), outside=True)
     group, seconds = group_of(ref), 0.2
     async with asyncio.timeout(30):
-        while (await group.protocol(group.backups()[0]).ask(Computes(group.switch.turn, seconds), 5.0)).passes:
+        while (await group.replicas.ask(group.replicas.backups()[0], Computes(group.switch.turn, seconds), 5.0)).passes:
             await asyncio.sleep(0)
-    os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
     async with asyncio.timeout(90):
         (outcome,) = await change.settled()
     assert not outcome.is_kept
@@ -244,11 +244,11 @@ async def test_a_replica_that_waits_for_the_life_that_it_begins_can_be_stopped(s
     assert await ref.ask(Add(1)) == 1
     group = group_of(ref)
     await two_again(ref)
-    left = next(name for name in group.names if name != group.primary)
-    os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+    left = next(name for name in group.membership.names if name != group.membership.primary)
+    os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
     server = system.node.cell_at(f"{ref.path}/ftm/{left}").ref
     async with asyncio.timeout(60):
-        while group.leading is None:
+        while group.membership.leading is None:
             await asyncio.sleep(0.001)
         status = await system.get_status(server)  # Its turn is free.
         assert status.turn is None

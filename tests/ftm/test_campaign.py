@@ -28,15 +28,15 @@ async def strike(system: hf.ActorSystem, ref: hf.ActorRef[Any], rng: random.Rand
     group = group_of(ref)
     kinds = ["replica", "part", "replica and part", "stop", *(["both"] if both else [])]
     kind = rng.choice(kinds)
-    name = rng.choice(group.names)
+    name = rng.choice(group.membership.names)
     pid = system._workers.processes().get(f"{ref.path}/ftm/{name}")
     if pid is None:
         return "nothing"  # It was ended just now.
-    cell = group.cell_of(rng.choice(PARTS))
+    cell = group.replicas.cell_of(rng.choice(PARTS))
     if "replica" in kind or kind == "both":
         os.kill(pid, signal.SIGKILL)
     if kind == "both":
-        other = next(one for one in group.names if one != name)
+        other = next(one for one in group.membership.names if one != name)
         await asyncio.sleep(rng.random() * 0.01)
         pids = system._workers.processes()
         if f"{ref.path}/ftm/{other}" in pids:

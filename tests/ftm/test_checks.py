@@ -18,7 +18,7 @@ from holdfast.ftm.bricks.letters import Letter
 from holdfast.ftm.bricks.replica_orders import Broken
 from holdfast.ftm.bricks.reply_log import ReplyLog
 from holdfast.ftm.group.group_place import GroupPlace
-from holdfast.ftm.group.proxy import Settle
+from holdfast.ftm.group.proxy import TakeAll
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR, Checkpoint
 from holdfast.ftm.replica.rewind_points import checksum
@@ -157,20 +157,22 @@ async def test_what_an_earlier_epoch_says_and_what_is_said_twice_is_nobodys_answ
     await two_again(ref)
     assert await ref.ask(accounts.Add(0)) == 1
     group = group_of(ref)
-    assert group.primary is not None
-    pid = pid_of(system, ref, group.primary)
+    assert group.membership.primary is not None
+    pid = pid_of(system, ref, group.membership.primary)
     await stop_process(pid)
     asked = ref.ask(accounts.Add(1), timeout=30)
     async with asyncio.timeout(10):
-        while group.out is None:
+        while group.delivery.out is None:
             await asyncio.sleep(0.001)
-    wrong, key, turn = Answer(REPLY, "", b"\x63"), group.out.requests[0].feed.id, group.switch.turn
+    wrong, key, turn = Answer(REPLY, "", b"\x63"), group.delivery.out.requests[0].feed.id, group.switch.turn
     known = next(key for key in range(key) if key not in group.switch.open)
     end = TurnEnd(turn + 1, key, OK, [], wrong)
-    group.take_done(Done(group.epoch - 1, group.config, group.out.number, [end], True))
-    assert group.stale == 1
-    group.take_done(Done(group.epoch, group.config, 0, [TurnEnd(turn, known, OK, [], wrong)], False))
-    assert group.doubled == 1
+    group.take_done(Done(group.membership.epoch - 1, group.adaptation.config, group.delivery.out.number, [end], True))
+    assert group.delivery.stale == 1
+    group.take_done(
+        Done(group.membership.epoch, group.adaptation.config, 0, [TurnEnd(turn, known, OK, [], wrong)], False)
+    )
+    assert group.delivery.doubled == 1
     os.kill(pid, signal.SIGCONT)
     assert await asked == 2
     assert await ref.ask(accounts.Tags()) == [0, 1]
@@ -184,8 +186,8 @@ async def test_who_led_before_is_dead_when_another_one_is_told_to_lead(system: h
     assert await ref.ask(accounts.Add(0)) == 1
     group, host = group_of(ref), ref._cell.host.place
     assert isinstance(host, GroupPlace)
-    assert group.primary is not None
-    pid = pid_of(system, ref, group.primary)
+    assert group.membership.primary is not None
+    pid = pid_of(system, ref, group.membership.primary)
     seen: list[tuple[str, bool]] = []
     host.on_step = lambda step: seen.append((step, Path(f"/proc/{pid}").exists()))
     await stop_process(pid)
@@ -200,11 +202,11 @@ async def test_nobody_speaks_for_a_replica(system: hf.ActorSystem) -> None:
     await two_again(ref)
     assert await ref.ask(accounts.Add(0)) == 1
     group = group_of(ref)
-    assert group.primary is not None
+    assert group.membership.primary is not None
     detector, proxy = (system.node.cell_at(f"{ref.path}/ftm/{name}").ref for name in ("detector", "proxy"))
-    detector.tell(Broken(group.primary, group.life_of(group.primary), "forged"))
+    detector.tell(Broken(group.membership.primary, group.replicas.life_of(group.membership.primary), "forged"))
     end = TurnEnd(group.switch.turn + 1, 1, OK, [], Answer(REPLY, "", b"\x63"))
-    proxy.tell(Done(group.epoch, group.config, -1, [end], False))
-    await proxy.ask(Settle())
-    assert (group.suspects, group.stale, group.epoch) == ({}, 1, 1)
+    proxy.tell(Done(group.membership.epoch, group.adaptation.config, -1, [end], False))
+    await proxy.ask(TakeAll())
+    assert (group.membership.suspected, group.delivery.stale, group.membership.epoch) == ({}, 1, 1)
     assert await ref.ask(accounts.Add(1)) == 2

@@ -10,9 +10,9 @@ import pytest
 
 import holdfast as hf
 from holdfast.ftm.group import join
-from holdfast.ftm.group.group import Group
 from holdfast.ftm.group.join import Joiner
-from holdfast.ftm.group.membership import Look
+from holdfast.ftm.group.membership import LookAgain
+from holdfast.ftm.group.replicas import Replicas
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.actors.process.waiting import until
 from tests.ftm.accounts import Add, Counter
@@ -24,7 +24,7 @@ async def test_a_silent_joiner_is_replaced_unless_its_state_may_be_the_reason(
     system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch, at_work: float
 ) -> None:
     monkeypatch.setattr(join, "FOLLOWED_WITHIN", 0.02)
-    monkeypatch.setattr(Group, "at_work", lambda group, name: at_work)
+    monkeypatch.setattr(Replicas, "at_work", lambda replicas, name: at_work)
     told, tell = [0], Joiner._tell_to_follow
 
     async def counted(joiner: Joiner, name: str, life: int, epoch: int) -> None:
@@ -34,16 +34,16 @@ async def test_a_silent_joiner_is_replaced_unless_its_state_may_be_the_reason(
     monkeypatch.setattr(Joiner, "_tell_to_follow", counted)
     ref: Any = await system.start(hf.child("c", hf.start(Counter), mechanism=PBR()))
     group = group_of(ref)
-    await until(lambda: len(group.members) == 2)
+    await until(lambda: len(group.membership.members) == 2)
     name = other(group)
-    life, pid = group.life_of(name), pid_of(system, ref, name)
+    life, pid = group.replicas.life_of(name), pid_of(system, ref, name)
     os.kill(pid, signal.SIGSTOP)
     told[0] = 0
-    group.lost(name, "it is to catch up again")
-    group.tell("join", Look())
-    await until(lambda: told[0] >= 4 or group.life_of(name) != life)
-    if group.life_of(name) == life:
+    group.replicas.lost(name, "it is to catch up again")
+    group.replicas.tell("join", LookAgain())
+    await until(lambda: told[0] >= 4 or group.replicas.life_of(name) != life)
+    if group.replicas.life_of(name) == life:
         os.kill(pid, signal.SIGCONT)
-    await until(lambda: name in group.members)
-    assert (group.life_of(name) == life) == (at_work > 0)
+    await until(lambda: name in group.membership.members)
+    assert (group.replicas.life_of(name) == life) == (at_work > 0)
     assert await ref.ask(Add(1)) == 1

@@ -103,10 +103,10 @@ async def renewed(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> None:
     """Kill the replica that does not lead, and wait until its next life has caught up."""
     group = group_of(ref)
     name = other(group)
-    life = group.members[name]
+    life = group.membership.members[name]
     os.kill(pid_of(system, ref, name), signal.SIGKILL)
     async with asyncio.timeout(30):
-        while group.members.get(name, life) == life:
+        while group.membership.members.get(name, life) == life:
             await asyncio.sleep(0.005)
     await two_again(ref)
 
@@ -174,7 +174,7 @@ async def test_a_replica_joins_while_a_detach_waits_for_work(system: hf.ActorSys
     assert await ref.ask(Fetch(str(file), owes=False)) == PROMISED
     detaching = asyncio.ensure_future(detach(system, ref))
     async with asyncio.timeout(30):
-        while not group_of(ref).is_stopping:
+        while not group_of(ref).delivery.is_stopping:
             await asyncio.sleep(0.005)
     await renewed(system, ref)
     assert not detaching.done()

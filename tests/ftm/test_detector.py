@@ -245,13 +245,13 @@ async def test_what_a_replica_waits_for_a_processor_is_read_of_its_process(syste
     group, name = group_of(ref), "r1"
     pid = pid_of(system, ref, name)
     processor = min(os.sched_getaffinity(pid))
-    before = group.starved(name)
+    before = group.replicas.starved(name)
     busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         for one in (pid, busy.pid):
             os.sched_setaffinity(one, {processor})
         async with asyncio.timeout(60):
-            while group.starved(name) == before:
+            while group.replicas.starved(name) == before:
                 await asyncio.sleep(0.005)  # It beats, and has to wait for that.
     finally:
         busy.kill()
@@ -296,7 +296,7 @@ async def test_a_replica_that_goes_through_a_large_state_is_not_suspected(system
     group = group_of(ref)
     assert [await ref.ask(Add(tag), timeout=60) for tag in range(3)] == [1, 2, 3]
     await two_again(ref)
-    assert (group.wrong, group.failovers, group.members) == (0, 0, {"r1": 1, "r2": 1})
+    assert (group.replicas.wrong, group.failovers, group.membership.members) == (0, 0, {"r1": 1, "r2": 1})
 
 
 QUICK, QUICKER = Detection(pause=0.2), Detection(pause=0.1)
@@ -308,7 +308,7 @@ async def test_the_outermost_mechanism_that_says_how_is_heard() -> None:
     async with hf.ActorSystem("app", log=False) as system:
         ref = await system.start(hf.child("alice", hf.start(Counter), mechanism=TR(detection=QUICKER)))
         host: Any = ref._cell.host.place
-        assert host.group.detection == QUICKER
+        assert host.group.replicas.detection == QUICKER
         for layers, said in (
             ((PBR(detection=QUICK), TR(detection=QUICKER)), QUICK),
             ((PBR(), TR(detection=QUICKER)), QUICKER),
@@ -316,7 +316,7 @@ async def test_the_outermost_mechanism_that_says_how_is_heard() -> None:
         ):
             async with system.transaction(timeout=30) as change:
                 change.transition(ref, layers, whole=True)
-            assert host.group.detection == said
+            assert host.group.replicas.detection == said
 
 
 @pytest.mark.asyncio(loop_factories=["virtual"])
@@ -338,7 +338,7 @@ async def test_a_new_replica_is_not_judged_by_an_earlier_one_of_its_name(system:
     group = group_of(ref)
     (gone,) = {"r2", "r3"} - set(adapted_to := (await changed(system, ref, PBR())))
     assert len(adapted_to) == 2
-    detector = group.cell_of("detector")
+    detector = group.replicas.cell_of("detector")
     assert detector is not None
     assert isinstance(detector.actor, Detector)
     before = detector.actor._known[gone, 1]
@@ -351,7 +351,7 @@ async def changed(system: hf.ActorSystem, ref: hf.ActorRef[Counter], mechanism: 
     async with system.transaction(timeout=120) as change:
         change.transition(ref, mechanism)
     await two_again(ref)
-    return group_of(ref).names
+    return group_of(ref).membership.names
 
 
 def test_what_is_no_detection_is_refused() -> None:

@@ -16,6 +16,7 @@ import holdfast as hf
 from holdfast.ftm.events import FailedOver, ReplicaJoined, ReplicaLost, WrongSuspicion
 from holdfast.ftm.group.group import Group
 from holdfast.ftm.group.group_place import GroupPlace
+from holdfast.ftm.group.membership import Lives, Membership, Suspicion
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from tests.ftm.accounts import (
@@ -58,7 +59,7 @@ def pid_of(system: hf.ActorSystem, ref: hf.ActorRef[Any], name: str) -> int:
 
 def other(group: Group) -> str:
     """The replica that does not lead."""
-    return next(name for name in group.names if name != group.primary)
+    return next(name for name in group.membership.names if name != group.membership.primary)
 
 
 async def started(system: hf.ActorSystem, recipe: Any = None, **options: Any) -> hf.ActorRef[Any]:
@@ -76,7 +77,7 @@ async def two_again(ref: hf.ActorRef[Any]) -> None:
 def is_complete(ref: hf.ActorRef[Any]) -> bool:
     host = ref._cell.host.place
     group = host.group if isinstance(host, GroupPlace) else None
-    return group is not None and group.primary is not None and all(map(group.is_well, group.names))
+    return group is not None and group.replicas.whole_since()[0]
 
 
 def stopped(pid: int) -> bool:
@@ -99,7 +100,7 @@ async def test_a_protected_actor_answers_as_an_ordinary_one(system: hf.ActorSyst
     with pytest.raises(hf.RemoteCrash, match="boom"):
         await ref.ask(Boom())
     assert await ref.ask(Total()) == 15
-    assert len(group_of(ref).members) == 2
+    assert len(group_of(ref).membership.members) == 2
 
 
 async def test_the_graph_of_the_mechanism_is_seen_in_the_tree(system: hf.ActorSystem) -> None:
@@ -125,7 +126,7 @@ async def test_the_bindings_of_the_bricks_are_seen_from_outside(system: hf.Actor
     """A44-A51: from the proxy to the protected actor, and back."""
     ref = await started(system)
     group = group_of(ref)
-    first, second = group.primary, other(group)
+    first, second = group.membership.primary, other(group)
 
     async def bound(brick: str) -> dict[str, str]:
         status = await system.get_status(system.ref(f"{ref.path}/ftm/{brick}", hf.Actor))
@@ -160,7 +161,7 @@ async def test_killing_a_replica_under_load_loses_nothing(system: hf.ActorSystem
     for _ in range(4):
         await load.reached(rng.randrange(1, 60))
         group = group_of(ref)
-        name = group.primary if who == "primary" else other(group)
+        name = group.membership.primary if who == "primary" else other(group)
         assert name is not None
         killed.append(name)
         os.kill(pid_of(system, ref, name), signal.SIGKILL)
@@ -209,10 +210,10 @@ async def test_the_parts_at_the_root_may_die_at_any_moment(system: hf.ActorSyste
         await load.reached(rng.randrange(1, 60))
         group = group_of(ref)
         if turn % 2:
-            assert group.primary is not None
-            os.kill(pid_of(system, ref, group.primary), signal.SIGKILL)
+            assert group.membership.primary is not None
+            os.kill(pid_of(system, ref, group.membership.primary), signal.SIGKILL)
             await asyncio.sleep(rng.random() * 0.03)
-        cell = group.cell_of(part)
+        cell = group.replicas.cell_of(part)
         assert cell is not None
         cell.kill()
         await load.reached(20)
@@ -226,7 +227,7 @@ async def test_the_supervisor_of_the_mechanism_may_die(system: hf.ActorSystem, m
     ref = await started(system, recovery=METHODS[method]())
     load = Load(ref)
     await load.reached(40)
-    ftm = group_of(ref).node.find(f"{ref.path}/ftm")
+    ftm = group_of(ref).replicas.node.find(f"{ref.path}/ftm")
     assert ftm is not None
     ftm.kill()
     await load.reached(40)
@@ -255,7 +256,7 @@ async def test_the_failover_manager_may_die_at_each_step(system: hf.ActorSystem,
     host.on_step = strike
     await load.reached(30)
     group = group_of(ref)
-    name = other(group) if step == "peer" else group.primary
+    name = other(group) if step == "peer" else group.membership.primary
     assert name is not None
     os.kill(pid_of(system, ref, name), signal.SIGKILL)
     await load.reached(50)
@@ -271,7 +272,7 @@ async def test_a_stopped_primary_that_wakes_up_changes_nothing(system: hf.ActorS
     load = Load(ref)
     events = system.events()
     await load.reached(30)
-    primary = group_of(ref).primary
+    primary = group_of(ref).membership.primary
     assert primary is not None
     pid = pid_of(system, ref, primary)
     await stop_process(pid)
@@ -287,25 +288,27 @@ async def test_a_stopped_primary_that_wakes_up_changes_nothing(system: hf.ActorS
     events.close()
 
 
-async def test_a_silent_primary_that_nobody_could_replace_is_waited_for(system: hf.ActorSystem) -> None:
+async def test_a_silent_primary_that_nobody_could_replace_is_waited_for(
+    system: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ref = await started(system)
     group = group_of(ref)
     assert await ref.ask(Add(0)) == 1
     events = system.events()
-    leads = group.primary
+    leads = group.membership.primary
     assert leads is not None
     pid = pid_of(system, ref, leads)
     os.kill(pid_of(system, ref, other(group)), signal.SIGKILL)
     await stop_process(pid)
-    looks, real = list[bool](), group.is_awaited
+    looks, real = list[bool](), Membership.is_awaited
 
-    def is_awaited(name: str) -> bool:
-        looks.append(real(name))
+    def is_awaited(known: Membership, name: str, lives: Lives, now: float, hopeless: float) -> bool:
+        looks.append(real(known, name, lives, now, hopeless))
         return looks[-1]
 
-    group.is_awaited = is_awaited  # type: ignore[method-assign]
+    monkeypatch.setattr(Membership, "is_awaited", is_awaited)
     async with asyncio.timeout(30):
-        while len(looks) < 3 and not group.is_over:
+        while len(looks) < 3 and not group.membership.is_over:
             await asyncio.sleep(0.005)
     os.kill(pid, signal.SIGCONT)
     assert await ref.ask(Add(1), timeout=30) == 2
@@ -325,15 +328,15 @@ async def test_a_silent_successor_that_is_all_there_is_is_waited_for(
     host: Any = ref._cell.host.place
     group = group_of(ref)
     assert await ref.ask(Add(0)) == 1
-    first, heir, stopped = group.primary, other(group), list[int]()
+    first, heir, stopped = group.membership.primary, other(group), list[int]()
     assert first is not None
-    looks, is_awaited = list[str](), group.is_awaited
+    looks, is_awaited = list[str](), Membership.is_awaited
 
-    def looked(name: str) -> bool:
+    def looked(known: Membership, name: str, lives: Lives, now: float, hopeless: float) -> bool:
         looks.append(name)
-        return is_awaited(name)
+        return is_awaited(known, name, lives, now, hopeless)
 
-    monkeypatch.setattr(group, "is_awaited", looked)
+    monkeypatch.setattr(Membership, "is_awaited", looked)
 
     def stop_heir(step: str) -> None:
         if step == "lead" and not stopped:
@@ -343,9 +346,9 @@ async def test_a_silent_successor_that_is_all_there_is_is_waited_for(
     host.on_step = stop_heir
     os.kill(pid_of(system, ref, first), signal.SIGKILL)
     async with asyncio.timeout(30):
-        while looks.count(heir) < 10 and not group.is_over:
+        while looks.count(heir) < 10 and not group.membership.is_over:
             await asyncio.sleep(0.005)
-    assert heir in group.members
+    assert heir in group.membership.members
     os.kill(stopped[0], signal.SIGCONT)
     assert await ref.ask(Add(1), timeout=30) == 2
     await two_again(ref)
@@ -357,13 +360,13 @@ async def test_a_stopped_backup_holds_nobody_up_for_long(system: hf.ActorSystem)
     load = Load(ref)
     await load.reached(30)
     group = group_of(ref)
-    leads = group.primary
+    leads = group.membership.primary
     await stop_process(pid_of(system, ref, other(group)))
     await load.reached(100)
     await two_again(ref)
     await load.stop()
     load.check(await ref.ask(Tags()))
-    assert group_of(ref).primary == leads
+    assert group_of(ref).membership.primary == leads
     assert load.longest < 5.0
 
 
@@ -372,11 +375,12 @@ async def test_a_primary_that_wakes_up_before_it_is_killed_was_suspected_wrongly
     events = system.events()
     group = group_of(ref)
     backup = other(group)
-    group.suspects[backup] = group.silences[backup] = group.members[backup]  # Nobody was told.
+    life = group.membership.members[backup]
+    group.membership.suspected[backup] = Suspicion(life, "a test wants it", 0.0, is_silence=True)  # Nobody was told.
     async with asyncio.timeout(10):
         while not any(isinstance(event, WrongSuspicion) for event in events.take()):
             await asyncio.sleep(0.005)
-    assert group.wrong == 1
+    assert group.replicas.wrong == 1
     assert await ref.ask(Add(0)) == 1
     events.close()
 
@@ -385,15 +389,15 @@ async def test_no_sign_of_life_saves_a_replica_that_has_to_be_replaced(system: h
     ref = await started(system)
     group = group_of(ref)
     await two_again(ref)
-    name = group.primary
+    name = group.membership.primary
     assert name is not None
-    life = group.members[name]
-    group.suspect(name, life, "a test wants it")
-    group.heard(name, life)  # Before anybody has acted on that.
+    life = group.membership.members[name]
+    group.replicas.suspect(name, life, "a test wants it")
+    group.replicas.heard(name, life)  # Before anybody has acted on that.
     async with asyncio.timeout(30):
-        while group.primary in (None, name):
+        while group.membership.primary in (None, name):
             await asyncio.sleep(0.001)
-    assert group.wrong == 0
+    assert group.replicas.wrong == 0
     assert await ref.ask(Add(0)) == 1
 
 
@@ -405,7 +409,7 @@ async def test_what_asks_in_the_middle_of_its_turns_moves_no_money_twice(system:
     for _ in range(4):
         await load.reached(rng.randrange(1, 40))
         group = group_of(ref)
-        name = rng.choice([group.primary, other(group)])
+        name = rng.choice([group.membership.primary, other(group)])
         assert name is not None
         os.kill(pid_of(system, ref, name), signal.SIGKILL)
         await load.reached(10)
@@ -505,7 +509,7 @@ async def test_one_that_comes_back_fresh_leads_on_from_no_state(system: hf.Actor
     ref = system.ref("/app/team/counter", Counter)
     assert await ref.ask(Add(0, 5), timeout=60.0) == 5
     with system.events() as stream:
-        for name in group_of(ref).names:
+        for name in group_of(ref).membership.names:
             os.kill(pid_of(system, ref, name), signal.SIGKILL)
         async with asyncio.timeout(30.0):
             async for one in stream:

@@ -49,7 +49,7 @@ async def test_background_work_is_begun_again_or_said_to_be_lost(
     await ref.ask(Add(0))
     await ref.ask(Wait(str(there), 1))
     assert await ref.ask(Add(2)) == 2
-    primary = group_of(ref).primary
+    primary = group_of(ref).membership.primary
     assert primary is not None
     if how == "kill":
         os.kill(pid_of(system, ref, primary), signal.SIGKILL)
@@ -111,7 +111,7 @@ async def test_nobody_waits_for_the_turn_in_hand_of_a_replica_that_is_broken(
 ) -> None:
     """A brick has crashed (A44-A59), and its replica would end with the turn: it is killed, another one leads."""
     ref = await system.start(hf.child("alice", hf.start(Stayer), mechanism=Fragile()))
-    primary = group_of(ref).primary
+    primary = group_of(ref).membership.primary
     with system.events() as events:
         answer = ref.ask(Stay(str(tmp_path)), timeout=60)
         await until_there(tmp_path / "begun")

@@ -123,7 +123,7 @@ def at_step(ref: hf.ActorRef[Any], step: str, act: Callable[[], Any]) -> list[An
 def kill(
     system: hf.ActorSystem, ref: hf.ActorRef[Any], name: str | None = None, how: signal.Signals = signal.SIGKILL
 ) -> None:
-    name = name or group_of(ref).primary
+    name = name or group_of(ref).membership.primary
     assert name is not None
     os.kill(pid_of(system, ref, name), how)
 
@@ -147,7 +147,7 @@ async def test_a_failover_does_not_wait_for_a_repair_that_is_asleep(system: hf.A
     asleep = asyncio.create_task(repair.carry_out())
     await repair.begun.wait()
     assert holder(system) is Hand.REPAIR
-    leads = group_of(ref).primary
+    leads = group_of(ref).membership.primary
     kill(system, ref)
     await load.reached(20)
     result = await asleep

@@ -46,8 +46,8 @@ async def test_a_timer_of_on_start_is_there_once_after_failovers(recovery: hf.Me
         host: Any = ref._cell.host.place
         assert await ref.ask(Count(), timeout=30.0) == 1
         for count in (2, 3, 4):
-            await until(lambda: len(host.group.members) > 1)
-            primary = host.group.primary
+            await until(lambda: len(host.group.membership.members) > 1)
+            primary = host.group.membership.primary
             os.kill(system.pid_of(system.ref(f"/app/ticking/ftm/{primary}", hf.Actor)), signal.SIGKILL)
             assert await ref.ask(Count(), timeout=60.0) == count
             assert [interval for *_, interval in host.home.switch.timers.saved().values()] == [3600.0]
@@ -80,8 +80,8 @@ async def test_a_handle_of_on_start_is_good_after_a_failover_and_a_restart_of_th
         ref = await system.start(spec)
         host: Any = ref._cell.host.place
         assert await ref.ask(Count(), timeout=30.0) == 1
-        await until(lambda: len(host.group.members) > 1)
-        os.kill(system.pid_of(system.ref(f"/app/it/ftm/{host.group.primary}", hf.Actor)), signal.SIGKILL)
+        await until(lambda: len(host.group.membership.members) > 1)
+        os.kill(system.pid_of(system.ref(f"/app/it/ftm/{host.group.membership.primary}", hf.Actor)), signal.SIGKILL)
         assert await ref.ask(Count(), timeout=60.0) == 2
     async with hf.ActorSystem("app", log=False, intensity=1000, store=store) as system:
         ref = await system.start(spec)

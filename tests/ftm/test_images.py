@@ -123,7 +123,7 @@ async def test_processes_that_are_killed_leave_the_identical_state_to_the_other(
     seen = await ref.ask(Sum())
     for _ in range(2):
         group = group_of(ref)
-        os.kill(pid_of(system, ref, group.primary or ""), signal.SIGKILL)
+        os.kill(pid_of(system, ref, group.membership.primary or ""), signal.SIGKILL)
         assert await ref.ask(Sum()) == seen
         await ref.ask(Touch("list", 99))
         seen = await ref.ask(Sum())

@@ -39,7 +39,7 @@ async def test_kills_of_the_one_that_leads_lose_and_double_nothing(system: hf.Ac
             if n % 10 == 0:
                 await asyncio.sleep(0.001)
         group = ref._cell.host.place.group  # type: ignore[attr-defined]
-        pid = system._workers.processes()[f"{ref.path}/ftm/{group.primary}"]
+        pid = system._workers.processes()[f"{ref.path}/ftm/{group.membership.primary}"]
         os.kill(pid, signal.SIGKILL)
     replies = await asyncio.gather(*asked)
     events.close()

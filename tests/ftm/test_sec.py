@@ -46,14 +46,14 @@ def group_of(ref: Any) -> Any:
 
 async def joined(ref: Any, count: int = 2) -> None:
     async with asyncio.timeout(20):
-        while group_of(ref) is None or len(group_of(ref).members) < count:
+        while group_of(ref) is None or len(group_of(ref).membership.members) < count:
             await asyncio.sleep(0.005)
 
 
 async def kill_primary(system: hf.ActorSystem, ref: Any) -> None:
     """Returns when another one leads."""
     before = group_of(ref).failovers
-    os.kill(system._workers.processes()[f"{ref.path}/ftm/{group_of(ref).primary}"], signal.SIGKILL)
+    os.kill(system._workers.processes()[f"{ref.path}/ftm/{group_of(ref).membership.primary}"], signal.SIGKILL)
     async with asyncio.timeout(20):
         while group_of(ref).failovers == before:
             await asyncio.sleep(0.002)
@@ -74,7 +74,7 @@ async def test_requests_are_answered_over_it(secured: hf.ActorSystem, name: str)
     ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(STACKS[name]())))
     replies = await asyncio.gather(*[ref.ask(Add(n), timeout=20.0) for n in range(200)])
     assert replies == list(range(1, 201))
-    assert group_of(ref).link is not None
+    assert group_of(ref).replicas.link is not None
 
 
 @pytest.mark.parametrize("name", [name for name in STACKS if name != "SEC"])
@@ -110,7 +110,7 @@ class Tap:
         return self
 
     def on_proxy(self, ref: Any) -> Tap:
-        cell = group_of(ref).cell_of("proxy")
+        cell = group_of(ref).replicas.cell_of("proxy")
         real = cell.admit
         cell.admit = lambda cell, item: self.pass_on(cell, item, lambda: real(cell, item))
         return self
@@ -181,7 +181,7 @@ async def test_what_is_altered_or_dropped_on_the_way_is_said_again(
                     places |= {one.place for one in events.take() if isinstance(one, hf.FrameRefused)}
                     await asyncio.sleep(0.01)
             assert places == {f"/app/c/ftm/{place}" for place in ("proxy", "r1", "r2")}
-            assert group_of(ref).link.rejected[reason] > 0
+            assert group_of(ref).replicas.link.rejected[reason] > 0
 
 
 async def test_what_is_replayed_is_refused(secured: hf.ActorSystem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,7 +199,7 @@ async def test_what_is_replayed_is_refused(secured: hf.ActorSystem, monkeypatch:
     letters = [(path, m) for path, m in tap.seen if isinstance(m, Parcel) and m.name.endswith(":Letter")]
     assert letters
     assert await ref.ask(Tags()) == [0]
-    assert group_of(ref).link.rejected["replayed"] > 0
+    assert group_of(ref).replicas.link.rejected["replayed"] > 0
 
 
 @pytest.mark.parametrize(("below", "count"), [(hf.PBR(), 2), (TMR(), 3)])
@@ -221,7 +221,7 @@ async def test_nothing_can_be_read_on_the_way(
 
     assert b"accounts:Add" in seen("/app/p")
     assert b"accounts:Add" not in seen("/app/c")
-    others = [f"r{number}" for number in range(1, count + 1) if f"r{number}" != group_of(ref).primary]
+    others = [f"r{number}" for number in range(1, count + 1) if f"r{number}" != group_of(ref).membership.primary]
     letters = [where for where, m in tap.seen if isinstance(m, Parcel) and m.name.endswith(":Letter")]
     assert {where.split("/")[4] for where in letters if where.startswith("/app/c/ftm/r")} >= set(others)
     assert not [m for where, m in tap.seen if where.startswith("/app/c") and isinstance(m, (Work, Lead, Join, Done))]
@@ -262,12 +262,17 @@ async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
     group, node = group_of(ref), secured.node
     protocol = node.cell_at("/app/c/ftm/r1/protocol").ref
     with secured.events() as events:
-        for order in (Lead(99, group.config), Follow(99, group.config), Peer(99, None), Export(group.epoch)):
+        for order in (
+            Lead(99, group.adaptation.config),
+            Follow(99, group.adaptation.config),
+            Peer(99, None),
+            Export(group.membership.epoch),
+        ):
             with pytest.raises(Refused, match="plain"):
                 await protocol.ask(order)
-        protocol.tell(Work(group.epoch, group.config, 99, []))
+        protocol.tell(Work(group.membership.epoch, group.adaptation.config, 99, []))
         over = Closed(0, dict(pack_exit(SHUTDOWN)), False)
-        end = Done(group.epoch, group.config, group.number, [], True, None, [over])
+        end = Done(group.membership.epoch, group.adaptation.config, group.delivery.number, [], True, None, [over])
         proxy = node.cell_at("/app/c/ftm/proxy")
         proxy.ref.tell(end)
         proxy.admit(proxy, Envelope(end, node.cell_at("/app/c/ftm/r1/protocol")))  # As whoever leads would send it.
@@ -280,7 +285,9 @@ async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
             await protocol.ask(Greet(Office().party("/app/c/ftm/proxy").begin("/app/c/ftm/r1").hello))
         key, ca = SigningKey.per_start(), secured.ref(CA, CertificationAuthority)
         certificate = await ca.ask(Enrol(make_request(key, "mallory")))
-        mallory = Participant(key, certificate, Trust(await ca.ask(GetRoot())), incarnation=1, epoch=group.epoch)
+        mallory = Participant(
+            key, certificate, Trust(await ca.ask(GetRoot())), incarnation=1, epoch=group.membership.epoch
+        )
         with pytest.raises(Refused, match="wrong_peer"):
             await protocol.ask(Greet(mallory.begin("/app/c/ftm/r1").hello))
         with pytest.raises(EnrolmentRefused):
@@ -291,27 +298,27 @@ async def test_what_is_forged_is_refused(secured: hf.ActorSystem) -> None:
                 reasons |= {one.reason for one in events.take() if isinstance(one, hf.FrameRefused)}
                 await asyncio.sleep(0.01)
     assert await ref.ask(Add(1)) == 1
-    assert (group_of(ref).epoch, ref._cell.life) == (1, 1)
+    assert (group_of(ref).membership.epoch, ref._cell.life) == (1, 1)
 
 
 async def test_frames_at_a_replica_without_a_secured_link_are_refused_and_harm_nobody(secured: hf.ActorSystem) -> None:
     ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.PBR()))
     await joined(ref)
-    lives = dict(group_of(ref).members)
+    lives = dict(group_of(ref).membership.members)
     for name in ("r1", "r2"):
         protocol = secured.node.cell_at(f"/app/c/ftm/{name}/protocol").ref
         for frame in (Greet(b"hello"), Agree(b"hello", b"finish"), Sealed(b"frame")):
             with pytest.raises(Refused, match="closed"):
                 await protocol.ask(frame)
     assert await ref.ask(Add(1)) == 1
-    assert group_of(ref).members == lives
+    assert group_of(ref).membership.members == lives
 
 
 async def test_keys_rotate_sessions_end_and_each_epoch_has_its_own(secured: hf.ActorSystem) -> None:
     sec = SEC(CA, rotate_messages=3, lifetime=0.3)
     ref = await secured.start(hf.child("c", hf.start(Counter), mechanism=hf.compose(sec, hf.PBR())))
     await joined(ref)
-    link, numbers, generations = group_of(ref).link, set(), set()
+    link, numbers, generations = group_of(ref).replicas.link, set(), set()
     for n in range(150):
         assert await ref.ask(Add(n), timeout=20.0) == n + 1
         session = link._partners["/app/c/ftm/r1"].session
@@ -322,7 +329,7 @@ async def test_keys_rotate_sessions_end_and_each_epoch_has_its_own(secured: hf.A
     assert max(generations) > 1
     await kill_primary(secured, ref)
     assert await ref.ask(Add(150), timeout=20.0) == 151
-    assert link._partners["/app/c/ftm/r2"].session.epoch == group_of(ref).epoch == 2
+    assert link._partners["/app/c/ftm/r2"].session.epoch == group_of(ref).membership.epoch == 2
     assert not [one for one in link._sessions.values() if one.is_open and one.epoch < 2]
 
 
@@ -491,14 +498,14 @@ async def test_attached_composed_and_detached_while_requests_flow(secured: hf.Ac
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
         change.compose(ref, SEC(CA), outside=True)
-    assert group_of(ref).link is not None
+    assert group_of(ref).replicas.link is not None
     await load.reached(20)
     await kill_primary(secured, ref)
     await load.reached(20)
     await joined(ref)
     async with secured.transaction(timeout=30) as change:
         change.detach(ref, "sec")
-    assert group_of(ref).link is None
+    assert group_of(ref).replicas.link is None
     await load.reached(20)
     async with secured.transaction(timeout=30) as change:
         change.transition(ref, hf.compose(SEC(CA), hf.PBR()))

@@ -98,7 +98,7 @@ async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) ->
     replica, protocol = node.cell_at("/app/c/ftm/r1").ref, node.cell_at("/app/c/ftm/r1/protocol").ref
     bricks = sorted(secured.tree())
     with secured.events() as events:
-        for order in (Prepare(99, [hf.PBR().describe()]), Commit(99), Abort(group.config)):
+        for order in (Prepare(99, [hf.PBR().describe()]), Commit(99), Abort(group.adaptation.config)):
             with pytest.raises(Refused, match="plain"):
                 await protocol.ask(order)
             with pytest.raises(hf.HoldfastError):
@@ -109,14 +109,16 @@ async def test_orders_that_are_forged_change_nothing(secured: hf.ActorSystem) ->
                 await replica.ask(its)
         with pytest.raises(Refused, match="forged"):
             await replica.ask(Opened(0))
-        node.cell_at("/app/c/ftm/proxy").ref.tell(Stalled(group.primary, group.epoch, 0))
+        node.cell_at("/app/c/ftm/proxy").ref.tell(Stalled(group.membership.primary, group.membership.epoch, 0))
         places: set[tuple[str, str]] = set()
         async with asyncio.timeout(20):
             while places < {("/app/c/ftm/r1", "plain"), ("/app/c/ftm/proxy", "plain")}:
                 places |= {(one.place, one.reason) for one in events.take() if isinstance(one, hf.FrameRefused)}
                 await asyncio.sleep(0.01)
-    assert await protocol.ask(Commit(group.config)) == 1  # What was done already can be asked, and is only told.
+    assert (
+        await protocol.ask(Commit(group.adaptation.config)) == 1
+    )  # What was done already can be asked, and is only told.
     assert sorted(secured.tree()) == bricks
     assert await ref.ask(Add(1)) == 2
     assert await ref.ask(Tags()) == [0, 1]
-    assert (group.epoch, ref._cell.life) == (1, 1)
+    assert (group.membership.epoch, ref._cell.life) == (1, 1)

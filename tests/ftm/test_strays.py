@@ -28,5 +28,5 @@ async def test_a_follower_that_is_wrong_for_good_is_ended_and_the_next_one_joins
     faulty = [one for one in seen if isinstance(one, hf.ReplicaFaulty)]
     assert {(one.replica, one.times) for one in faulty} == {("r2", 3)}
     assert not any(isinstance(one, hf.FailedOver) for one in seen)
-    assert group_of(ref).primary == "r1"
+    assert group_of(ref).membership.primary == "r1"
     load.check(await ref.ask(Tags()))

@@ -71,8 +71,8 @@ async def test_nothing_is_lost_or_doubled_whichever_replica_dies(system: hf.Acto
         await load.reached(rng.randrange(5, 60))
         group = group_of(ref)
         await two_again(ref)
-        primary = group.primary
-        victim = primary if rng.random() < 0.6 else next(one for one in group.names if one != primary)
+        primary = group.membership.primary
+        victim = primary if rng.random() < 0.6 else next(one for one in group.membership.names if one != primary)
         os.kill(pid_of(system, ref, victim or ""), signal.SIGKILL)
     await load.reached(30)
     await load.stop()
@@ -109,7 +109,7 @@ async def ended(pids: set[int]) -> None:
 
 
 def pids_of(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> set[int]:
-    return {pid_of(system, ref, one) for one in group_of(ref).names}
+    return {pid_of(system, ref, one) for one in group_of(ref).membership.names}
 
 
 @pytest.mark.parametrize("method", RECOVERIES)
@@ -127,7 +127,7 @@ async def test_the_group_ends_with_the_process_of_the_subtree_and_begins_with_th
     assert await alice.ask(Tags()) == ([0, 1, 2, 3, 4, 99] if method == "hybrid" else [99])
     assert await bob.ask(Tags(), timeout=30.0) == []
     await two_again(alice)
-    os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, alice, group_of(alice).membership.primary or ""), signal.SIGKILL)
     assert await alice.ask(Add(100), timeout=30.0) == (7 if method == "hybrid" else 2)
 
 
@@ -240,7 +240,7 @@ async def test_who_watches_it_hears_of_its_end_and_not_of_a_replica(system: hf.A
     await watcher.ask(Watch("monitor"))
     await linked.ask(Watch("link"))
     assert await alice.ask(Add(0)) == 1
-    os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, alice, group_of(alice).membership.primary or ""), signal.SIGKILL)
     assert await alice.ask(Add(1)) == 2
     await two_again(alice)
     assert (await watcher.ask(Heard()), await linked.ask(Heard())) == ([], [])
@@ -266,7 +266,7 @@ async def test_its_bindings_are_those_of_its_replicas(system: hf.ActorSystem) ->
     system.bind(ref, "account", other)
     assert await ref.ask(Pay(3)) == 103
     await two_again(ref)
-    os.kill(pid_of(system, ref, group_of(ref).primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, ref, group_of(ref).membership.primary or ""), signal.SIGKILL)
     assert await ref.ask(Pay(3)) == 106
 
 

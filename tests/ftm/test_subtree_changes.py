@@ -47,7 +47,7 @@ async def test_its_mechanism_is_changed_under_load(system: hf.ActorSystem) -> No
     assert names_of(alice) == ["pbr", "tr"]
     await load.reached(20)
     await two_again(alice)
-    os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, alice, group_of(alice).membership.primary or ""), signal.SIGKILL)
     await load.reached(20)
     await load.stop()
     load.check(await alice.ask(Tags()))
@@ -119,7 +119,7 @@ async def test_attached_and_detached_under_load_nothing_is_lost(system: hf.Actor
         assert isinstance(alice._cell.host.place, GroupPlace)
         await load.reached(30)
         await two_again(alice)
-        os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+        os.kill(pid_of(system, alice, group_of(alice).membership.primary or ""), signal.SIGKILL)
         await load.reached(30)
         await two_again(alice)
         await detach(system, alice)
@@ -198,7 +198,7 @@ async def test_undone_with_its_transaction_it_lives_as_before(system: hf.ActorSy
     assert isinstance(alice._cell.host.place, SlotPlace)
     assert names_of(bob) == ["pbr"]
     await two_again(bob)
-    os.kill(pid_of(system, bob, group_of(bob).primary or ""), signal.SIGKILL)
+    os.kill(pid_of(system, bob, group_of(bob).membership.primary or ""), signal.SIGKILL)
     for load, ref in zip(loads, (alice, bob), strict=True):
         await load.reached(10)
         await load.stop()

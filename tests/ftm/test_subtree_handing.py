@@ -103,7 +103,7 @@ async def test_there_and_back_under_load_nothing_is_lost(system: hf.ActorSystem,
         await load.reached(30)
         if way == "replicas":
             await two_again(alice)
-            os.kill(pid_of(system, alice, group_of(alice).primary or ""), signal.SIGKILL)
+            os.kill(pid_of(system, alice, group_of(alice).membership.primary or ""), signal.SIGKILL)
             await load.reached(30)
             await two_again(alice)
         await home(system, alice)
@@ -124,7 +124,7 @@ async def test_there_and_back_under_load_nothing_is_lost(system: hf.ActorSystem,
 def is_to_rest(system: hf.ActorSystem, ref: hf.ActorRef[Any]) -> bool:
     """Whether whoever lives there has been told to come to rest."""
     if isinstance(ref._cell.host.place, GroupPlace):
-        return group_of(ref).is_stopping
+        return group_of(ref).delivery.is_stopping
     top = system.node.cell_at("/app/bank").host.place
     assert isinstance(top, SubtreePlace)
     move = system._moves._under_way.get(ref._cell)

@@ -160,7 +160,7 @@ async def three_again(ref: hf.ActorRef[Any]) -> None:
         while (
             ref._cell.state != "running"
             or getattr(ref._cell.host.place, "group", None) is None
-            or len(group_of(ref).members) < 3
+            or len(group_of(ref).membership.members) < 3
         ):
             await asyncio.sleep(0.005)
 

@@ -114,7 +114,7 @@ async def test_a_promise_outlives_the_replica_that_leads(system: hf.ActorSystem,
     promised = ref.ask(Later(), IN_TIME)
     await take(system, ref, "protect")
     group = group_of(ref)
-    os.kill(replica(system, ref, str(group.primary)), signal.SIGKILL)
+    os.kill(replica(system, ref, str(group.membership.primary)), signal.SIGKILL)
     assert await ref.ask(Give(9), IN_TIME)
     assert await promised == 9
 
@@ -126,7 +126,7 @@ async def test_a_promise_ends_with_the_last_replica(system: hf.ActorSystem, plac
     promised = ref.ask(Later(), IN_TIME)
     await take(system, ref, "protect")
     group = group_of(ref)
-    for name in group.names:
+    for name in group.membership.names:
         os.kill(replica(system, ref, name), signal.SIGKILL)
     with pytest.raises(hf.AskFailed):
         await promised

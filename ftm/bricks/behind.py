@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 
 from ...checkpoint.protocol import Closed, PipeDone
-from ..bricks.brick_messages import Beside, Strayed
+from .brick_messages import Beside, Strayed
 
 
 class Behind:
