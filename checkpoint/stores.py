@@ -51,7 +51,7 @@ PARTS = (
 """What an engine has."""
 
 
-def check_durability(store: str | Journal | None, durability: Durability | None) -> Durability | None:
+def check_durability(store: str | Journal | None, durability: Durability | None) -> None:
     """Refuse what cannot be kept.
 
     Raises:
@@ -67,4 +67,3 @@ def check_durability(store: str | Journal | None, durability: Durability | None)
     lasts = store is not None and store != "memory" and (isinstance(store, str) or store.durable)
     if durability in ("os", "fsync") and not lasts:
         raise SpecError("ActorSystem", f"durability={durability!r} needs a store: store='sqlite:PATH'")
-    return durability
