@@ -27,7 +27,7 @@ class Finishing:
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Unknown:
+class Unclear:
     """It is not known what there is to repair; at `ends` the case is given up."""
 
     why: str
@@ -41,7 +41,7 @@ class HeldByMode:
     mode: str
 
 
-Phase = Verifying | Finishing | Unknown | HeldByMode
+Phase = Verifying | Finishing | Unclear | HeldByMode
 
 
 @dataclasses.dataclass(slots=True)

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from ..engine import State
 from ..model import Model
 from ..planning import Plan, Step, TimedOut, Unsolvable
-from .case import Case, Finishing, HeldByMode, Phase, Unknown, Verifying
-from .choice import Moment, remaining, symptoms_held
+from .case import Case, Finishing, HeldByMode, Phase, Unclear, Verifying
+from .choice import CaseView, remaining, symptoms_held
 from .executor import DENIED, DONE, SKIPPED, Result
 from .outlook import Outlook
 from .policy import Policy
@@ -70,7 +70,7 @@ class Close:
 Decision = Wait | Enter | PlanFor | Dismiss | GiveUp | Close
 
 
-def decide(case: Case, at: Moment, policy: Policy) -> Decision:
+def decide(case: Case, at: CaseView, policy: Policy) -> Decision:
     """What to do now in the phase that the case is in."""
     match case.phase:
         case None:
@@ -79,7 +79,7 @@ def decide(case: Case, at: Moment, policy: Policy) -> Decision:
             return _decide_verifying(case, at, policy, touched, since, ends)
         case Finishing(ends):
             return _decide_finishing(case, at, ends)
-        case Unknown(why, ends):
+        case Unclear(why, ends):
             if not why_unknown(at):
                 return Enter()
             return Wait(ends - at.now, wakes=True) if at.now < ends else GiveUp((), f"{why} for {policy.unknown:g} s")
@@ -88,13 +88,13 @@ def decide(case: Case, at: Moment, policy: Policy) -> Decision:
             return Wait(math.inf, wakes=True) if is_held else Enter()
 
 
-def _decide_round(case: Case, at: Moment, policy: Policy) -> Decision:
+def _decide_round(case: Case, at: CaseView, policy: Policy) -> Decision:
     if at.settles > at.now:
         return Wait(at.settles - at.now)
     if at.diagnosis.state is State.HEALTHY:
         return Enter(Finishing(at.now + policy.verify))
     if why := why_unknown(at):
-        return Enter(Unknown(why, at.now + policy.unknown), held=why)
+        return Enter(Unclear(why, at.now + policy.unknown), held=why)
     if at.bad is None:
         return _decide_nothing_left(case, at)
     if case.rounds >= policy.rounds or at.now - case.began > policy.seconds:
@@ -103,7 +103,7 @@ def _decide_round(case: Case, at: Moment, policy: Policy) -> Decision:
     return PlanFor(at.bad)
 
 
-def _decide_nothing_left(case: Case, at: Moment) -> Decision:
+def _decide_nothing_left(case: Case, at: CaseView) -> Decision:
     """No candidate is open: what is left was given up before, cannot be planned for, or is not ours to touch."""
     if not case.hopeless:
         return Close(is_repaired=not at.was_planned_dry or case.rounds > 0)
@@ -112,7 +112,7 @@ def _decide_nothing_left(case: Case, at: Moment) -> Decision:
 
 
 def _decide_verifying(
-    case: Case, at: Moment, policy: Policy, touched: Collection[str], since: float, ends: float
+    case: Case, at: CaseView, policy: Policy, touched: Collection[str], since: float, ends: float
 ) -> Decision:
     """Wait until the symptoms have gone; no longer, once a stable diagnosis blames others than were touched."""
     is_healthy = at.diagnosis.state is State.HEALTHY and not remaining(case.symptoms, at.observed)
@@ -126,7 +126,7 @@ def _decide_verifying(
     return Enter() if blames_others else Wait(left, wakes=True)
 
 
-def _decide_finishing(case: Case, at: Moment, ends: float) -> Decision:
+def _decide_finishing(case: Case, at: CaseView, ends: float) -> Decision:
     """The diagnosis finds nothing bad: it counts when the symptoms are seen to have gone."""
     if at.diagnosis.state is not State.HEALTHY:
         return Enter()
@@ -138,7 +138,7 @@ def _decide_finishing(case: Case, at: Moment, ends: float) -> Decision:
     return Wait(ends - at.now, wakes=True)
 
 
-def why_unknown(at: Moment) -> str:
+def why_unknown(at: CaseView) -> str:
     """Why it is not known what there is to repair; empty if it is.
 
     No repair starts from observations that say nothing or cannot all be true (T49, T50).

@@ -23,7 +23,7 @@ from .policy import Policy
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
-class Moment:
+class CaseView:
     """What repair knows at one moment of a case.
 
     Attributes:
@@ -84,7 +84,7 @@ def problem_for(
     repertoire: Repertoire,
     policy: Policy,
     ledger: Ledger,
-    at: Moment,
+    at: CaseView,
     bad: Collection[str],
     alone: Collection[str],
 ) -> Problem:

@@ -52,7 +52,7 @@ from .case_decisions import (
     was_skipped,
     why_overtaken,
 )
-from .choice import Moment, choose, components_of, problem_for
+from .choice import CaseView, choose, components_of, problem_for
 from .executor import DENIED, DONE, SKIPPED, Executor, Result
 from .ledger import Ledger, Memory
 from .outlook import Outlook
@@ -235,11 +235,11 @@ class Repairer(Actor):
         parked = (name for name, address in self._addresses.items() if self._arbiter.is_parked(address))
         return {*self._policy.exclude, *base_of(self._addresses, ours), *self._memory.given_up, *parked}
 
-    def _moment(self, case: Case) -> Moment:
+    def _moment(self, case: Case) -> CaseView:
         """What is known now, for the next decision of a case."""
         outlook, now = self._outlook, self.now()
         is_healthy = outlook.diagnosis.state is State.HEALTHY
-        return Moment(
+        return CaseView(
             outlook.diagnosis,
             outlook.observations.current(now),
             self._memory.mode,

@@ -25,7 +25,7 @@ from holdfast.diagnosis.repair.case_decisions import (
     judge_results,
     was_skipped,
 )
-from holdfast.diagnosis.repair.choice import Moment, choose
+from holdfast.diagnosis.repair.choice import CaseView, choose
 from holdfast.diagnosis.repair.executor import Result
 
 PARTS = ("a", "b", "c")
@@ -85,8 +85,8 @@ class Repair(RuleBasedStateMachine):
         )
         return None if found is None else found.bad
 
-    def moment(self, case: Case) -> Moment:
-        return Moment(
+    def moment(self, case: Case) -> CaseView:
+        return CaseView(
             self.diagnosis,
             self.observed,
             self.mode,
