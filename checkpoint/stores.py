@@ -7,11 +7,11 @@ from typing import get_args
 
 from ..actors.errors import SpecError
 from .engine_calls import Called
-from .journal import Journal, MemoryJournal
+from .journal import Journal, MemoryJournal, StoreEngine
 from .method import Durability
 
 
-def open_journal(store: str | Journal | None, *, takeover: bool = False) -> Journal:
+def open_journal(store: str | Journal | None, *, takeover: bool = False) -> StoreEngine:
     """The journal that `store` names: None or "memory", or "sqlite:PATH"; or the open engine that it is.
 
     Raises:

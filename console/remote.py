@@ -34,6 +34,7 @@ from .wire import (
     Whereis,
     check_user,
     frame,
+    open_arg,
     outcome,
     pack_arg,
     peer_uid,
@@ -405,7 +406,7 @@ class RemoteChange:
         """The steps, in order; in full when the system has answered."""
         if self._steps is not None:
             return self._steps
-        named = [(verb, str(getattr(args[0], "value", ""))) for verb, args in self._operations]
+        named = [(verb, open_arg(args[0])) for verb, args in self._operations]
         return tuple(Step(n, verb, target, f"{verb} {target}") for n, (verb, target) in enumerate(named, 1))
 
     @property

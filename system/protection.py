@@ -15,11 +15,11 @@ import msgspec
 from ..actors.errors import SpecError
 from ..actors.events import Event
 from ..supervision.respec import rebuilt, spec_below
+from ..supervision.spec import ChildSpec
 
 if TYPE_CHECKING:
     from ..actors.kernel.cell import Cell
     from ..checkpoint.home.homes import Homes
-    from ..supervision.spec import ChildSpec
 
 KEPT = "mechanisms"
 """The note with what there is."""
@@ -37,7 +37,7 @@ def check_no_part(cell: Cell) -> None:
     """Whether an actor is not what a mechanism has below the address that it protects. Raises SpecError."""
     above = cell.parent
     while above is not None:
-        if getattr(above.spec, "mechanism", None) is not None:
+        if isinstance(above.spec, ChildSpec) and above.spec.mechanism is not None:
             raise SpecError(cell.path, part_of(above.path))
         above = above.parent
 

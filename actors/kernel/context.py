@@ -424,6 +424,11 @@ class ActorContext:
         """Whether an order has to wait (a journaled actor takes none before it has caught up); it comes again then."""
         return False
 
+    @property
+    def named_variables(self) -> tuple[str, ...] | None:
+        """The key variables that a recovery file names for this actor; None if none does."""
+        return None
+
     def may_replace(self) -> None:
         """The state is about to be replaced from outside. Raises ControlFailed if it cannot be now."""
 

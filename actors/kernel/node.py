@@ -241,8 +241,7 @@ class Node(RunLoop):
         if cell.state is DOWN or cell.state is GONE:
             lifecycle.retire(cell, "its parent has stopped")
             return cell.extra().reason
-        stop = getattr(cell.spec, "stop", None)
-        reason: ExitReason = await (stop(cell) if stop is not None else lifecycle.stop_in_time(cell))
+        reason: ExitReason = await (lifecycle.stop_in_time(cell) if cell.spec is None else cell.spec.stop(cell))
         lifecycle.retire(cell, "its parent has stopped")
         return reason
 

@@ -12,7 +12,7 @@ from ...actors.persistence import child_key
 from ..addresses import Addresses, renamed
 from ..group_commit import Commits, Unkept
 from ..inputs import HomeJournal
-from ..journal import Journal, Saved
+from ..journal import Saved, StoreEngine
 from ..method import Durability, Method, hybrid
 from ..recovery.recoveries import Recoveries
 from ..recovery_file import RecoveryFile
@@ -43,7 +43,7 @@ class Homes:
     def __init__(
         self,
         node: Node,
-        journal: Journal,
+        journal: StoreEngine,
         *,
         durability: Durability | None = None,
         file: RecoveryFile | None = None,

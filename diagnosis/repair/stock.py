@@ -338,7 +338,7 @@ def _word(mechanism: Any) -> str:
     """A mechanism in the name of an action."""
     if isinstance(mechanism, (tuple, list)):
         return "_".join(map(_word, mechanism))
-    name = mechanism if isinstance(mechanism, str) else getattr(mechanism, "name", "")
+    name = mechanism if isinstance(mechanism, str) else str(mechanism.name)
     return name if name.isidentifier() else "mechanism"
 
 

@@ -187,7 +187,7 @@ class TMR(Mechanism):
     units: ClassVar[int] = 3
     layer: ClassVar[str] = "replication"
     keeps_members: ClassVar[bool] = True
-    cost: ClassVar[Cost] = Cost(latency=2, total=3, requests=4, recovery=0.02)
+    cost: ClassVar[Cost | None] = Cost(latency=2, total=3, requests=4, recovery=0.02)
     roles: ClassVar[dict[str, Role]] = {
         "leader": Role(before=Computing, after=Voting),
         "follower": Role(before=Computing, computes=False),

@@ -69,7 +69,7 @@ def check_stack(layers: tuple[Mechanism, ...], kind: type[Actor] | None, where: 
             why = f"it wants {one.replicas} replicas, and {others[0].name} outside of it {others[0].replicas}"
             raise MechanismRefused(one.name, why)
         above = one
-        inside: frozenset[str] = getattr(one, "over", frozenset())
+        inside = one.over
         here = {other.layer for other in layers[layers.index(one) + 1 :]}
         if inside and not inside & here:
             raise MechanismRefused(one.name, f"a mechanism of the layer {', '.join(sorted(inside))} must stand inside")

@@ -20,6 +20,7 @@ import msgspec
 import psutil
 
 from ...actors.events import Event, EventHub, EventStream
+from ...actors.exit_reasons import ExitReason
 from ...actors.kernel.actor import Actor, on
 from ...actors.kernel.message import Message, Order
 from ...actors.kernel.node import cell_kind
@@ -252,7 +253,7 @@ class Watch:
         if event.address.startswith(f"{self.address}/ftm/"):  # Replicas that are lost are told at the address itself.
             return None
         reason = getattr(event, "reason", None)
-        if getattr(reason, "is_clean", False):  # A process that ended because it was to is no fault.
+        if isinstance(reason, ExitReason) and reason.is_clean:  # A process that ended because it was to is no fault.
             return None
         if isinstance(reason, str) and reason in HARMLESS:
             return None
