@@ -2,34 +2,25 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol, runtime_checkable
+from collections.abc import Callable
+from typing import Any
 
 
-@runtime_checkable
-class GivesState(Protocol):
-    """An actor that makes its state itself."""
-
-    def get_state(self) -> Any: ...
+def state_getter(actor: object) -> Callable[[], Any] | None:
+    """What makes an actor's state, if its class does that itself."""
+    return getattr(actor, "get_state", None)
 
 
-@runtime_checkable
-class TakesState(Protocol):
-    """An actor that is given such a state back."""
-
-    def set_state(self, state: Any) -> Any: ...
+def state_setter(actor: object) -> Callable[[Any], Any] | None:
+    """What gives an actor such a state back."""
+    return getattr(actor, "set_state", None)
 
 
-@runtime_checkable
-class MigratesState(Protocol):
-    """A class that makes its state of one that an older version of it, or another class, has had."""
-
-    def migrate(self, state: Any, before: Any) -> Any: ...
+def state_migrator(kind: type) -> Callable[[Any, Any], Any] | None:
+    """What makes the state of a class of one that an older version of it, or another class, has had."""
+    return getattr(kind, "migrate", None)
 
 
-@runtime_checkable
-class GivesDeltas(Protocol):
-    """A class whose actors say what has changed in their state, and take that in."""
-
-    def get_delta(self) -> Any: ...
-
-    def apply_delta(self, delta: Any) -> Any: ...
+def gives_deltas(kind: type) -> bool:
+    """Whether the actors of a class say what has changed in their state, and take that in."""
+    return hasattr(kind, "get_delta") and hasattr(kind, "apply_delta")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterable
 from typing import TYPE_CHECKING, Any, cast
 
 from ..errors import ControlFailed, error_text, portable, type_name
-from ..state_hooks import GivesState, TakesState
+from ..state_hooks import state_getter, state_setter
 from ..values import UnsavableValue, decode_value, encode_value
 from ..values.classes import slots_of
 
@@ -26,8 +26,9 @@ class Opaque:
 
 def live_state(actor: Actor) -> Any:
     """The state itself: what `get_state()` gives if the class has it, else a dict of the key variables."""
-    if isinstance(actor, GivesState):
-        return actor.get_state()
+    get_state = state_getter(actor)
+    if get_state is not None:
+        return get_state()
     root, names = actor._state_root(), actor.key_variables
     if names is None:
         return {name: value for name, value in attributes(root) if not name.startswith("_") and name != "ctx"}
@@ -79,10 +80,11 @@ def put_state(actor: Actor, state: Any) -> None:
         ControlFailed: it is no state of this actor. Anything else: the class's own code raised.
     """
     where = actor.ctx.path
-    if isinstance(actor, GivesState):
-        if not isinstance(actor, TakesState):
+    if state_getter(actor) is not None:
+        set_state = state_setter(actor)
+        if set_state is None:
             raise ControlFailed(where, "replace_state", f"{type_name(type(actor))} has get_state but no set_state")
-        actor.set_state(state)
+        set_state(state)
         return
     if not isinstance(state, dict) or not all(isinstance(name, str) for name in state):
         raise ControlFailed(where, "replace_state", f"the state must be a dict of variables, not {state!r}")
@@ -126,8 +128,8 @@ def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Generator[None]:
     ctx = actor.ctx
     ctx.may_replace()
     kind, before = type(actor), dict(vars(actor))
-    hooked = state_to_change(actor) if isinstance(actor, TakesState) else None
-    values = None if isinstance(actor, GivesState) else live_state(actor)
+    hooked = state_to_change(actor) if state_setter(actor) is not None else None
+    values = live_state(actor) if state_getter(actor) is None else None
 
     def put_back() -> None:
         actor.__class__ = kind
@@ -135,8 +137,9 @@ def _changing(actor: Actor, verb: str, *, is_trial: bool) -> Generator[None]:
         vars(actor).update(before)
         if values is not None:
             put_state(actor, values)  # They may be another object's than the actor's.
-        if hooked is not None and isinstance(actor, TakesState):
-            actor.set_state(hooked)
+        set_state = state_setter(actor)
+        if hooked is not None and set_state is not None:
+            set_state(hooked)
 
     try:
         yield

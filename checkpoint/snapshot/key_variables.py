@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 from ...actors.control.live_state import attributes
 from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
-from ...actors.state_hooks import GivesState, MigratesState, TakesState
+from ...actors.state_hooks import state_getter, state_migrator, state_setter
 from ...actors.values import UnsavableValue, decode_value, encode_value
 from ..method import Method
 from .state_image import is_image, read_image
@@ -36,8 +36,9 @@ def state_of(actor: Actor) -> StateForm:
     Raises:
         StateMismatch: a declared key variable is not there. What `get_state` raises.
     """
-    if isinstance(actor, GivesState) and key_names(actor) is None:
-        return StateForm(actor.schema_version, "state", actor.get_state())
+    get_state = state_getter(actor)
+    if get_state is not None and key_names(actor) is None:
+        return StateForm(actor.schema_version, "state", get_state())
     where, root = actor.ctx.path, actor._state_root()
     return StateForm(actor.schema_version, "keys", {name: read_path(where, root, name) for name in variables(actor)})
 
@@ -154,7 +155,7 @@ def key_names(actor: Actor) -> tuple[str, ...] | None:
     if named is not None:
         return named
     # A class with get_state means that, whatever else it says.
-    return None if isinstance(actor, GivesState) else actor.key_variables
+    return actor.key_variables if state_getter(actor) is None else None
 
 
 def read_path(where: str, root: object, path: str) -> Any:
@@ -213,7 +214,7 @@ def check_saved(actor: Actor, method: Method) -> None:
         UnsavableValue: naming the variable and the type. StateMismatch: a declared key variable is not there or cannot
             be set, or the class lacks what puts its state back.
     """
-    if method.snapshots and key_names(actor) is None and isinstance(actor, GivesState):
+    if method.snapshots and key_names(actor) is None and state_getter(actor) is not None:
         setter_of(actor)
     save_state(actor)
     where, root = actor.ctx.path, actor._state_root()
@@ -227,11 +228,12 @@ def setter_of(actor: Actor) -> Callable[[Any], object]:
     Raises:
         StateMismatch: there is none, or it is a coroutine function, which would only do it later.
     """
-    if not isinstance(actor, TakesState):
+    set_state = state_setter(actor)
+    if set_state is None:
         raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))} has no set_state, which goes with get_state")
-    if inspect.iscoroutinefunction(actor.set_state):
+    if inspect.iscoroutinefunction(set_state):
         raise StateMismatch(actor.ctx.path, f"{type_name(type(actor))}.set_state is `async def`: it must be plain")
-    return actor.set_state
+    return set_state
 
 
 def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
@@ -244,11 +246,12 @@ def migrated(kind: type[Actor], state: Any, version: int, where: str) -> Any:
     known = f"it has schema version {version}, {type_name(kind)} {kind.schema_version}"
     if not isinstance(version, int) or version > kind.schema_version:
         raise StateMismatch(where, f"{known}: an older class cannot read what a newer one has saved")
-    if not isinstance(kind, MigratesState):
+    migrate = state_migrator(kind)
+    if migrate is None:
         raise StateMismatch(where, f"{known}, which has no classmethod migrate(state, from_version)")
-    if inspect.iscoroutinefunction(kind.migrate):
+    if inspect.iscoroutinefunction(migrate):
         raise StateMismatch(where, f"{known}, whose migrate is `async def`: it must be plain")
     try:
-        return kind.migrate(state, version)
+        return migrate(state, version)
     except BaseException as error:
         raise StateMismatch(where, f"{known}, and its migrate failed: {type(error).__name__}: {error}") from error

@@ -22,7 +22,7 @@ from ...actors.kernel.actor import Actor
 from ...actors.kernel.cell import DOWN, RUNNING, Cell
 from ...actors.kernel.envelope import Item
 from ...actors.kernel.message import message_name
-from ...actors.state_hooks import GivesDeltas
+from ...actors.state_hooks import gives_deltas
 from ...actors.values import encode_value
 from ...checkpoint.life.recorded_inbox import Fed, GoLive, StopRecorded
 from ...checkpoint.method import Method
@@ -156,7 +156,7 @@ class Server(lifecycle.HerePlace):
         cell.table = table = kind._table
         state = self.state
         state.has_access = has_state_access(kind)
-        state.has_deltas = state.has_access and isinstance(kind, GivesDeltas)
+        state.has_deltas = state.has_access and gives_deltas(kind)
         state.waiting = frozenset(
             message_name(one) for one in kind._declared if inspect.iscoroutinefunction(table[one])
         )
