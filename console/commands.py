@@ -72,9 +72,9 @@ def demo(
     Exit status 0: nothing lost, nothing doubled, the maps are equal bit by bit. 1: something differs. 2: there is
     nothing to run on.
     """
+    from .demo.demo_runs import Plan
     from .demo.log import LogError, killian_court
     from .demo.main import run_demo
-    from .demo.run import Plan
 
     try:
         plan = Plan(log or killian_court(), kills, seed, method.value, interval, speed)

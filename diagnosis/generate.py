@@ -22,7 +22,7 @@ from .messages import DIAGNOSIS, EXPLANATION, GRACE, MODEL, OBSERVATIONS, REPAIR
 from .model import Component, Declaration, Expectation, Kind
 from .observers.general import GeneralObserver, Learned
 from .observers.hearing import Heard, listen
-from .observers.node import NodeObserver
+from .observers.node_observer import NodeObserver
 from .observers.observer import Manner, Observer
 from .observers.verdicts import Agreement
 

@@ -24,7 +24,7 @@ from .model import (
     lint,
     read,
 )
-from .model.history import apply
+from .model.model_history import apply
 
 LOADED: Final = "loaded"
 

@@ -11,7 +11,7 @@ from ..checkpoint.journal import Journal
 from ..checkpoint.method import Durability
 from ..checkpoint.recovery_file import RecoveryFile, load_recovery
 from ..checkpoint.recovery_settings import RecoveryHooks
-from ..checkpoint.stores import check_durability
+from ..checkpoint.store_opening import check_durability
 from ..supervision.spec import Flags
 
 

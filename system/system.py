@@ -36,7 +36,7 @@ from ..checkpoint.places.subtree_place import subtree
 from ..checkpoint.protocol import Wanted
 from ..checkpoint.recovery_file import RecoveryFile
 from ..checkpoint.recovery_settings import RecoveryHooks
-from ..checkpoint.stores import check_system, open_journal
+from ..checkpoint.store_opening import check_system, open_journal
 from ..supervision.admin import NoSuchChild, RemoveChild, StartChild
 from ..supervision.patience import end_within
 from ..supervision.respec import respec
@@ -45,9 +45,9 @@ from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
 from .live_moves import Moves
 from .logs import LogSink
+from .mechanism_notes import Protection, check_no_part
 from .options import SystemOptions
 from .portal import ThreadPortal
-from .protection import Protection, check_no_part
 from .recorded import Recorded
 from .recovery import RecoveryTree
 from .script import load_script

@@ -12,9 +12,9 @@ import msgspec
 from ..errors import type_name
 from ..safe_state import SafeStateChange, watch
 from .bindings import Binding
+from .blocking_handlers import in_thread
 from .envelope import Table
 from .message import Message
-from .threads import in_thread
 
 if TYPE_CHECKING:
     from ..exit_reasons import ExitReason

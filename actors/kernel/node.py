@@ -18,6 +18,7 @@ from ..events import DeadLetter, Event, EventHub, SupervisorGaveUp
 from ..exit_reasons import KILLED, ExitReason
 from ..persistence import Keeper, NothingKept
 from . import lifecycle
+from .blocking_handlers import Threads
 from .cell import DOWN, GONE, RUNNING, Cell, Host
 from .codec import Codec
 from .deadlines import Deadlines
@@ -25,7 +26,6 @@ from .lifecycle import LOCAL
 from .loop import RunLoop
 from .mailbox import Bound, Bounded, admit_bounded, admit_gone
 from .message import Refusal
-from .threads import Threads
 from .topics import Topics
 
 if TYPE_CHECKING:

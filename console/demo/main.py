@@ -8,9 +8,9 @@ from pathlib import Path
 from rich.console import Console
 
 from ... import run
+from .demo_runs import Plan, compare
 from .picture import draw, save
 from .report import Outcome, Report
-from .run import Plan, compare
 from .show import watcher_for
 
 

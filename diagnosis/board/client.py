@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from ...actors.errors import HoldfastError
 from ...actors.streams import connect
 from ...supervision.backoff import Backoff
-from .frames import (
+from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,

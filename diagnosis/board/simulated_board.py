@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable
 
 import msgspec
 
-from .frames import CHANNELS, ChannelSpecification, Measurements, Reading, Specification
+from .board_frames import CHANNELS, ChannelSpecification, Measurements, Reading, Specification
 
 RIPPLE = 0.01
 """Share of the current by which a measurement is off, at most."""

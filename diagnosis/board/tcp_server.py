@@ -8,7 +8,7 @@ import socket
 from typing import Protocol
 
 from ...actors.streams import Listener
-from .frames import (
+from .board_frames import (
     Answer,
     AskMeasurements,
     AskSpecification,

@@ -23,7 +23,7 @@ from ...actors.process.process_host import WorkerPlace
 from ...actors.process.wire.peer import OutsideHost
 from ..literals import Literal
 from ..messages import Grace
-from .node import at_root
+from .node_observer import at_root
 from .observer import Manner, Observer, atom_of
 from .regression import Regression
 from .verdicts import Filter, Limits

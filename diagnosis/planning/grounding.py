@@ -27,7 +27,7 @@ from .language import (
     Problem,
     Same,
 )
-from .world import Binding, World, fill, statics
+from .static_facts import Binding, World, fill, statics
 
 Term: TypeAlias = frozenset[Literal]
 """A conjunction."""

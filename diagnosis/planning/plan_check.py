@@ -22,7 +22,7 @@ from .language import (
     Problem,
     Same,
 )
-from .world import Binding, World, fill
+from .static_facts import Binding, World, fill
 
 TRUE: Final = And()
 """The condition of an effect that has none."""

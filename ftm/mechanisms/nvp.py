@@ -23,8 +23,8 @@ from ...actors.kernel.actor import Actor
 from ..alarms import Masked
 from ..bricks.brick_messages import Request, State
 from ..bricks.runs import Deciding, Remembering, Run, Shadow, turns_of, vote
-from ..model.declaration import Cost
 from ..model.mechanism import Mechanism, Role
+from ..model.mechanism_declaration import Cost
 from ..votes.assertions import names_of
 from ..votes.versions import version
 from ..votes.voters import AnyVoter, Custom, Majority, Median, NoMajority, Undecided, Voter

@@ -28,8 +28,8 @@ from ..bricks.brick_messages import Done, NotFollowing, Request, StaleEpoch, Sta
 from ..bricks.runs import Deciding, Digests, Run, turns_of, vote
 from ..bricks.shadow_runs import NEEDS_STATE, Compute, Computed, Helping, Settled
 from ..bricks.standing import PeerLost
-from ..model.declaration import Cost
 from ..model.mechanism import Mechanism, Role
+from ..model.mechanism_declaration import Cost
 from ..votes.voters import Majority, Median, NoMajority, Undecided
 from .nvp import voter_of
 

@@ -19,7 +19,7 @@ from itertools import product
 import msgspec
 
 from .application import Application
-from .declaration import FAULTS, LAYERS, LEVELS, NEEDS, Cost, Entry, Mechanisms
+from .mechanism_declaration import FAULTS, LAYERS, LEVELS, NEEDS, Cost, Entry, Mechanisms
 
 
 class Faults(msgspec.Struct, frozen=True):

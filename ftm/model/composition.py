@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from ...actors.errors import type_name
 from ...actors.kernel.message import message_name
-from .declaration import BadDeclaration, Entry
 from .mechanism import Description, Mechanism, MechanismRefused, Part, Role, compose, find, load, load_module
+from .mechanism_declaration import BadDeclaration, Entry
 
 if TYPE_CHECKING:
     from ...actors.kernel.actor import Actor

@@ -23,8 +23,8 @@ from ...actors.errors import HoldfastError, type_name
 from ...actors.kernel.actor import Actor
 from ...actors.kernel.message import message_name
 from ...actors.process.wire.start_codec import Described
-from .declaration import Declaration
 from .detection import Detection
+from .mechanism_declaration import Declaration
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node

@@ -18,11 +18,11 @@ from ...actors.errors import AskFailed, HoldfastError, remote_crash
 from ...actors.exit_reasons import KILLED, ExitReason, Shutdown, crash
 from ...actors.kernel import lifecycle
 from ...actors.kernel.actor import Actor, on
+from ...actors.kernel.blocking_handlers import ThreadContext, is_async
 from ...actors.kernel.cell import DOWN
 from ...actors.kernel.envelope import ReplyHandle
 from ...actors.kernel.message import Message, Refusal
 from ...actors.kernel.ref import current
-from ...actors.kernel.threads import ThreadContext, is_async
 from ..children import Child, StartLimit
 from ..dynamic import DynamicSupervisor
 from ..spec import ChildSpec

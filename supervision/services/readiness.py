@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 from ...actors.errors import SpecError
-from ...actors.kernel.threads import Threads, is_async
+from ...actors.kernel.blocking_handlers import Threads, is_async
 from ...actors.streams import Address, connect
 
 FIRST_LOOK, LAST_LOOK = 0.01, 0.2

@@ -1,6 +1,6 @@
 """Declarations of eight mechanisms, as their files have them; bricks are not needed to select."""
 
-from holdfast.ftm.model.declaration import Cost, Declaration
+from holdfast.ftm.model.mechanism_declaration import Cost, Declaration
 
 
 class PBR(Declaration):

@@ -19,7 +19,7 @@ from holdfast.ftm.group.reconfiguration import STEPS, CannotAdapt
 from holdfast.ftm.mechanisms.lfr import LFR
 from holdfast.ftm.mechanisms.pbr import PBR
 from holdfast.ftm.mechanisms.tr import TR
-from holdfast.system.protection import UNDER_WAY, AdaptationUndone, Protection
+from holdfast.system.mechanism_notes import UNDER_WAY, AdaptationUndone, Protection
 from holdfast.system.transaction.change import Change
 from tests.ftm.accounts import Add, Counter, Load, Tags
 from tests.ftm.test_adaptation import protected, stack, transition

@@ -24,7 +24,7 @@ from holdfast.ftm.model.change_model import (
     select,
 )
 from holdfast.ftm.model.coverage import coverage, selection_table, selection_text
-from holdfast.ftm.model.declaration import FAULTS, LAYERS, BadDeclaration, Cost, Declaration, Entry
+from holdfast.ftm.model.mechanism_declaration import FAULTS, LAYERS, BadDeclaration, Cost, Declaration, Entry
 from tests.ftm.declarations import AD, EIGHT, LFR, NVP, PBR, RB, SEC, TMR, TR
 
 GOOD = Application("Account")

@@ -37,7 +37,7 @@ from holdfast.diagnosis.board import (
     WrongCurrent,
 )
 from holdfast.diagnosis.board import tcp_server as board_server
-from holdfast.diagnosis.board.frames import HEAD, AskMeasurements, Decoder, Frame, Refused, Switch, encode
+from holdfast.diagnosis.board.board_frames import HEAD, AskMeasurements, Decoder, Frame, Refused, Switch, encode
 from holdfast.testing import probe
 
 BASE, PC = 0, 1

@@ -7,7 +7,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from holdfast.diagnosis.board import BadFrame, ChannelSpecification, Measurements, Reading, Specification
-from holdfast.diagnosis.board.frames import (
+from holdfast.diagnosis.board.board_frames import (
     CHANNELS,
     HEAD,
     LARGEST,
