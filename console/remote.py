@@ -28,7 +28,7 @@ from .wire import (
     RESPONSE,
     AnyRequest,
     BadRequest,
-    Control,
+    ControlActor,
     Transact,
     Tree,
     Whereis,
@@ -235,7 +235,7 @@ class RemoteSystem:
         if changes and self._dry_run:
             raise SpecError(verb, "in a dry run no order is given to an actor: put it into a transaction")
         packed = [pack_arg(arg, verb) for arg in args]
-        return await self.call(Control(verb, text_of(ref), packed, timeout, self._script), timeout)
+        return await self.call(ControlActor(verb, text_of(ref), packed, timeout, self._script), timeout)
 
     # -- transactions -------------------------------------------------------------------------------------------------
 

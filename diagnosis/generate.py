@@ -77,7 +77,7 @@ async def generate(
     """
     heard: dict[str, set[str]] = {}
     wanted = [topic for topic in dict.fromkeys((*node.topics.names(), *topics)) if topic not in OURS]
-    cell = node.spawn(Start(Listener, (tuple(wanted), heard)))
+    cell = node.spawn(Start(TopicListener, (tuple(wanted), heard)))
     try:
         await asyncio.sleep(seconds)
     finally:
@@ -87,7 +87,7 @@ async def generate(
     return declared(_wiring(node, heard, out))
 
 
-class Listener(Actor):
+class TopicListener(Actor):
     """Notes who publishes on which topics."""
 
     deterministic = False

@@ -26,8 +26,8 @@ LimitsOf = Mapping[str, Mapping[Property, Limits]]
 """What is good, for each property of some components."""
 
 
-class Host(Protocol):
-    """What is watched: an `ActorSystem`."""
+class WatchedSystem(Protocol):
+    """The system that is watched: an `ActorSystem`."""
 
     @property
     def node(self) -> Node:
@@ -73,7 +73,7 @@ class Watch:
 
 
 async def watch(
-    system: Host,
+    system: WatchedSystem,
     model: Declaration | System | None = None,
     observers: Iterable[ChildSpec] = (),
     *,

@@ -48,7 +48,7 @@ class AdaptationUndone(Event, frozen=True, eq=False):
     step: str
 
 
-class Protection:
+class MechanismNotes:
     """What the mechanisms of addresses have become; `completing` gives them to the specs of this root."""
 
     def __init__(self, homes: Homes) -> None:

@@ -45,7 +45,7 @@ from ..supervision.supervisor import Supervisor, kill_starting
 from .controls import Controls
 from .live_moves import Moves
 from .logs import LogSink
-from .mechanism_notes import Protection, check_no_part
+from .mechanism_notes import MechanismNotes, check_no_part
 from .options import SystemOptions
 from .portal import ThreadPortal
 from .recorded import Recorded
@@ -172,7 +172,7 @@ class ActorSystem(Recorded, Controls):
             self._sink = LogSink(self.name, node.loop, log_payloads=options.log_payloads)
             node.events.add_sink(self._sink)
         self.specifications = Specifications(self._homes, is_kept=options.store is not None)
-        self.mechanism_notes = Protection(self._homes)
+        self.mechanism_notes = MechanismNotes(self._homes)
         node.connect(
             Ports(
                 host_for=self._host_for,

@@ -19,7 +19,7 @@ from ...actors.kernel.cell import Cell
 from ...actors.kernel.codec import Parcel
 from ...actors.kernel.envelope import Ask, Envelope, Item
 from ...actors.kernel.message import message_name
-from ..durable_links import Ties
+from ..durable_links import DurableTies
 from ..durable_timers import Timers
 from ..inputs import Batch, HomeJournal, Input, Turn
 from ..journal import Saved
@@ -89,7 +89,7 @@ class Switch:
         self.calls = PendingCalls(self)
         self.timers = Timers(self)
         self.topics: dict[str, None] = {}
-        self.ties = Ties(self)
+        self.ties = DurableTies(self)
         self.outputs = Outputs(self)
         self.limit = Limit(self)
         self.replay = PacedReplay(self)

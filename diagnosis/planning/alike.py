@@ -20,7 +20,7 @@ Numbered: TypeAlias = tuple[int, bool]
 
 
 @dataclasses.dataclass(slots=True)
-class Part:
+class ActionGroup:
     """Actions that hang together, in order, and their atoms as they are numbered."""
 
     actions: Sequence[GroundAction]
@@ -44,7 +44,7 @@ class OneOfEach:
         for goal in problem.goals:
             part = owner.get(goal.atom)
             (fixed if part is None else part.goals).append(goal)
-        kinds: dict[object, list[Part]] = {}
+        kinds: dict[object, list[ActionGroup]] = {}
         for part, form in breathing(parts):
             if part.goals:
                 state = tuple([atom in problem.init for atom in part.atoms])
@@ -75,7 +75,7 @@ class OneOfEach:
         return tuple(goal for goal in self._problem.goals if goal in found)
 
 
-def _numbered(actions: Sequence[GroundAction]) -> tuple[Part, object]:
+def _numbered(actions: Sequence[GroundAction]) -> tuple[ActionGroup, object]:
     """A part, and its form: equal only for parts that are alike."""
     numbers: dict[Atom, int] = {}
 
@@ -93,4 +93,4 @@ def _numbered(actions: Sequence[GroundAction]) -> tuple[Part, object]:
             for action in actions
         ]
     )
-    return Part(actions, numbers, []), form
+    return ActionGroup(actions, numbers, []), form

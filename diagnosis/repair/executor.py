@@ -38,7 +38,7 @@ class Result:
     why: str = ""
 
 
-class World(Protocol):
+class RepairWorld(Protocol):
     """What an executor sees and tells; the repairer is it."""
 
     def now(self) -> float:
@@ -85,7 +85,7 @@ class Executor:
 
     def __init__(
         self,
-        world: World,
+        world: RepairWorld,
         arbiter: Arbiter,
         *,
         address: Callable[[Step], str],

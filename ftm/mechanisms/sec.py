@@ -243,10 +243,10 @@ class SEC(Mechanism):
         enrols: Callable[[], list[str]] | None = None,
     ) -> SecuredLink:
         """This participant's end of its links."""
-        from ..sec.identity import End
+        from ..sec.identity import LinkEnd
         from ..sec.link import Link
 
-        return Link(End(node, address, path, self, epoch, enrols))
+        return Link(LinkEnd(node, address, path, self, epoch, enrols))
 
 
 __all__ = ["SEC", "LinkLost", "Opening", "Sealing"]

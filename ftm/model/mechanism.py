@@ -24,7 +24,7 @@ from ...actors.kernel.actor import Actor
 from ...actors.kernel.message import message_name
 from ...actors.process.wire.start_codec import Described
 from .detection import Detection
-from .mechanism_declaration import Declaration
+from .mechanism_declaration import MechanismDeclaration
 
 if TYPE_CHECKING:
     from ...actors.kernel.node import Node
@@ -85,7 +85,7 @@ class Description(msgspec.Struct, array_like=True, frozen=True):
 
 
 @dataclasses.dataclass(frozen=True)
-class Mechanism(Declaration, Described):
+class Mechanism(MechanismDeclaration, Described):
     """Base of all mechanisms. Derive a frozen dataclass, and set the class attributes."""
 
     revived_by: ClassVar[str] = f"{__name__}:revive"

@@ -51,7 +51,7 @@ class Cost(msgspec.Struct, frozen=True):
     recovery: float = 0.0
 
 
-class Declaration:
+class MechanismDeclaration:
     """What is read of a mechanism, a class or an instance of one. A declaration has `name`, `tolerates` and `needs`.
 
     `replicas`, `units`: how many it takes. `layer`: one of `LAYERS`, if it cannot be told from
@@ -93,7 +93,7 @@ class Entry(msgspec.Struct, frozen=True):
     least_energy: float = 0.0
 
     @classmethod
-    def of(cls, mechanism: Declaration | type[Declaration] | Entry) -> Entry:
+    def of(cls, mechanism: MechanismDeclaration | type[MechanismDeclaration] | Entry) -> Entry:
         """Read a declaration.
 
         Raises:
@@ -122,7 +122,7 @@ class Entry(msgspec.Struct, frozen=True):
         )
 
 
-Mechanisms = Sequence[Declaration | type[Declaration] | Entry]
+Mechanisms = Sequence[MechanismDeclaration | type[MechanismDeclaration] | Entry]
 """Declarations: classes of mechanisms or instances of them, or what was read of them."""
 
 

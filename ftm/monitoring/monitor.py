@@ -76,7 +76,7 @@ class Adapt(Order[None]):
     is_urgent: bool = False
 
 
-class Look(Message):
+class MonitorLook(Message):
     """Look at what there is, and decide. It tells itself."""
 
 
@@ -276,7 +276,7 @@ class MonitoringEngine(Actor):
             self._withdraw("the monitoring engine was restarted")
         if watch.running is not None:
             self._tried(Tried(watch.running.number, "the monitoring engine was restarted meanwhile"))
-        self.ctx.every(watch.judge.settings.interval, Look())
+        self.ctx.every(watch.judge.settings.interval, MonitorLook())
 
     def _now(self) -> float:
         return self.ctx.cell.node.loop.time()
@@ -286,8 +286,8 @@ class MonitoringEngine(Actor):
 
     # -- seeing -----------------------------------------------------------------------------------------------------
 
-    @on(Look)
-    def _look(self, message: Look) -> None:
+    @on(MonitorLook)
+    def _look(self, message: MonitorLook) -> None:
         watch = self._watch
         for kind in watch.take_signs():
             self._sign(kind, 1)

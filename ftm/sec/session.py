@@ -50,7 +50,7 @@ SUITES: Final[dict[str, type[AESGCM] | type[ChaCha20Poly1305]]] = {
 }
 
 
-class Limits(msgspec.Struct, frozen=True):
+class SessionLimits(msgspec.Struct, frozen=True):
     """When keys are exchanged, and when a session ends.
 
     Args:
@@ -159,7 +159,7 @@ class Session(Secret):
         incarnation: int,
         clock: Callable[[], float],
         lifetime: float,
-        limits: Limits,
+        limits: SessionLimits,
         rejected: Counter[str],
     ) -> None:
         now = clock()

@@ -17,7 +17,7 @@ from ...actors.kernel.context import ActorContext
 from ...actors.kernel.links import link
 from ...actors.kernel.ref import ActorRef
 from ..spec import Shutdown
-from .jobs import Work
+from .jobs import BeginJob
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -179,7 +179,7 @@ async def _result(cell: Cell) -> Any:
 
     Raises whatever it failed with; AskFailed if it was ended.
     """
-    reply = cell.ref.ask(Work(), FOREVER)
+    reply = cell.ref.ask(BeginJob(), FOREVER)
     reply.add_done_callback(seen)
     if cell.state is not DOWN:  # Else its process is coming up: if that fails, so does the ask.
         gone = cell.ended()

@@ -28,7 +28,7 @@ from ..dynamic import DynamicSupervisor
 from ..spec import ChildSpec
 
 
-class Work(Message[Any]):
+class BeginJob(Message[Any]):
     """Begin; the reply, which comes at the end, is what the function returned."""
 
 
@@ -39,7 +39,7 @@ class JobActor(Actor):
         label: what the job is called; its supervisor adds a number.
         function: what is called; packed by name if the job is to live in another process.
         args: its arguments.
-        is_awaited: it begins with `Work`, and answers that; else with its start.
+        is_awaited: it begins with `BeginJob`, and answers that; else with its start.
         is_coded: it lives in another process than whoever started it.
     """
 
@@ -57,8 +57,8 @@ class JobActor(Actor):
         if not self._is_awaited:
             self._work = self.ctx.create_task(self._run())
 
-    @on(Work)
-    def _begin(self, message: Work) -> ReplyHandle[Any]:
+    @on(BeginJob)
+    def _begin(self, message: BeginJob) -> ReplyHandle[Any]:
         """Begin."""
         self._handle = self.ctx.reply_handle()
         self._work = self.ctx.create_task(self._run())

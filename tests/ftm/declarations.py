@@ -1,9 +1,9 @@
 """Declarations of eight mechanisms, as their files have them; bricks are not needed to select."""
 
-from holdfast.ftm.model.mechanism_declaration import Cost, Declaration
+from holdfast.ftm.model.mechanism_declaration import Cost, MechanismDeclaration
 
 
-class PBR(Declaration):
+class PBR(MechanismDeclaration):
     name = "pbr"
     replicas = units = 2
     tolerates = frozenset({"crash"})
@@ -12,7 +12,7 @@ class PBR(Declaration):
     cost = Cost(states=1, requests=1, recovery=0.02)
 
 
-class LFR(Declaration):
+class LFR(MechanismDeclaration):
     name = "lfr"
     replicas = units = 2
     tolerates = frozenset({"crash"})
@@ -22,14 +22,14 @@ class LFR(Declaration):
     cost = Cost(total=2, requests=1, recovery=0.01)
 
 
-class TR(Declaration):
+class TR(MechanismDeclaration):
     name = "tr"
     tolerates = frozenset({"transient_value"})
     needs = frozenset({"determinism", "state_access"})
     cpu = "high"
 
 
-class AD(Declaration):
+class AD(MechanismDeclaration):
     name = "a&d"
     replicas = units = 2
     tolerates = frozenset({"transient_value", "permanent_value"})
@@ -37,20 +37,20 @@ class AD(Declaration):
     over = frozenset({"replication"})
 
 
-class SEC(Declaration):
+class SEC(MechanismDeclaration):
     name = "sec"
     tolerates = frozenset({"eavesdropping", "forgery", "replay"})
     needs = frozenset({"certificates"})
 
 
-class RB(Declaration):
+class RB(MechanismDeclaration):
     name = "rb"
     layer = "repetition"
     tolerates = frozenset({"development", "transient_value"})
     needs = frozenset({"versions", "assertions", "state_access"})
 
 
-class NVP(Declaration):
+class NVP(MechanismDeclaration):
     name = "nvp"
     layer = "repetition"
     units = 3
@@ -60,7 +60,7 @@ class NVP(Declaration):
     cost = Cost(runs=1, latency=1, total=3, requests=2)
 
 
-class TMR(Declaration):
+class TMR(MechanismDeclaration):
     name = "tmr"
     replicas = units = 3
     tolerates = frozenset({"crash", "transient_value", "permanent_value"})
