@@ -72,7 +72,7 @@ class Crash(ExitReason, frozen=True, eq=False):
 
     @property
     def traceback(self) -> str:
-        """The formatted traceback."""
+        """The traceback of the exception, formatted when it is asked for."""
         return self.formatted if self.error is None else format_error(self.error)
 
     def __str__(self) -> str:

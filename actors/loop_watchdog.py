@@ -61,7 +61,7 @@ class LoopWatch:
             self._thread.start()
 
     def close(self) -> None:
-        """No more of it."""
+        """Stop watching, and wait for the watching thread to end."""
         self._over.set()
         if self._timer is not None:
             self._timer.cancel()

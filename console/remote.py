@@ -182,7 +182,7 @@ class RemoteSystem:
         return RemoteRef(path)
 
     async def get_status(self, ref: RemoteTarget, *, timeout: float = 5.0) -> Status:
-        """How an actor is."""
+        """Get the status of an actor, also while a turn of it waits."""
         status: Status = await self._control("get_status", ref, timeout)
         return status
 
@@ -317,7 +317,7 @@ class RemoteChange:
         self._put("reorder", supervisor, list(ids))
 
     def strategy(self, supervisor: RemoteTarget, strategy: Strategy) -> None:
-        """Restart by another strategy."""
+        """Have a supervisor restart its children by another strategy."""
         self._put("strategy", supervisor, strategy)
 
     def intensity(self, supervisor: RemoteTarget, intensity: int, period: float) -> None:
@@ -329,7 +329,7 @@ class RemoteChange:
         self._put("isolation", target, isolation)
 
     def bind(self, owner: RemoteTarget, port: str, target: RemoteTarget) -> None:
-        """Point a binding elsewhere."""
+        """Have a binding lead to another actor."""
         self._put("bind", owner, port, text_of(target))
 
     def register(self, name: str, target: RemoteTarget) -> None:
@@ -337,7 +337,7 @@ class RemoteChange:
         self._put("register", name, text_of(target))
 
     def unregister(self, name: str) -> None:
-        """Free a name."""
+        """Free a name that an actor has beside its address."""
         self._put("unregister", name)
 
     def suspend(self, target: RemoteTarget) -> None:
@@ -366,7 +366,7 @@ class RemoteChange:
         return f"{text_of(supervisor)}/{name}"
 
     def unbind(self, owner: RemoteTarget, port: str) -> None:
-        """Point a binding nowhere."""
+        """Have a binding lead to nobody."""
         self._put("unbind", owner, port)
 
     def protect(self, target: RemoteTarget, mechanism: Any) -> None:
@@ -411,7 +411,7 @@ class RemoteChange:
 
     @property
     def difference(self) -> tuple[str, ...]:
-        """How the tree changes."""
+        """How the tree changes, line by line."""
         return self._difference
 
     def describe(self) -> str:
@@ -421,7 +421,7 @@ class RemoteChange:
 
 
 def text_of(target: RemoteTarget) -> str:
-    """A target's address."""
+    """The address of a target, which may be a ref or text."""
     return target.path if isinstance(target, RemoteRef) else target
 
 

@@ -60,7 +60,7 @@ def check_user(uid: int, expected: int) -> None:
 
 
 class Arg(msgspec.Struct, array_like=True, frozen=True, tag_field="kind"):
-    """An argument."""
+    """Base of the arguments of an order that goes over the control endpoint."""
 
 
 class PlainArg(Arg, tag="plain", array_like=True, frozen=True):
@@ -143,7 +143,7 @@ def open_mechanism(data: list[Any]) -> Any:
 
 
 class ControlRequest(msgspec.Struct, tag_field="ask", forbid_unknown_fields=True, frozen=True):
-    """Base of all requests."""
+    """Base of all requests to a running system."""
 
 
 class Tree(ControlRequest, tag="tree", frozen=True):

@@ -96,7 +96,7 @@ class TopicListener(Actor):
         self._listens_to, self._publishers = topics, heard
 
     def on_start(self, restored: bool) -> None:
-        """Listen."""
+        """Subscribe to the topics that are to be listened to."""
         for topic in self._listens_to:
             listen(self, topic)
 

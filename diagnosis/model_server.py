@@ -30,7 +30,7 @@ LOADED: Final = "loaded"
 
 
 class GetModel(Message[Version]):
-    """The version that counts."""
+    """Asks for the version of the model that is in force."""
 
 
 class GetVersions(Message[tuple[Version, ...]]):

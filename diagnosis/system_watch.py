@@ -31,7 +31,7 @@ class WatchedSystem(Protocol):
 
     @property
     def node(self) -> Node:
-        """Its own process."""
+        """The node of the process in which diagnosis itself lives."""
         ...
 
     async def start(self, spec: ChildSpec) -> ActorRef[Any]:
@@ -60,7 +60,7 @@ class Watch:
         return self._node.find_ref(f"{self.tree.path}/{DIAGNOSER}", DiagnoserActor)
 
     async def diagnosis(self) -> Diagnosis:
-        """What is wrong now."""
+        """The present diagnosis of the system."""
         return await self.diagnoser.ask(GetDiagnosis())
 
     async def why(self) -> Explained:
@@ -68,7 +68,7 @@ class Watch:
         return await self.diagnoser.ask(GetExplanation())
 
     async def observed(self) -> Observed:
-        """What is known now."""
+        """What is observed of the system at the moment."""
         return await self.diagnoser.ask(GetObserved())
 
 

@@ -133,7 +133,7 @@ class MechanismNotes:
             self.flush()
 
     def flush(self) -> None:
-        """Keep what there is."""
+        """Write what has changed to the store."""
         if self._is_dirty:
             self._is_dirty = False
             self._homes.note(KEPT, msgspec.msgpack.encode(self._kept) if self._kept else None)

@@ -34,7 +34,7 @@ Migrate = Callable[[Any, type[Actor]], Any]
 
 
 class Order:
-    """Base of all orders."""
+    """Base of all orders, which an actor obeys ahead of its messages."""
 
     verb: ClassVar[str]
 
@@ -48,7 +48,7 @@ class Order:
 
     @classmethod
     def unpack(cls, data: dict[str, Any]) -> Order:
-        """The order again."""
+        """Make the order again of the data that it travelled as."""
         return cls()
 
 

@@ -75,7 +75,7 @@ class Call(Item):
         return None
 
     def give(self, value: object) -> None:
-        """Answer whoever waits."""
+        """Answer whoever waits for this order."""
         ask = self.ask
         if isinstance(ask, OrderAsk):
             ask.give(value)

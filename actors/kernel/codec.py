@@ -123,7 +123,7 @@ class Codec:
         return self.encode(same, actor)
 
     def parcel(self, message: Message[Any], actor: str) -> Parcel:
-        """A message, encoded."""
+        """Encode a message, with the name of its type beside the bytes."""
         return Parcel(message_name(type(message)), self.encode(message, actor))
 
     def decode(self, kind: Any, body: Any) -> Any:

@@ -417,7 +417,7 @@ class Runner:
             self._call.set_result(None)
 
     def retire(self) -> None:
-        """End the task."""
+        """End the task of this runner."""
         self.task.cancel()
 
     def _done(self, _: object) -> None:

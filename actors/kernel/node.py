@@ -343,7 +343,7 @@ class Node(RunLoop):
 
 
 def _void() -> None:
-    """Nobody watches."""
+    """Do nothing: this process keeps no time limits by a thread."""
 
 
 def cell_kind(cell: Cell) -> type[Actor] | None:

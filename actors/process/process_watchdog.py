@@ -93,7 +93,7 @@ class ProcessWatch:
             del self._timers[:-2]
 
     def close(self) -> None:
-        """Stop watching."""
+        """Stop watching the process from now on."""
         for timer in self._timers:
             timer.cancel()
 

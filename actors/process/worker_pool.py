@@ -221,7 +221,7 @@ class Worker(Peer):
             self.kill(Hung(seconds))
 
     def beat(self) -> None:
-        """Its loop turns."""
+        """Note that the event loop of the process turns."""
         if self._watch is not None:
             self._watch.beat()
 
@@ -531,7 +531,7 @@ class Workers:
             self.node.emit(event)
 
     def processes(self) -> dict[str, int]:
-        """Address to pid."""
+        """The pid of each actor's process, by address."""
         return {cell.path: worker.pid for cell, worker in self.by_cell.items()}
 
     async def close(self) -> None:

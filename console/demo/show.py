@@ -47,13 +47,13 @@ class Watcher(Protocol):
         """The mapper's process got SIGKILL."""
 
     def recovered(self, recovery: MapperRecovery) -> None:
-        """The mapper is back."""
+        """Show that the mapper is back."""
 
     def notice(self, text: str) -> None:
         """Something the user should know, such as a log that is cut off."""
 
     def finish(self, report: DemoReport) -> None:
-        """Both runs are over."""
+        """Show the verdict when both runs are over."""
 
     def close(self) -> None:
         """Nothing more will come, perhaps because of an error."""

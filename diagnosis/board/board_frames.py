@@ -47,7 +47,7 @@ class BadFrame(HoldfastError, text="bad frame: {why}"):
 
 
 class AskSpecification(msgspec.Struct, frozen=True):
-    """What are you?"""
+    """Asks the board what it is and which channels it has."""
 
 
 class AskMeasurements(msgspec.Struct, frozen=True):
@@ -89,7 +89,7 @@ class Specification(msgspec.Struct, frozen=True):
 
 
 class Reading(msgspec.Struct, frozen=True):
-    """One channel now."""
+    """What one channel measures at the moment."""
 
     on: bool
     milliamperes: int

@@ -111,7 +111,7 @@ class Board:
         self._watchers: set[asyncio.Future[Measurements]] = set()
 
     async def __aenter__(self) -> Board:
-        """Begin to connect."""
+        """Begin to connect, which goes on in the background."""
         if self._keeper is not None:
             raise RuntimeError("a Board is entered once")
         self._keeper = asyncio.get_running_loop().create_task(self._keep(), name=f"connection to {self.url}")
@@ -148,7 +148,7 @@ class Board:
         return await self._ask(AskSpecification(), Specification)
 
     async def measure(self) -> Measurements:
-        """What it measures now."""
+        """Ask the board what its channels measure now."""
         return await self._ask(AskMeasurements(), Measurements)
 
     async def switch(self, channel: int, on: bool) -> None:
@@ -225,7 +225,7 @@ class Board:
         return self._sequence, answer
 
     async def _keep(self) -> None:
-        """Connect again and again."""
+        """Connect again whenever the connection is lost, with growing delays."""
         attempt = 0
         while True:
             try:

@@ -40,7 +40,7 @@ class Device(Protocol):
     """What the server is in front of. Its channels are those that frames allow."""
 
     def specification(self) -> Specification:
-        """What it is."""
+        """Say what the board is and which channels it has."""
         ...
 
     def measure(self) -> Measurements:
@@ -134,7 +134,7 @@ class BoardServer:
 
 
 class _Client:
-    """One connection."""
+    """One connection of a client, with what is read and written over it."""
 
     def __init__(
         self, server: BoardServer, device: Device, reader: asyncio.StreamReader, writer: asyncio.StreamWriter

@@ -58,7 +58,7 @@ class Diagnoser:
 
     @property
     def model(self) -> Model:
-        """The model that counts."""
+        """The model that diagnoses are made by."""
         return self._model
 
     def use(self, model: Model) -> None:

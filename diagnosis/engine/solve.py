@@ -57,7 +57,7 @@ class SearchBudget:
                 self._control.interrupt()
 
     def close(self) -> None:
-        """No more searches."""
+        """Begin no more searches, and keep no more time."""
         self.cancel()
         if self._timer is not None:
             self._timer.cancel()

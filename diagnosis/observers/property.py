@@ -122,7 +122,7 @@ class PropertyObserver(Observer):
         self._lives.clear()
 
     async def look(self) -> None:
-        """Measure it all."""
+        """Measure all properties, and say which are within their bounds."""
         late = self.age % self.manner.every
         self._late = late if self.manner.every - late > EARLY else 0.0
         values = await self._measure()

@@ -92,7 +92,7 @@ class Case:
         self.tried[bad] -= 1
 
     def add_symptoms(self, symptoms: Iterable[Literal]) -> None:
-        """More symptoms were seen."""
+        """Add symptoms that were seen meanwhile."""
         self.symptoms = tuple(dict.fromkeys((*self.symptoms, *symptoms)))
 
     def count(self, step: Step) -> None:

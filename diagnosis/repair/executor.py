@@ -62,11 +62,11 @@ class RepairWorld(Protocol):
         ...
 
     async def began(self, step: Step, epoch: int) -> None:
-        """A step begins."""
+        """Note and tell that a step begins."""
         ...
 
     async def ended(self, result: Result) -> None:
-        """A step has ended."""
+        """Note and tell that a step has ended."""
         ...
 
 

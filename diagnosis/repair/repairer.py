@@ -347,15 +347,15 @@ class Repairer(Actor):
     # -- what the executor sees and tells ---------------------------------------------------------------------------
 
     def now(self) -> float:
-        """See `World`."""
+        """The time in seconds on the loop clock."""
         return asyncio.get_running_loop().time()
 
     def seen(self, atom: Literal) -> tuple[bool | None, float]:
-        """See `World`."""
+        """Whether an atom holds, None if that is not known; and when it was last observed."""
         return self._outlook.seen(atom, self.now())
 
     async def changed(self) -> None:
-        """See `World`."""
+        """Return when something is observed, or a diagnosis comes."""
         waker = asyncio.get_running_loop().create_future()
         self._wakers.append(waker)
         try:
@@ -370,7 +370,7 @@ class Repairer(Actor):
         return why_overtaken(step, self._case, self._outlook, self._policy, self._memory.mode, self.now())
 
     async def approve(self, step: Step) -> str:
-        """See `World`."""
+        """Ask a person; why a dangerous step must not be done, empty if it may."""
         number, case = next(self._numbers), self._case
         reason = f"case {case.number}: {', '.join(sorted(case.blamed))}" if case is not None else ""
         answer: asyncio.Future[str] = asyncio.get_running_loop().create_future()
@@ -388,7 +388,7 @@ class Repairer(Actor):
         return why
 
     async def began(self, step: Step, epoch: int) -> None:
-        """See `World`."""
+        """Note and tell that a step begins."""
         assert self._case is not None
         self._ledger.note(step, self.now())
         self._case.count(step)
@@ -396,7 +396,7 @@ class Repairer(Actor):
         await self._tell(say.ActionBegan(self._case.number, step, epoch, self._case.reason, self.now()))
 
     async def ended(self, result: Result) -> None:
-        """See `World`."""
+        """Note and tell that a step has ended, and how."""
         assert self._case is not None
         step = result.step
         if result.outcome not in (SKIPPED, DENIED):

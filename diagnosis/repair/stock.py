@@ -270,10 +270,10 @@ class Change(Protocol):
     """What a transaction collects, as far as these actions need it."""
 
     def attach(self, target: str, mechanism: Any) -> None:
-        """Protect an actor."""
+        """Protect an actor by a mechanism."""
 
     def compose(self, target: str, mechanism: Any, *, outside: bool = False) -> None:
-        """Nest one more mechanism."""
+        """Nest one more mechanism into those that an actor has."""
 
     def transition(self, target: str, mechanism: Any) -> None:
         """Put a mechanism in the place of another."""

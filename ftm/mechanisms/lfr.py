@@ -135,7 +135,7 @@ class Handling(Before):
     peer_messages = (Forward,)
 
     async def from_peer(self, message: Message[Any]) -> None:
-        """Take a batch."""
+        """Take a batch of requests from the leader."""
         assert isinstance(message, Forward)
         standing = self._standing
         await standing.following.until_ready()

@@ -46,7 +46,7 @@ class Versions(Deciding):
         ]
 
     async def on_stop(self, reason: object) -> None:
-        """They go too."""
+        """Stop the shadows of the other versions too."""
         for shadow in self._others:
             await shadow.close()
 

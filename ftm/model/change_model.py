@@ -118,7 +118,7 @@ class Selection(msgspec.Struct, frozen=True):
 
     @property
     def best(self) -> Choice | None:
-        """The cheapest valid choice."""
+        """The cheapest of the valid choices."""
         return self.valid[0] if self.valid else None
 
     def explain(self) -> str:

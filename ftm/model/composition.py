@@ -114,7 +114,7 @@ def describe(layers: Any) -> list[Description] | None:
 
 
 def names_of(layers: Any) -> str:
-    """Layers in words."""
+    """The names of layers, outermost first, as one text."""
     return " + ".join(type_name(type(layer)).rpartition(".")[2] for layer in compose(layers))
 
 

@@ -140,7 +140,7 @@ class Monitored(msgspec.Struct, frozen=True):
 
 
 class Report(Message[Monitored]):
-    """What do you know?"""
+    """Asks the engine for what it knows."""
 
 
 class CarryOut(Message):

@@ -201,7 +201,7 @@ class Server(lifecycle.HerePlace):
 
     @property
     def turn(self) -> int:
-        """The last turn."""
+        """The number of the last turn."""
         return self.points.turn if self.life is None else self.life.turn
 
     @property

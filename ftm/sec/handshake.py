@@ -194,7 +194,7 @@ class Participant(Secret):
 
     @property
     def sessions(self) -> tuple[Session, ...]:
-        """Those that are open."""
+        """The sessions that are open."""
         return tuple(session for session in self._sessions.values() if session.is_open)
 
     def raise_epoch(self, epoch: int) -> None:
@@ -210,7 +210,7 @@ class Participant(Secret):
         return is_newer
 
     def close(self) -> None:
-        """End all sessions."""
+        """End all sessions, and agree on no more."""
         self._close(CLOSED, lambda session: True)
 
     def _close(self, reason: str, is_over: Callable[[Session], bool]) -> None:

@@ -118,7 +118,7 @@ class Window:
         return REPLAYED if self._bits >> behind & 1 else ""
 
     def put(self, number: int) -> None:
-        """A number was here."""
+        """Note that the frame of this number has come."""
         ahead = number - self.newest
         if ahead > 0:
             # A number far ahead must not make a number of that many bits.

@@ -52,7 +52,7 @@ class Agreed(msgspec.Struct, Generic[T], frozen=True):
 
     @property
     def is_unanimous(self) -> bool:
-        """Whether nobody dissents."""
+        """Whether no ballot says anything else."""
         return not self.dissenting
 
 

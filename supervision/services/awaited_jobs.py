@@ -68,7 +68,7 @@ class Job(Generic[R]):
 
     @property
     def is_done(self) -> bool:
-        """Whether it is over."""
+        """Whether the job is over."""
         return self._future.done()
 
     async def outcome(self, timeout: float | None = None) -> Ok[None, R] | Failed[None] | None:
@@ -87,7 +87,7 @@ class Job(Generic[R]):
         self._end(self._shutdown)
 
     def kill(self) -> None:
-        """End it at once."""
+        """End the job at once, in whatever state it is."""
         self._end("brutal_kill")
 
     async def stop(self, shutdown: Shutdown | None = None) -> Ok[None, R] | Failed[None]:

@@ -59,7 +59,7 @@ class JobActor(Actor):
 
     @on(BeginJob)
     def _begin(self, message: BeginJob) -> ReplyHandle[Any]:
-        """Begin."""
+        """Begin the job, and answer when it is over."""
         self._handle = self.ctx.reply_handle()
         self._work = self.ctx.create_task(self._run())
         return self._handle

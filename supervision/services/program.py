@@ -194,7 +194,7 @@ class Program(Actor):
             self._sign.line(whole)
 
     def _last(self) -> list[str]:
-        """What it said last."""
+        """The last words that the program has written."""
         return [*self._lines, *(text for text in self._parts.values() if text)][-LINES:]
 
     def _started(self, started: asyncio.Future[int]) -> None:
@@ -213,7 +213,7 @@ class Program(Actor):
 
     @on(ProgramInfo, readonly=True)
     def info(self, message: ProgramInfo) -> ProgramStatus:
-        """How it is."""
+        """Tell how the program is."""
         kept = self._kept
         return ProgramStatus(-1 if kept is None else kept.pid, self._now() - self._since, self._last())
 
@@ -303,7 +303,7 @@ class _Leash:
         cell.extra().belongings.timers.add(self)
 
     def cancel(self) -> None:
-        """The life is over."""
+        """End the program, because the life that owns it is over."""
         cell, kept = self._cell, self._kept
         cell.extra().belongings.timers.discard(self)
         if kept.ended.done():

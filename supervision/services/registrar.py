@@ -116,7 +116,7 @@ class GetMeta(Message[list[Any]]):
 
 
 class DeleteMeta(Message[None]):
-    """Forget such a value."""
+    """Forgets a value that belongs to the registry as a whole."""
 
     name: str
 
@@ -140,7 +140,7 @@ class KeyFreed(Message[None]):
 
 
 @dataclasses.dataclass(slots=True, eq=False)
-class RegistryEntry:
+class HeldKey:
     """One key, held by one life of an actor."""
 
     number: int
@@ -150,7 +150,7 @@ class RegistryEntry:
     value: Any
 
     def row(self) -> RegistryRow:
-        """As it travels."""
+        """Make the row in which the entry travels."""
         return RegistryRow(self.number, self.key, self.holder.ref, self.value)
 
 
@@ -170,7 +170,7 @@ class Holdings:
     """What one actor holds, in the order in which it came to it."""
 
     monitor: Monitor
-    entries: dict[RegistryEntry, None] = dataclasses.field(default_factory=dict[RegistryEntry, None])
+    entries: dict[HeldKey, None] = dataclasses.field(default_factory=dict[HeldKey, None])
     claims: dict[Claim, None] = dataclasses.field(default_factory=dict[Claim, None])
 
 
@@ -180,9 +180,7 @@ class Book:
 
     meta: dict[str, Any]
     number: int = 0
-    keys: dict[bytes, dict[RegistryEntry, None]] = dataclasses.field(
-        default_factory=dict[bytes, dict[RegistryEntry, None]]
-    )
+    keys: dict[bytes, dict[HeldKey, None]] = dataclasses.field(default_factory=dict[bytes, dict[HeldKey, None]])
     locks: dict[bytes, deque[Claim]] = dataclasses.field(default_factory=dict[bytes, deque[Claim]])
     holders: dict[Cell, Holdings] = dataclasses.field(default_factory=dict[Cell, Holdings])
 
@@ -234,7 +232,7 @@ class RegistryActor(Actor):
                 else:
                     raise KeyTaken(entry.holder.ref)
         self._book.number += 1
-        entry = RegistryEntry(self._book.number, message.key, holder, message.life, message.value)
+        entry = HeldKey(self._book.number, message.key, holder, message.life, message.value)
         self._book.keys.setdefault(message.key, {})[entry] = None
         self._holdings(holder).entries[entry] = None
         self._tell_listeners(KeyRegistered(self.ctx.ref, key_of(entry.key), holder.ref, entry.value))
@@ -272,7 +270,7 @@ class RegistryActor(Actor):
 
     @on(ReplaceValue)
     def _replace(self, message: ReplaceValue) -> bool:
-        """Only one's own."""
+        """Put another value into an entry, if it is the sender's own."""
         if not self._is_unique:
             raise NotUnique("update_value")
         holder = self._sender()
@@ -282,7 +280,7 @@ class RegistryActor(Actor):
                 return True
         return False
 
-    def _remove(self, entry: RegistryEntry, *, ended: bool) -> None:
+    def _remove(self, entry: HeldKey, *, ended: bool) -> None:
         entries = self._book.keys[entry.key]
         del entries[entry]
         if not entries:
@@ -295,7 +293,7 @@ class RegistryActor(Actor):
 
     @on(Lock)
     def _lock(self, message: Lock) -> ReplyHandle[Any] | None:
-        """First come, first served."""
+        """Queue for the lock of a key; whoever has asked first gets it."""
         item = self.ctx.item
         handle = self.ctx.reply_handle()
         sender = item.sender if isinstance(item, Ask) else None

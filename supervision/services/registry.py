@@ -260,7 +260,7 @@ class Registry(Generic[K, V]):
         return found[0] if found else default
 
     async def delete_meta(self, name: str) -> None:
-        """Forget such a value."""
+        """Forget a value that belongs to the registry as a whole."""
         await self._ask(DeleteMeta(name))
 
     async def _ask(self, message: Message[T]) -> T:

@@ -246,7 +246,7 @@ class KeptProgram:
         return Exited(code) if code else NORMAL
 
     def hung(self, seconds: float) -> None:
-        """Programs have no heartbeat."""
+        """Kill the program; this never happens, since programs have no heartbeat."""
         self.kill(Hung(seconds))
 
 

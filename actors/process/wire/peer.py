@@ -148,7 +148,7 @@ class Peer:
         self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
 
     def join(self, connection: Connection) -> None:
-        """Speak over this connection."""
+        """Speak with the other side over this connection."""
         self.connection, self.kinds_out = connection, connection.names.kinds
 
     def on_forget(self, frame: frames.Forget) -> None:
@@ -217,7 +217,7 @@ class Peer:
         return None if name is None else self.node.cell_at(self.connection.names.from_wire(name))
 
     def on_tell(self, cell: Cell, frame: frames.Tell, page: memoryview | None) -> None:
-        """Take in a message."""
+        """Take in a tell from the other side."""
         try:
             message = self._message_in(cell, frame)
         except HoldfastError as error:

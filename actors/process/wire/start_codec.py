@@ -24,7 +24,7 @@ class Described(ABC):
 
     @abstractmethod
     def describe(self) -> Any:
-        """The description."""
+        """Describe the value, in plain data."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -155,7 +155,7 @@ def _find(name: str, base: type) -> type[Any]:
 
 
 def _named(name: str) -> Any:
-    """What has this name."""
+    """Find the class or function that has this name."""
     module_name, _, path = name.partition(":")
     try:
         found: Any = sys.modules.get(module_name) or importlib.import_module(module_name)
