@@ -122,8 +122,6 @@ class Hung(ExitReason, frozen=True):
         return f"hung for {self.seconds:g} s"
 
 
-AnyExit = Normal | Shutdown | Killed | NoProc | Crash | Signal | Exited | OutOfMemory | Hung
-
 NORMAL = Normal()
 SHUTDOWN = Shutdown()
 KILLED = Killed()

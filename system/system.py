@@ -63,8 +63,6 @@ REPLICA = f"{__name__.rpartition('.')[0].rpartition('.')[0]}.ftm.replica"
 """What the processes of replicas import beforehand."""
 PATIENCE = 10.0
 """Seconds after which a table of the recovery file should have found somebody whom it is for."""
-ADMIN_TIMEOUT = 60.0
-"""Seconds an admin call of the system may take that starts and stops nobody."""
 
 LONG = 365 * 86_400.0
 """Seconds `start` and `stop` wait: no limit of their own, the child specs say how long a start or an end may take."""

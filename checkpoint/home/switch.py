@@ -380,7 +380,7 @@ class Switch:
     def _take(self, turn: int, key: int, outs: list[Out], batch: Batch) -> None:
         """Let new outputs out; drop those that are out already."""
         ledger = self.ledger
-        again = ledger.compare_outputs(turn, key, outs, self._is_rebound)
+        again = ledger.compare_outputs(turn, key, outs, functools.partial(went_elsewhere, self))
         if turn <= ledger.turn:
             self.life.see_again(turn, outs[-1].k if outs else 0)
         for out in outs[:again]:
@@ -388,9 +388,6 @@ class Switch:
                 self.calls.join(turn, key, out)
         for out in outs[again:]:
             self.outputs.execute(turn, key, out, batch)
-
-    def _is_rebound(self, out: Out, digest: int) -> bool:
-        return went_elsewhere(self, out, digest)
 
     def _turn_end(self, end: TurnEnd) -> None:
         ledger = self.ledger

@@ -10,7 +10,7 @@ from rich.console import Console
 from ... import run
 from .demo_runs import DemoPlan, compare
 from .picture import draw, save
-from .report import DemoReport, RunOutcome
+from .report import DemoReport
 from .show import watcher_for
 
 
@@ -38,7 +38,7 @@ def with_picture(report: DemoReport, file: Path) -> DemoReport:
     left, right = report.undisturbed, report.disturbed
     titles = "undisturbed", f"{report.method}, killed {len(right.kills)} times: {_verdict(report)}"
     try:
-        save(draw(left.grid, right.grid, titles=titles, path=_common_path(left, right)), file)
+        save(draw(left.grid, right.grid, titles=titles, path=list(left.path if left.path == right.path else ())), file)
     except OSError as error:
         return replace(report, notices=(*report.notices, f"picture  not written: {error}"))
     return replace(report, picture=str(file))
@@ -47,7 +47,3 @@ def with_picture(report: DemoReport, file: Path) -> DemoReport:
 def _verdict(report: DemoReport) -> str:
     cells = report.differing_cells
     return f"{cells:,} cells differ" if cells else "identical"
-
-
-def _common_path(left: RunOutcome, right: RunOutcome) -> list[tuple[float, float]]:
-    return list(left.path if left.path == right.path else ())

@@ -34,24 +34,10 @@ from ..messages import (
 from ..model import Model
 from ..observations import Observation, ObservationSet
 from ..planning import ClingoPlanner, Plan, Planner, Step, find_plan
+from . import case_decisions as deciding
 from . import notices as say
 from .actions import Act, RepairAction, Repertoire
 from .case import Case, base_of, reached
-from .case_decisions import (
-    Close,
-    Decision,
-    Dismiss,
-    Enter,
-    GiveUp,
-    PlanFor,
-    Wait,
-    decide,
-    is_unsure,
-    judge_no_plan,
-    judge_results,
-    was_skipped,
-    why_overtaken,
-)
 from .choice import CaseView, choose, components_of, problem_for
 from .executor import DENIED, DONE, SKIPPED, Executor, Result
 from .ledger import Ledger, Memory
@@ -249,7 +235,7 @@ class Repairer(Actor):
             bad=self._chosen(case),
             given_up=self._memory.given_up,
             was_planned_dry=self._dry is not None,
-            is_unsure=is_healthy and is_unsure(case, self._model, outlook, now),
+            is_unsure=is_healthy and deciding.is_unsure(case, self._model, outlook, now),
         )
 
     async def _repair(self, case: Case) -> None:
@@ -257,59 +243,61 @@ class Repairer(Actor):
             chosen = self._chosen(case) or ()
             case.add_symptoms(self._outlook.diagnosis.symptoms)
             await self._tell(say.RepairBegan(case.number, chosen, case.symptoms))
-            decision: Decision | None = None
-            while not isinstance(decision, Close):
-                decision = await self._carry_out(case, decision or decide(case, self._moment(case), self._policy))
+            decision: deciding.Decision | None = None
+            while not isinstance(decision, deciding.Close):
+                decision = await self._carry_out(
+                    case, decision or deciding.decide(case, self._moment(case), self._policy)
+                )
             if decision.is_repaired:
                 await self._tell(say.Repaired(case.number, tuple(case.actions), self.now() - case.began))
         finally:
             self._case = None
         self._begin()
 
-    async def _carry_out(self, case: Case, decision: Decision) -> Decision | None:
+    async def _carry_out(self, case: Case, decision: deciding.Decision) -> deciding.Decision | None:
         """Do what was decided; the next decision, if it follows from that."""
         match decision:
-            case Wait(seconds, wakes):
+            case deciding.Wait(seconds, wakes):
                 await self._sleep(seconds, wakes=wakes)
-            case Enter(phase, held):
+            case deciding.Enter(phase, held):
                 case.enter(phase, self.now())
                 if held:
                     await self._tell(say.Held(case.number, held))
-            case PlanFor(bad):
+            case deciding.PlanFor(bad):
                 return await self._plan(case, bad)
-            case Dismiss(bad, why):
+            case deciding.Dismiss(bad, why):
                 case.hopeless[bad] = why
-            case GiveUp(components, why):
+            case deciding.GiveUp(components, why):
                 await self._give_up(case, components, why)
-                return Close(is_repaired=False)
-            case Close():
+                return deciding.Close(is_repaired=False)
+            case deciding.Close():
                 return decision
         return None
 
-    async def _plan(self, case: Case, bad: tuple[str, ...]) -> Decision:
+    async def _plan(self, case: Case, bad: tuple[str, ...]) -> deciding.Decision:
         """Plan for a candidate, and carry the plan out; what follows from that."""
         at, policy = self._moment(case), self._policy
         case.add_symptoms(at.diagnosis.symptoms)
         problem = problem_for(self._model, self._actions, policy, self._ledger, at, bad, self._alone())
         outcome = await find_plan(self._planner, problem, timeout=policy.plan_seconds, degrade=True)
         if not isinstance(outcome, Plan) or not outcome.stages:
-            return judge_no_plan(case, bad, outcome, at.mode, policy)
+            return deciding.judge_no_plan(case, bad, outcome, at.mode, policy)
         wait = self._ledger.wait(outcome.steps, dict(self._actions.actions), self.now())
         if wait > 0:
-            return Wait(wait)
+            return deciding.Wait(wait)
         if self._outlook.diagnosis is not at.diagnosis and self._chosen(case) != bad:
-            return Enter()  # The world did not wait for the planner.
+            return deciding.Enter()  # The world did not wait for the planner.
         unmet = components_of(outcome.unmet)
         await self._tell(say.Planned(case.number, bad, outcome.stages, unmet, policy.is_dry))
         if policy.is_dry:
             self._dry = bad
-            return Close(is_repaired=False)
+            return deciding.Close(is_repaired=False)
         case.begin_plan(bad)
         results = await self._executor(case).execute(problem, outcome)
         case.failures += [f"{result.step} {result.outcome}: {result.why}" for result in results if result.why]
-        if was_skipped(results):
+        if deciding.was_skipped(results):
             case.take_back_plan(bad)
-        return judge_results(bad, outcome, results, self.now(), policy)
+        return deciding.judge_results(bad, outcome, results, self.now(), policy)
 
     def _executor(self, case: Case) -> Executor:
         return Executor(
@@ -367,7 +355,7 @@ class Repairer(Actor):
     def overtaken(self, step: Step) -> str:
         """Why the step is not to be done any more; empty if it is."""
         assert self._case is not None
-        return why_overtaken(step, self._case, self._outlook, self._policy, self._memory.mode, self.now())
+        return deciding.why_overtaken(step, self._case, self._outlook, self._policy, self._memory.mode, self.now())
 
     async def approve(self, step: Step) -> str:
         """Ask a person; why a dangerous step must not be done, empty if it may."""

@@ -90,7 +90,8 @@ class Peer:
         self.pending[key] = ask
         ask.started = number or True  # From here on only the page of its process knows, if that counts it.
         if len(self.pending) > 4096 and key % 1024 == 0:
-            self._forget_done()
+            # Asks that expired are dropped: their replies, if any come, are late.
+            self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
 
     def offer(self, path: str, message: Any, sender: Cell | None) -> asyncio.Future[None]:
         """Send a message to `path`; the future ends when it is accepted there.
@@ -142,10 +143,6 @@ class Peer:
         if type(name) is int:  # Text introduces the name with this frame: known from the next one on.
             self.kinds_out[kind] = name
         return name, message
-
-    def _forget_done(self) -> None:
-        """Drop asks that expired: their replies, if any come, are late."""
-        self.pending = {key: ask for key, ask in self.pending.items() if not ask.is_done}
 
     def join(self, connection: Connection) -> None:
         """Speak with the other side over this connection."""
