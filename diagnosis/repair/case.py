@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import NamedTuple
 
 from ...supervision.arbiter import covers
 from ..literals import Literal
 from ..planning import Step
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Verifying:
+class Verifying(NamedTuple):
     """A plan was carried out at `since`, and the symptoms have until `ends` to go."""
 
     touched: frozenset[str]
@@ -19,23 +19,20 @@ class Verifying:
     ends: float
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Finishing:
+class Finishing(NamedTuple):
     """The diagnosis finds nothing bad any more; the symptoms have until `ends` to be seen to have gone."""
 
     ends: float
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class Unclear:
+class Unclear(NamedTuple):
     """It is not known what there is to repair; at `ends` the case is given up."""
 
     why: str
     ends: float
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class HeldByMode:
+class HeldByMode(NamedTuple):
     """In this mode nothing can be done: it has to change, or the fault has to go."""
 
     mode: str

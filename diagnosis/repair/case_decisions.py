@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 from ..engine import State
 from ..model import Model
@@ -21,47 +21,41 @@ from .outlook import Outlook
 from .policy import Policy
 
 
-@dataclass(frozen=True, slots=True)
-class Wait:
+class Wait(NamedTuple):
     """Wait so many seconds; with `wakes` no longer than until something comes in."""
 
     seconds: float
     wakes: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Enter:
+class Enter(NamedTuple):
     """Go on in another phase (None: with the next round), and tell why nothing is done, if something is said."""
 
     phase: Phase | None = None
     held: str = ""
 
 
-@dataclass(frozen=True, slots=True)
-class PlanFor:
+class PlanFor(NamedTuple):
     """Plan for this candidate, and carry the plan out."""
 
     bad: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Dismiss:
+class Dismiss(NamedTuple):
     """Try this candidate no more in this case: nothing can be done for it."""
 
     bad: tuple[str, ...]
     why: str
 
 
-@dataclass(frozen=True, slots=True)
-class GiveUp:
+class GiveUp(NamedTuple):
     """Say that these components are beyond repair, and end the case."""
 
     components: tuple[str, ...]
     why: str
 
 
-@dataclass(frozen=True, slots=True)
-class Close:
+class Close(NamedTuple):
     """End the case; with `is_repaired` as a success."""
 
     is_repaired: bool

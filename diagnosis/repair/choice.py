@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Collection, Mapping
+from typing import NamedTuple
 
 from ..engine import Candidate, Diagnosis, State
 from ..literals import Literal
@@ -22,8 +23,7 @@ from .ledger import Ledger
 from .policy import Policy
 
 
-@dataclasses.dataclass(frozen=True, slots=True)
-class CaseView:
+class CaseView(NamedTuple):
     """What repair knows at one moment of a case.
 
     Attributes:
