@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 from ..literals import Literal
 from ..model import Model
 from .breath import breathe, breathing
+from .connected import connected
 
 FALSE: Final = 0
 """The atom that never holds: the head of rules without one."""
@@ -182,25 +183,15 @@ def _reaching(steps: list[RuleStep], failures: frozenset[int]) -> list[RuleStep]
 
 
 def parts_of(steps: list[RuleStep], failures: frozenset[int]) -> Iterator[RulePart]:
-    """Group what hangs together by a component or by an atom that nobody observed (union-find)."""
-    parent = list(range(len(steps)))
+    """Group what hangs together by a component or by an atom that nobody observed."""
 
-    def root(number: int) -> int:
-        while parent[number] != number:
-            parent[number] = number = parent[parent[number]]
-        return number
+    def keys_of(step: RuleStep) -> Iterator[int]:
+        yield from (~component for component in step.needs)  # Atoms are >= 0.
+        yield from step.body
+        if step.head not in failures:
+            yield step.head
 
-    by_component: dict[int, int] = {}
-    by_atom: dict[int, int] = {}
-    for number, step in enumerate(breathing(steps)):
-        for component in step.needs:
-            parent[root(number)] = root(by_component.setdefault(component, number))
-        for atom in step.body if step.head in failures else (*step.body, step.head):
-            parent[root(number)] = root(by_atom.setdefault(atom, number))
-    groups: dict[int, list[RuleStep]] = {}
-    for number, step in enumerate(breathing(steps)):
-        groups.setdefault(root(number), []).append(step)
-    for group in groups.values():
+    for group in connected(steps, keys_of):
         denials = tuple(step for step in group if step.head in failures)
         yield RulePart(denials, tuple(step for step in group if step.head not in failures))
 

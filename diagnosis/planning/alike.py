@@ -11,9 +11,10 @@ from collections.abc import Iterable, Sequence
 from typing import TypeAlias
 
 from ..engine.breath import breathing
+from ..engine.connected import connected
 from .grounding import GroundAction
 from .language import Atom, Literal, Problem
-from .relevance import together
+from .relevance import atoms
 
 Numbered: TypeAlias = tuple[int, bool]
 """A literal, by the number of its atom within a part."""
@@ -38,7 +39,7 @@ class OneOfEach:
 
     def __init__(self, problem: Problem, actions: Sequence[GroundAction]) -> None:
         self._problem = problem
-        parts = [_numbered(some) for some in together(actions)]
+        parts = [_numbered(some) for some in connected(actions, atoms)]
         owner = {atom: part for part, _ in parts for atom in part.atoms}
         fixed: list[Literal] = []
         for goal in problem.goals:
